@@ -1,0 +1,44 @@
+# quickstart: set up and train a small policy.  test, lint: check the code.  bench: print the benchmark tables.
+# Everything runs in .venv, which the first target makes; another interpreter: make quickstart PYTHON=python3.12
+
+supported := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do $$p -c '$(supported)' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+EXTRA ?= dev
+PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
+CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/congrasp
+
+# Compiled programs are kept between runs; another folder: JAX_COMPILATION_CACHE_DIR=...
+export JAX_COMPILATION_CACHE_DIR ?= $(CACHE)/jax
+
+.PHONY: quickstart test lint bench install clean
+.DEFAULT_GOAL := quickstart
+
+quickstart: install
+	$(VENV)/bin/congrasp train --preset quickstart
+
+test: install
+	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -m "not gpu" --cov --cov-report=term $(ARGS)
+
+lint: install
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+
+bench: install
+	$(VENV)/bin/congrasp bench physics
+	$(VENV)/bin/congrasp bench query
+
+install: $(VENV)/.$(EXTRA)
+
+$(VENV)/.$(EXTRA): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" && $(PYTHON) -c '$(supported)' 2>/dev/null || \
+	  { echo "congrasp needs Python 3.11, 3.12 or 3.13. Install one and name it: make PYTHON=python3.12" >&2; exit 2; }
+	@test -x $(VENV)/bin/python || { echo "Making $(VENV) with $(PYTHON)"; $(PYTHON) -m venv $(VENV); } || \
+	  { echo "Python's venv module does not work here. On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 2; }
+	@echo "Installing congrasp[$(EXTRA)] into $(VENV): about 1.5 GB, some minutes the first time"
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[$(EXTRA)]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build *.egg-info .coverage* .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,338 @@
+"""The environment as pure functions over a batch of worlds: episodes, observations, rewards, success.
+
+Physics stands between `targets` and `score`; who steps it is `actors.rollout`'s business.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from actors.physics.engine import Readout, World
+from actors.taskset import TaskSet
+from common import rotations
+from common.config import RewardWeights, TaskConfig
+from common.constraints.priority import Request, resolve
+from common.hands import kinematics
+from common.hands.spec import Hand
+from common.task.control import heading_wrist_pose
+from common.task.features import Features, features
+from common.task.metrics import errors
+from common.task.reward import TERMS, fallen, reward_terms
+from common.task.types import MASKS, Action, Array, Goal, SceneState, Surface
+
+_WINDOWED = ("heading_rad", "heading_m", "pose_rad", "pose_m", "trajectory_rad", "trajectory_m")
+_COUNTED = ("minus_links", "any_links", "force_sum", "force_link_max")
+_SUMS = ("return", *_WINDOWED, *_COUNTED)
+METRICS = (
+    "success",
+    "held",
+    "return",
+    "length",
+    "links_at_removal",
+    "moved_at_removal",
+    *_WINDOWED,
+    "affordance_ratio",
+    "force_sum",
+    "force_link_max",
+    "bad",
+    *(f"mask_{name}" for name in MASKS),
+    "object_index",
+)
+"""Metrics of a finished episode, in the order of `EnvironmentState.finished`; then come the sums of the terms."""
+EPISODE_FIELDS = (*(f"episode/{name}" for name in METRICS), *(f"term/{name}" for name in TERMS))
+
+
+class EnvironmentState(NamedTuple):
+    """A batch of worlds between two control steps."""
+
+    key: Array
+    """() random key of the next resets."""
+    world: World
+    """What the present episodes started from."""
+    goal: Goal
+    """Active constraints."""
+    surface: Surface
+    """Surface points of the worlds' objects."""
+    time: Array
+    """(B,) control steps since the episode began."""
+    hold: Array
+    """(B,) control steps without the table before the episode ends."""
+    q_target: Array
+    """(B, F) targets of the previous step."""
+    u_target: Array
+    """(B, 6)."""
+    removal_height: Array
+    """(B,) object's height when the table was removed."""
+    links_at_removal: Array
+    """(B,) links touching then."""
+    moved_at_removal: Array
+    """(B,) metres the object had moved by then."""
+    kept: Array
+    """(B,) bool: the object had not fallen `hold_steps` after the removal (the paper's success)."""
+    bad: Array
+    """(B,) bool: the physics diverged in this episode."""
+    sums: dict[str, Array]
+    """Sums (B,) over the episode."""
+    terms: Array
+    """(B, terms) sums of the reward's terms over the episode."""
+    finished: Array
+    """(B, fields) metrics of the episode that ended last, in the order of `EPISODE_FIELDS`."""
+    has_finished: Array
+    """(B,) bool: an episode ended since the flag was cleared."""
+
+
+class Score(NamedTuple):
+    """Result of one control step."""
+
+    reward: Array
+    """(B,)."""
+    terminal: Array
+    """(B,) bool: the episode ended with this step."""
+    terms: Array
+    """(B, terms) weighted reward terms."""
+
+
+def scene_state(env: EnvironmentState, readout: Readout, task: TaskConfig) -> SceneState:
+    """The moment as the task's formulas see it."""
+    return SceneState(
+        q=readout.q,
+        u=readout.u,
+        q_velocity=readout.q_velocity,
+        u_velocity=readout.u_velocity,
+        q_target=env.q_target,
+        u_target=env.u_target,
+        object_position=readout.object_position,
+        object_quaternion=readout.object_quaternion,
+        object_velocity=readout.object_velocity,
+        object_angular_velocity=readout.object_angular_velocity,
+        contact_force=readout.contact_force,
+        contact_position=readout.contact_position,
+        contact_found=readout.contact_found,
+        base_position=env.world.base_position,
+        base_quaternion=env.world.base_quaternion,
+        q_initial=env.world.q,
+        object_position_initial=env.world.object_position,
+        object_quaternion_initial=env.world.object_quaternion,
+        time=env.time.astype(jnp.float32),
+        table=table_present(env, task),
+    )
+
+
+def table_present(env: EnvironmentState, task: TaskConfig) -> Array:
+    """(B,) bool: whether the table stands in the coming control step."""
+    return (env.time < task.approach_steps) | task.stationary_object
+
+
+def start(hand: Hand, task: TaskConfig, taskset: TaskSet, key: Array, batch: int) -> EnvironmentState:
+    """Fresh episodes in every world."""
+    key, episode_key = jax.random.split(key)
+    world, goal, surface, hold = sample_episodes(hand, task, taskset, episode_key, batch)
+    return _fresh(key, world, goal, surface, hold, batch)
+
+
+def _fresh(key: Array, world: World, goal: Goal, surface: Surface, hold: Array, batch: int) -> EnvironmentState:
+    zero, no = jnp.zeros(batch), jnp.zeros(batch, bool)
+    return EnvironmentState(
+        key=key,
+        world=world,
+        goal=goal,
+        surface=surface,
+        time=jnp.zeros(batch, jnp.int32),
+        hold=hold,
+        q_target=world.q,
+        u_target=jnp.zeros((batch, 6)),
+        removal_height=world.object_position[:, 2],
+        links_at_removal=zero,
+        moved_at_removal=zero,
+        kept=no,
+        bad=no,
+        sums=dict.fromkeys(_SUMS, zero),
+        terms=jnp.zeros((batch, len(TERMS))),
+        finished=jnp.zeros((batch, len(EPISODE_FIELDS))),
+        has_finished=no,
+    )
+
+
+def restart(hand: Hand, task: TaskConfig, taskset: TaskSet, env: EnvironmentState, mask: Array) -> EnvironmentState:
+    """New episodes in the masked worlds (B,); the others are untouched."""
+    batch = mask.shape[0]
+    key, episode_key = jax.random.split(env.key)
+    world, goal, surface, hold = sample_episodes(hand, task, taskset, episode_key, batch)
+    fresh = _fresh(key, world, goal, surface, hold, batch)
+
+    def pick(new: Array, old: Array) -> Array:
+        return jnp.where(mask.reshape(-1, *([1] * (new.ndim - 1))), new, old)
+
+    merged = jax.tree.map(pick, fresh._replace(key=mask, finished=mask, has_finished=mask), env._replace(
+        key=mask, finished=mask, has_finished=mask
+    ))  # fmt: skip
+    return merged._replace(key=key, finished=env.finished, has_finished=env.has_finished)
+
+
+def sample_episodes(
+    hand: Hand, task: TaskConfig, taskset: TaskSet, key: Array, batch: int
+) -> tuple[World, Goal, Surface, Array]:
+    """Objects, resting poses, constraints and initial hands (paper, sections Training Setup and Hand Initialization).
+
+    Returns:
+      World, goal (after the priority rules), surface and hold length (B,) int.
+    """
+    keys = iter(jax.random.split(key, 10))
+    uniform = lambda: jax.random.uniform(next(keys), (batch,))  # noqa: E731
+    objects = jax.random.randint(next(keys), (batch,), 0, taskset.points.shape[0])
+    rests = jax.random.randint(next(keys), (batch,), 0, taskset.rest.shape[1])
+    affordance = (uniform() < task.p_affordance) & taskset.has_minus[objects]
+    variant = affordance.astype(jnp.int32)
+    available = taskset.has_pose[objects, variant, rests]
+    pose = (uniform() < task.p_pose) & available
+    trajectory = (uniform() < task.p_trajectory) & available
+    slot = jax.random.randint(next(keys), (batch,), 0, taskset.heading_index.shape[-1])
+    heading = taskset.heading_index[objects, variant, rests, slot]
+    slot = jax.random.randint(next(keys), (batch,), 0, taskset.pose_index.shape[-1])
+    reference = taskset.pose_index[objects, variant, rests, slot]
+
+    surface = Surface(taskset.points[objects], taskset.minus[objects])
+    asked = Goal(
+        heading_position=taskset.heading_position[objects, variant, heading],
+        heading_direction=taskset.heading_direction[objects, variant, heading],
+        heading_cross=taskset.heading_cross[objects, variant, heading],
+        pose_q=taskset.pose_q[objects, variant, reference],
+        pose_position=taskset.pose_position[objects, variant, reference],
+        pose_quaternion=taskset.pose_quaternion[objects, variant, reference],
+        trajectory_position=taskset.trajectory_position[objects, variant, reference],
+        trajectory_quaternion=taskset.trajectory_quaternion[objects, variant, reference],
+        mask=jnp.zeros((batch, len(MASKS))),
+    )
+    goal = resolve(hand, surface, Request(asked, affordance, pose, trajectory)).goal
+
+    rest = taskset.rest[objects, rests]
+    q = jnp.where(pose[:, None], goal.pose_q, jnp.array(hand.q_open))
+    base_position, base_quaternion = initial_wrist(hand, task, goal, q, trajectory, rest[:, :3], rest[:, 3:])
+    low, high = task.mass_range
+    friction_low, friction_high = task.friction_range
+    world = World(
+        object_index=objects,
+        mass_scale=low + (high - low) * uniform(),
+        friction=friction_low + (friction_high - friction_low) * uniform(),
+        base_position=base_position,
+        base_quaternion=base_quaternion,
+        q=q,
+        object_position=rest[:, :3],
+        object_quaternion=rest[:, 3:],
+        stationary=jnp.full(batch, task.stationary_object),
+    )
+    hold = jax.random.randint(next(keys), (batch,), task.hold_steps, task.hold_steps_max + 1)
+    return world, goal, surface, hold
+
+
+def initial_wrist(
+    hand: Hand,
+    task: TaskConfig,
+    goal: Goal,
+    q: Array,
+    trajectory: Array,
+    object_position: Array,
+    object_quaternion: Array,
+) -> tuple[Array, Array]:
+    """World wrist poses (B, 3), (B, 4) at the start: the first waypoint, or aligned with the heading and backed off."""
+    center = kinematics.hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)))
+    position, quaternion = heading_wrist_pose(hand, goal, center)
+    position = position - task.back_off * goal.heading_direction
+    position = jnp.where(trajectory[:, None], goal.trajectory_position[:, 0], position)
+    quaternion = jnp.where(trajectory[:, None], goal.trajectory_quaternion[:, 0], quaternion)
+    return rotations.compose_pose(object_position, object_quaternion, position, quaternion)
+
+
+def moment(
+    hand: Hand, task: TaskConfig, env: EnvironmentState, readout: Readout
+) -> tuple[SceneState, Features]:
+    """Scene state and features of the present moment."""
+    scene = scene_state(env, readout, task)
+    return scene, features(hand, task, scene, env.surface, env.goal)
+
+
+def score(
+    hand: Hand, task: TaskConfig, weights: RewardWeights, env: EnvironmentState, readout: Readout, action: Action
+) -> tuple[EnvironmentState, Score, SceneState, Features]:
+    """Reward and bookkeeping of a control step that physics has just made.
+
+    Args:
+      hand: the hand.
+      task: timing.
+      weights: reward weights, may be traced.
+      env: the worlds before the step.
+      readout: the worlds after it.
+      action: the joint targets of the step.
+
+    Returns:
+      The worlds after the step (episodes that ended are still in place), its score, and the moment after it.
+    """
+    had_table = table_present(env, task)
+    env = env._replace(
+        time=env.time + 1,
+        q_target=jnp.where(readout.bad[:, None], env.world.q, action.q_target),
+        u_target=jnp.where(readout.bad[:, None], 0.0, action.u_target),
+        bad=env.bad | readout.bad,
+    )
+    scene, seen = moment(hand, task, env, readout)
+    terms = reward_terms(hand, task, weights, scene, seen, env.goal)
+    terms["drop"] = jnp.where(env.bad, -weights.drop, terms["drop"])
+    stacked = jnp.stack([terms[name] for name in TERMS], -1)
+    reward = jnp.sum(stacked, -1)
+
+    removed_now = env.time == task.approach_steps
+    height = scene.object_position[:, 2]
+    links = jnp.sum(seen.touching, -1).astype(jnp.float32)
+    moved = jnp.linalg.norm(scene.object_position - scene.object_position_initial, axis=-1)
+    env = env._replace(
+        removal_height=jnp.where(removed_now, height, env.removal_height),
+        links_at_removal=jnp.where(removed_now, links, env.links_at_removal),
+        moved_at_removal=jnp.where(removed_now, moved, env.moved_at_removal),
+    )
+    up = (height > env.removal_height - task.drop_height) & ~fallen(task, scene) & ~env.bad & (env.links_at_removal > 0)
+    env = env._replace(kept=jnp.where(env.time == task.approach_steps + task.hold_steps, up, env.kept))
+
+    error = errors(hand, task, scene, seen, env.goal)
+    force = jnp.linalg.norm(seen.force, axis=-1)
+    before, after = had_table.astype(jnp.float32), 1.0 - had_table.astype(jnp.float32)
+    step = {name: getattr(error, name) * (before if name.startswith("trajectory") else after) for name in _WINDOWED}
+    step |= {
+        "return": reward,
+        "minus_links": error.minus_links * after,
+        "any_links": error.any_links * after,
+        "force_sum": jnp.sum(force, -1) * after,
+        "force_link_max": jnp.max(force, -1) * after,
+    }
+    env = env._replace(
+        sums={name: env.sums[name] + step[name] for name in _SUMS},
+        terms=env.terms + stacked,
+    )
+    terminal = env.time >= task.approach_steps + env.hold
+    finished = jnp.where(terminal[:, None], _episode(task, env, up), env.finished)
+    env = env._replace(finished=finished, has_finished=env.has_finished | terminal)
+    return env, Score(reward, terminal, stacked), scene, seen
+
+
+def _episode(task: TaskConfig, env: EnvironmentState, up: Array) -> Array:
+    """(B, fields) metrics of the present episodes, as if they ended now."""
+    length = env.time.astype(jnp.float32)
+    before = jnp.full_like(length, task.approach_steps)
+    after = jnp.maximum(length - task.approach_steps, 1.0)
+    metrics = {
+        "success": env.kept,
+        "held": env.kept & up,
+        "return": env.sums["return"],
+        "length": length,
+        "links_at_removal": env.links_at_removal,
+        "moved_at_removal": env.moved_at_removal,
+        **{name: env.sums[name] / (before if name.startswith("trajectory") else after) for name in _WINDOWED},
+        "affordance_ratio": env.sums["minus_links"] / jnp.maximum(env.sums["any_links"], 1.0),
+        "force_sum": env.sums["force_sum"] / after,
+        "force_link_max": env.sums["force_link_max"] / after,
+        "bad": env.bad,
+        **{f"mask_{name}": env.goal.mask[:, i] for i, name in enumerate(MASKS)},
+        "object_index": env.world.object_index,
+    }
+    values = jnp.stack([jnp.asarray(metrics[name], jnp.float32) for name in METRICS], -1)
+    return jnp.concatenate([values, env.terms], -1)

@@ -1,0 +1,79 @@
+"""What every physics engine offers: a batch of worlds with one hand and one object each.
+
+`warp` and `jax` are pure functions over pytrees that are traced into a compiled rollout; `native` steps MuJoCo C on
+threads and keeps its state in place. Both go through the same three calls.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+from common.task.types import Array
+
+
+class World(NamedTuple):
+    """What an episode starts from, for a batch of worlds B; world frame."""
+
+    object_index: Array
+    """(B,) int, index into the engine's objects."""
+    mass_scale: Array
+    """(B,) factor of the object's mass and inertia."""
+    friction: Array
+    """(B,) sliding friction of the object's geoms."""
+    base_position: Array
+    """(B, 3) initial wrist position: the wrist joints are zero there."""
+    base_quaternion: Array
+    """(B, 4)."""
+    q: Array
+    """(B, F) initial finger angles."""
+    object_position: Array
+    """(B, 3) resting position of the object's centre of mass."""
+    object_quaternion: Array
+    """(B, 4)."""
+    stationary: Array
+    """(B,) bool: the object is welded to where it is."""
+
+
+class Readout(NamedTuple):
+    """State of the worlds after a control step; see `common.task.types.SceneState` for shapes and frames."""
+
+    q: Array
+    u: Array
+    q_velocity: Array
+    u_velocity: Array
+    object_position: Array
+    object_quaternion: Array
+    object_velocity: Array
+    object_angular_velocity: Array
+    contact_force: Array
+    contact_position: Array
+    contact_found: Array
+    bad: Array
+    """(B,) bool: the world diverged in this step and was put back to its start (see `common.physics guard`)."""
+
+
+class Physics(Protocol):
+    """A batch of worlds. `state` is a pytree for compiled engines and an opaque handle for `native`."""
+
+    name: str
+    compiled: bool
+    """Whether the calls can be traced by JAX."""
+
+    def start(self, world: World) -> Any:
+        """State of fresh worlds."""
+
+    def reset(self, state: Any, mask: Array, world: World) -> Any:
+        """Worlds where mask (B,) is true start anew from `world`; the others go on."""
+
+    def step(self, state: Any, target: Array, table: Array) -> tuple[Any, Readout]:
+        """One control step with joint targets (B, 6 + F), wrist first; table (B,) says where the table stands."""
+
+    def read(self, state: Any) -> Readout:
+        """The worlds as they are, without contacts after a reset."""
+
+    def close(self) -> None:
+        """Releases threads and memory; safe to call twice."""
+
+
+MAX_SPEED = 400.0
+"""A joint faster than this (m/s or rad/s) marks a diverged world."""
+MAX_DISTANCE = 25.0
+"""A joint position beyond this (m or rad) marks a diverged world; free fall of 2 s stays below it."""

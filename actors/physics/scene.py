@@ -1,0 +1,131 @@
+"""The MuJoCo model of one scene: hand, object, table, the anchor that holds a stationary object, contact sensors."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from common.config import TaskConfig
+from common.hands.mjcf import HAND_CONTYPE, WRIST_JOINTS, add_hand
+from common.hands.spec import Hand
+from common.objects.mjcf import CONTACT, add_object
+from common.objects.spec import GraspObject
+from common.task.types import CONTACTS_PER_LINK
+
+OBJECT_CONTYPE = 2
+"""Collision bit of the object; the table answers to it."""
+TABLE_AWAY = (0.0, 0.0, -1000.0)
+"""Where the table goes when it is removed: a kilometre down, so that nothing reaches it again."""
+SENSOR_WIDTH = 13
+"""Numbers of one contact: found, force (3, contact frame), position (3), normal (3), tangent (3)."""
+_CONTACT_FIELDS = (
+    mujoco.mjtConDataField.mjCONDATA_FOUND,
+    mujoco.mjtConDataField.mjCONDATA_FORCE,
+    mujoco.mjtConDataField.mjCONDATA_POS,
+    mujoco.mjtConDataField.mjCONDATA_NORMAL,
+    mujoco.mjtConDataField.mjCONDATA_TANGENT,
+)
+_STRONGEST = 2  # reduce="maxforce"
+
+
+@dataclasses.dataclass(frozen=True)
+class Addresses:
+    """Where a compiled scene keeps what the task reads and writes."""
+
+    wrist_qpos: np.ndarray
+    finger_qpos: np.ndarray
+    object_qpos: np.ndarray
+    wrist_qvel: np.ndarray
+    finger_qvel: np.ndarray
+    object_qvel: np.ndarray
+    base_body: int
+    object_body: int
+    table_mocap: int
+    anchor_mocap: int
+    weld: int
+
+
+def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
+    """Hand, table, anchor and options, without an object."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = task.control_dt / task.substeps
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    spec.option.iterations = 6
+    spec.option.ls_iterations = 12
+    add_hand(spec, hand)
+    table = spec.worldbody.add_body(name="table", mocap=True)
+    table.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=(0.0, 0.0, -0.05),
+        size=(0.6, 0.6, 0.05),
+        contype=0,
+        conaffinity=OBJECT_CONTYPE | (HAND_CONTYPE if task.hand_table_collision else 0),
+        condim=CONTACT.condim,
+        friction=CONTACT.friction,
+        solref=CONTACT.solref,
+    )
+    spec.worldbody.add_body(name="anchor", mocap=True)
+    return spec
+
+
+def finish_spec(spec: mujoco.MjSpec, hand: Hand) -> None:
+    """The weld of the stationary phase and the contact sensors; the object is in its place already."""
+    spec.add_equality(
+        name="hold",
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1="anchor",
+        name2="object",
+        active=False,
+        data=[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0],  # anchor, relative pose, torque scale
+        solref=(0.005, 1.0),
+    )
+    fields = sum(1 << int(field) for field in _CONTACT_FIELDS)
+    for link in hand.links:
+        spec.add_sensor(
+            name=f"contact_{link.name}",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=link.name,
+            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            refname="object",
+            intprm=[fields, _STRONGEST, CONTACTS_PER_LINK],
+        )
+
+
+def compile_scene(hand: Hand, task: TaskConfig, obj: GraspObject) -> mujoco.MjModel:
+    """The scene with one object, as `native` uses it."""
+    spec = scene_spec(hand, task)
+    add_object(spec, obj, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE)
+    finish_spec(spec, hand)
+    return spec.compile()
+
+
+def addresses(model: mujoco.MjModel, hand: Hand) -> Addresses:
+    """Indices by name, in the order of u, q and the object's free joint."""
+
+    def joint(name: str) -> tuple[int, int]:
+        index = model.joint(name).id
+        return model.jnt_qposadr[index], model.jnt_dofadr[index]
+
+    wrist = np.array([joint(name) for name in WRIST_JOINTS])
+    fingers = np.array([joint(j.name) for j in hand.joints])
+    body = model.body("object")
+    qpos, qvel = model.jnt_qposadr[body.jntadr[0]], model.jnt_dofadr[body.jntadr[0]]
+    return Addresses(
+        wrist_qpos=wrist[:, 0],
+        finger_qpos=fingers[:, 0],
+        object_qpos=np.arange(qpos, qpos + 7),
+        wrist_qvel=wrist[:, 1],
+        finger_qvel=fingers[:, 1],
+        object_qvel=np.arange(qvel, qvel + 6),
+        base_body=model.body("hand_base").id,
+        object_body=body.id,
+        table_mocap=int(model.body("table").mocapid[0]),
+        anchor_mocap=int(model.body("anchor").mocapid[0]),
+        weld=model.equality("hold").id,
+    )

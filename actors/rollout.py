@@ -1,0 +1,224 @@
+"""Rollouts: policy, decode, physics, reward and reset for T control steps of a batch of worlds.
+
+With a compiled engine the whole rollout is one program (`jax.lax.scan`); with `native` the same functions are
+compiled piecewise around the C step.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from actors import environment
+from actors.environment import EPISODE_FIELDS, EnvironmentState
+from actors.physics.engine import Physics
+from actors.taskset import TaskSet
+from common.config import TaskConfig
+from common.hands.spec import Hand
+from common.task.control import decode
+from common.task.features import Features
+from common.task.observation import observe
+from common.task.reward import TERMS
+from common.task.types import Action, Array, Goal, SceneState
+
+Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
+"""(parameters, observation (B, D) float32, random key) -> action (B, A), log-probability (B,)."""
+
+
+class Trace(NamedTuple):
+    """What is kept of world 0 at every step, for logs and pictures (T leads)."""
+
+    q: Array
+    u: Array
+    q_target: Array
+    u_target: Array
+    wrist_position: Array
+    wrist_quaternion: Array
+    object_position: Array
+    object_quaternion: Array
+    contact_force: Array
+    """(T, L, 3) net force on each link, world frame, N."""
+    action: Array
+    terms: Array
+    """(T, terms) weighted reward terms."""
+    table: Array
+    terminal: Array
+
+
+class Rollout(NamedTuple):
+    """T control steps of B worlds."""
+
+    observation: Array
+    """(T, B, D)."""
+    action: Array
+    """(T, B, A)."""
+    log_probability: Array
+    """(T, B) under the behaviour policy."""
+    reward: Array
+    """(T, B)."""
+    terminal: Array
+    """(T, B) bool."""
+    last_observation: Array
+    """(B, D)."""
+    episodes: Array
+    """(B, fields) metrics of the last episode that ended in each world, in the order of `EPISODE_FIELDS`."""
+    has_episode: Array
+    """(B,) bool."""
+    trace: Trace
+
+
+class RolloutWorker:
+    """Worlds that go on from one rollout to the next."""
+
+    def __init__(
+        self,
+        hand: Hand,
+        task: TaskConfig,
+        physics: Physics,
+        taskset: TaskSet,
+        policy: Policy,
+        *,
+        batch: int,
+        seed: int,
+        half: bool,
+    ):
+        """Starts fresh episodes.
+
+        Args:
+          hand: the hand.
+          task: the task.
+          physics: the engine; its objects are those of `taskset`.
+          taskset: what episodes are drawn from.
+          policy: a pure function; parameters are given at each rollout.
+          batch: B, number of worlds.
+          seed: seed of episodes and actions.
+          half: observations are rounded to float16, for the policy as well as for the learner.
+        """
+        self._hand, self._task, self._physics, self._taskset, self._policy = hand, task, physics, taskset, policy
+        self._dtype = jnp.float16 if half else jnp.float32
+        self._weights, self._control = task.reward, task.control
+        episode_key, self._key = jax.random.split(jax.random.key(seed))
+        self.env: EnvironmentState = jax.jit(
+            functools.partial(environment.start, hand, task, batch=batch), static_argnames=()
+        )(taskset, episode_key)
+        self._state = physics.start(self.env.world)
+        self._act_jit = jax.jit(self._act)
+        self._score_jit = jax.jit(functools.partial(environment.score, hand, task))
+        self._restart_jit = jax.jit(functools.partial(environment.restart, hand, task))
+        self._moment_jit = jax.jit(functools.partial(environment.moment, hand, task))
+        self._observe_jit = jax.jit(lambda scene, seen, goal: observe(task, scene, seen, goal).astype(self._dtype))
+        self._scan_jit = jax.jit(self._scan, static_argnames="steps")
+        self._moment: tuple[SceneState, Features] = self._moment_jit(self.env, physics.read(self._state))
+
+    def collect(self, parameters: Any, steps: int) -> Rollout:
+        """The next `steps` control steps under these policy parameters."""
+        self._key, key = jax.random.split(self._key)
+        self.env = self.env._replace(has_finished=jnp.zeros_like(self.env.has_finished))
+        run = self._collect_compiled if self._physics.compiled else self._collect_stepwise
+        return run(parameters, key, steps)
+
+    def _act(
+        self, parameters: Any, control: Any, env: EnvironmentState, scene: SceneState, seen: Features, key: Array
+    ) -> tuple[Array, Array, Array, Action, Array]:
+        observation = observe(self._task, scene, seen, env.goal).astype(self._dtype)
+        action, log_probability = self._policy(parameters, observation.astype(jnp.float32), key)
+        target = decode(self._hand, control, scene, seen, env.goal, action)
+        joints = jnp.concatenate([target.u_target, target.q_target], -1)
+        return observation, action, log_probability, target, joints
+
+    def _collect_stepwise(self, parameters: Any, key: Array, steps: int) -> Rollout:
+        scene, seen = self._moment
+        rows, traces = [], []
+        for step_key in jax.random.split(key, steps):
+            env = self.env
+            observation, action, log_probability, target, joints = self._act_jit(
+                parameters, self._control, env, scene, seen, step_key
+            )
+            self._state, readout = self._physics.step(
+                self._state, np.asarray(joints), np.asarray(environment.table_present(env, self._task))
+            )
+            self.env, score, scene, seen = self._score_jit(self._weights, env, readout, target)
+            rows.append((observation, action, log_probability, score.reward, score.terminal))
+            traces.append((scene, seen, action, score))
+            if bool(np.any(score.terminal)):
+                self.env = self._restart_jit(self._taskset, self.env, score.terminal)
+                self._state = self._physics.reset(self._state, score.terminal, self.env.world)
+                scene, seen = self._moment_jit(self.env, self._physics.read(self._state))
+        self._moment = scene, seen
+        columns = [np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)]
+        trace = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *(_trace(*t) for t in traces))
+        last = self._observe_jit(scene, seen, self.env.goal)
+        return Rollout(*columns, last, self.env.finished, self.env.has_finished, trace)
+
+    def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
+        carry = (self.env, self._state, self._moment)
+        carry, rollout = self._scan_jit(
+            parameters, self._weights, self._control, self._taskset, carry, key, steps=steps
+        )
+        self.env, self._state, self._moment = carry
+        return rollout
+
+    def _scan(
+        self, parameters: Any, weights: Any, control: Any, taskset: TaskSet, carry: Any, key: Array, steps: int
+    ) -> tuple[Any, Rollout]:
+        physics = self._physics
+
+        def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
+            env, state, (scene, seen) = carry
+            observation, action, log_probability, target, joints = self._act(
+                parameters, control, env, scene, seen, step_key
+            )
+            state, readout = physics.step(state, joints, environment.table_present(env, self._task))
+            env, score, scene, seen = environment.score(self._hand, self._task, weights, env, readout, target)
+            kept = _trace(scene, seen, action, score)
+
+            def renew(operand: Any) -> Any:
+                env, state, _ = operand
+                env = environment.restart(self._hand, self._task, taskset, env, score.terminal)
+                state = physics.reset(state, score.terminal, env.world)
+                return env, state, environment.moment(self._hand, self._task, env, physics.read(state))
+
+            carry = jax.lax.cond(jnp.any(score.terminal), renew, lambda x: x, (env, state, (scene, seen)))
+            return carry, (observation, action, log_probability, score.reward, score.terminal, kept)
+
+        carry, (*columns, trace) = jax.lax.scan(body, carry, jax.random.split(key, steps))
+        env, _, (scene, seen) = carry
+        last = observe(self._task, scene, seen, env.goal).astype(self._dtype)
+        return carry, Rollout(*columns, last, env.finished, env.has_finished, trace)
+
+
+def _trace(scene: SceneState, seen: Features, action: Array, score: environment.Score) -> Trace:
+    contact = jnp if isinstance(scene.contact_force, jax.core.Tracer) else np
+    force = contact.sum(contact.where(scene.contact_found[0][..., None], scene.contact_force[0], 0.0), -2)
+    return Trace(
+        q=scene.q[0],
+        u=scene.u[0],
+        q_target=scene.q_target[0],
+        u_target=scene.u_target[0],
+        wrist_position=seen.wrist_position[0],
+        wrist_quaternion=seen.wrist_quaternion[0],
+        object_position=scene.object_position[0],
+        object_quaternion=scene.object_quaternion[0],
+        contact_force=force,
+        action=action[0],
+        terms=score.terms[0],
+        table=scene.table[0],
+        terminal=score.terminal[0],
+    )
+
+
+def goal_of_world(goal: Goal, index: int = 0) -> Goal:
+    """The goal of one world, without the batch axis, as NumPy."""
+    return Goal(*(np.asarray(field)[index] for field in goal))
+
+
+def finished_episodes(rollout: Rollout) -> dict[str, np.ndarray]:
+    """Metrics (E,) of the E episodes that ended, by the names in `EPISODE_FIELDS`."""
+    rows = np.asarray(rollout.episodes)[np.asarray(rollout.has_episode)]
+    return dict(zip(EPISODE_FIELDS, rows.T, strict=True))
+
+
+__all__ = ["TERMS", "Policy", "Rollout", "RolloutWorker", "Trace", "finished_episodes", "goal_of_world"]

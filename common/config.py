@@ -1,0 +1,244 @@
+"""Everything that can be set, as frozen dataclasses; the string under a field is its help on the command line.
+
+A run is described by one `RunConfig`. It travels as JSON: the learner keeps it in the run directory and hands it to
+every actor that connects, so that an actor needs no other argument than an address.
+"""
+
+import dataclasses
+import hashlib
+import json
+from typing import Any, Literal
+
+import dacite
+
+from common.errors import CongraspError
+
+PhysicsName = Literal["auto", "warp", "jax", "native"]
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardWeights:
+    """Weights of the reward's terms, all in units of reward per control step (paper, section Reward Function)."""
+
+    distance: float = 0.3
+    """w_dis: per metre of the weighted distance from the hand's keypoints to the object's surface."""
+    contact: float = 1.0
+    """w_c: for all links in contact (shared out by the links' contact weights, which sum to one)."""
+    force: float = 0.5
+    """w_f: for all links pressing with `force_max` or more."""
+    force_max: float = 5.0
+    """f_max, N per link: force beyond it earns nothing."""
+    force_excess: float = 0.01
+    """Penalty per newton above `force_max`, per link (ours: the paper only clamps, and hands then squeeze hard)."""
+    object_position: float = 20.0
+    """w_o: per square metre of the object's displacement (clipped at 0.04 m^2)."""
+    object_rotation: float = 0.1
+    """w_R: per square radian of the object's rotation (clipped at 4 rad^2)."""
+    wrist_velocity: float = 0.01
+    """w_u: per squared velocity of the six wrist joints (m/s and rad/s)."""
+    finger_deviation: float = 0.002
+    """w_q of the regulariser: per squared radian from the initial finger pose."""
+    drop: float = 1.0
+    """w_drop: per step with the object fallen."""
+    heading_direction: float = 0.3
+    """w_dir: for the heading axis along the target direction (cosine)."""
+    heading_position: float = 3.0
+    """w_pos: per metre between hand centre and heading position."""
+    pose_finger: float = 0.1
+    """w_q of the pose term: per squared radian of the finger joints, gated by the hand's distance."""
+    pose_link: float = 5.0
+    """w_x: per square metre of the finger links' positions, gated by the hand's distance."""
+    pose_wrist_position: float = 20.0
+    """w_p: per square metre of the wrist's position."""
+    pose_wrist_rotation: float = 0.5
+    """w_R of the pose term: per square radian of the wrist's rotation."""
+    trajectory_position: float = 20.0
+    """w_traj-p: per square metre between the wrist and the active waypoint."""
+    trajectory_rotation: float = 0.5
+    """w_traj-q: per square radian between the wrist and the active waypoint."""
+    affordance_distance: float = 0.05
+    """w_d: for each unit of softplus((m - d)/tau) near the non-grasping region."""
+    affordance_force: float = 0.1
+    """w_f of the affordance term: per newton on the non-grasping region (clipped at 10 N per link)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlConfig:
+    """How actions become joint targets (paper, section Control Space)."""
+
+    finger_scale: float = 0.1
+    """alpha_f, rad per unit of action and control step."""
+    wrist_position_scale: float = 0.02
+    """alpha_w of the three slides, m per unit of action."""
+    wrist_rotation_scale: float = 0.1
+    """alpha_w of the three hinges, rad per unit of action."""
+    guidance_position_limit: float = 0.08
+    """The guidance target is at most this far ahead of the wrist, m."""
+    guidance_rotation_limit: float = 0.5
+    """The guidance target is at most this far ahead of the wrist, rad."""
+    lookahead: int = 1
+    """Waypoints ahead of the nearest one that the guidance aims at (0 is the paper's ablation without feed-forward)."""
+    follow_object: bool = False
+    """Guidance on the object's current pose instead of its pose at the start of the episode."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskConfig:
+    """The task: hand, timing, observation, control, reward and constraint sampling."""
+
+    hand: str = "human"
+    """Name of the hand."""
+    control_dt: float = 0.01
+    """Seconds between two actions."""
+    substeps: int = 4
+    """Physics steps in one control step."""
+    approach_steps: int = 50
+    """Control steps before the table is removed."""
+    hold_steps: int = 25
+    """Control steps without the table that count for success (and the least in training)."""
+    hold_steps_max: int = 25
+    """Training draws the hold's length between `hold_steps` and this."""
+    stationary_object: bool = False
+    """The paper's first phase: the object is held in place and the table stays."""
+    dynamic_center: bool = True
+    """Hand centre from the live fingertips; false is the paper's ablation with a centre fixed in the wrist frame."""
+    hand_table_collision: bool = False
+    """Whether the hand collides with the table."""
+    back_off: float = 0.15
+    """Metres from the aligned wrist to its start, against the heading direction."""
+    surface_points: int = 256
+    """Surface points of an object that the policy senses (at most 512)."""
+    trajectory_points: int = 15
+    """K, waypoints of a wrist trajectory."""
+    p_affordance: float = 0.5
+    """Probability that an episode has an affordance constraint (objects with parts only)."""
+    p_pose: float = 0.5
+    """Probability that an episode has a reference pose."""
+    p_trajectory: float = 0.5
+    """Probability that an episode has a wrist trajectory."""
+    headings: Literal["all", "above"] = "all"
+    """`above` keeps approach directions within 30 degrees of straight down (easier)."""
+    mass_range: tuple[float, float] = (1.0, 1.0)
+    """Factors of the object's mass, uniform at every reset."""
+    friction_range: tuple[float, float] = (1.0, 1.0)
+    """Sliding friction between the hand and the object, uniform at every reset."""
+    drop_height: float = 0.05
+    """The object has fallen when it is this far (m) below its height at the table's removal."""
+    control: ControlConfig = ControlConfig()
+    """How actions become joint targets."""
+    reward: RewardWeights = RewardWeights()
+    """The reward's weights."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectsConfig:
+    """Which objects a run uses."""
+
+    families: tuple[str, ...] = ()
+    """Families of the procedural generator; empty means all."""
+    count: int = 64
+    """Procedural objects in one actor's pool."""
+    seed: int = 0
+    """First seed; actors shift it so that each has its own objects. Evaluation uses seeds from one million upward."""
+    folder: str = ""
+    """A folder of imported objects to use instead of procedural ones."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the policy's and the critic's networks (they share no weights)."""
+
+    hidden: tuple[int, ...] = (512, 256, 128)
+    """Units of the trunk's layers."""
+    encoder: int = 64
+    """Units of each optional constraint's encoder."""
+    initial_std: float = 0.6
+    """Standard deviation of the action at the start, in units of action."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """Decoupled PPO (Hilton et al. 2021, arXiv 2110.00641) with adaptive-KL learning rate."""
+
+    rollouts_per_update: int = 2
+    """Rollout messages that one update consumes (the batch)."""
+    epochs: int = 4
+    """Passes over the batch."""
+    minibatches: int = 16
+    """Minibatches in one pass."""
+    clip: float = 0.2
+    """Clip of pi/pi_proximal."""
+    importance_max: float = 4.0
+    """Truncation of pi_proximal/pi_behaviour."""
+    gamma: float = 0.98
+    """Discount."""
+    gae_lambda: float = 0.95
+    """Lambda of the generalised advantage estimate."""
+    learning_rate: float = 5e-4
+    """Adam's rate at the start."""
+    learning_rate_range: tuple[float, float] = (1e-5, 3e-3)
+    """Bounds of the adaptive rate."""
+    kl_target: float = 0.012
+    """The rate falls above twice this and rises below half of it."""
+    entropy: float = 0.0
+    """Weight of the entropy bonus."""
+    value_coefficient: float = 0.5
+    """Weight of the value loss."""
+    max_grad_norm: float = 1.0
+    """Global norm at which gradients are clipped."""
+    reward_scale: float = 0.1
+    """Factor on rewards before returns are made."""
+    max_staleness: int = 1
+    """eta: versions by which an accepted rollout may be behind the update that uses it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """One training run."""
+
+    name: str = "run"
+    """Name of the run; it is part of every key on the wire."""
+    seed: int = 0
+    """Seed of networks, minibatches and environments."""
+    environments: int = 64
+    """Environments in one actor."""
+    rollout_steps: int = 75
+    """Control steps in one rollout message."""
+    updates: int = 1000
+    """Updates after which the run ends."""
+    physics: PhysicsName = "auto"
+    """Physics engine of the actors."""
+    half_observations: bool = True
+    """Observations travel (and are acted on) as float16."""
+    checkpoint_every: int = 25
+    """Updates between two checkpoints."""
+    episode_every: int = 10
+    """Rollouts of an actor between two episodes that it publishes for logs."""
+    task: TaskConfig = TaskConfig()
+    """The task."""
+    objects: ObjectsConfig = ObjectsConfig()
+    """The objects."""
+    network: NetworkConfig = NetworkConfig()
+    """The networks."""
+    ppo: PPOConfig = PPOConfig()
+    """The learner's algorithm."""
+
+
+def to_json(config: Any) -> str:
+    """A configuration dataclass as JSON text."""
+    return json.dumps(dataclasses.asdict(config), indent=2, sort_keys=True)
+
+
+def run_config_from_json(text: str | bytes) -> RunConfig:
+    """The inverse of `to_json` for a `RunConfig`; unknown keys and wrong types are errors that name the key."""
+    try:
+        return dacite.from_dict(RunConfig, json.loads(text), dacite.Config(strict=True, cast=[tuple, float]))
+    except json.JSONDecodeError as error:
+        raise CongraspError(f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'.") from None
+    except dacite.DaciteError as error:
+        raise CongraspError(f"The configuration does not fit this version: {error}.") from None
+
+
+def digest(config: Any) -> str:
+    """Sixteen hex digits that identify a configuration's content."""
+    return hashlib.sha256(to_json(config).encode()).hexdigest()[:16]

@@ -1,0 +1,108 @@
+"""Reference poses made by closing the hand around an object without physics.
+
+They stand in for final states of a trained policy's grasps until there is one (`poses_from_grasps`): the wrist is put
+where the heading wants it, and every finger closes until its skin meets the surface.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from common import rotations
+from common.hands import kinematics
+from common.hands.spec import Hand
+from common.task.control import heading_wrist_pose
+from common.task.features import squared_distances
+from common.task.types import Array, Goal
+
+_STEPS = 24
+
+
+class Poses(NamedTuple):
+    """Reference poses, any number M, in the object frame."""
+
+    q: Array
+    """(M, F) finger angles."""
+    position: Array
+    """(M, 3) wrist."""
+    quaternion: Array
+    """(M, 4) wrist."""
+
+
+@functools.cache
+def _fingers(hand: Hand) -> tuple[np.ndarray, np.ndarray, int]:
+    """Finger index of every joint (F,) and of every keypoint (P,; -1 for the palm), and the number of fingers."""
+    parent = {link.name: link.parent for link in hand.links}
+
+    def root(name: str) -> str:
+        while parent[name] != hand.links[0].name:
+            name = parent[name]
+        return name
+
+    roots = sorted({root(link.name) for link in hand.links[1:]})
+    of_link = [-1, *(roots.index(root(link.name)) for link in hand.links[1:])]
+    joints = [of_link[i] for i, link in enumerate(hand.links) for _ in link.joints]
+    return np.array(joints), np.array([of_link[i] for i in hand.keypoint_links]), len(roots)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def closed_poses(
+    hand: Hand, points: Array, normals: Array, heading_position: Array, direction: Array, cross: Array
+) -> Poses:
+    """Poses at M headings on one object.
+
+    Args:
+      hand: the hand.
+      points: (N, 3) surface points in the object frame.
+      normals: (N, 3) outward unit normals.
+      heading_position: (M, 3) p-bar.
+      direction: (M, 3) v-bar.
+      cross: (M, 3) direction of the cross-finger axis.
+    """
+    count = direction.shape[0]
+    joint_finger, point_finger, fingers = _fingers(hand)
+    radii = jnp.array(hand.keypoint_radii)
+    q_open, q_closed = jnp.array(hand.q_open), jnp.array(hand.q_closed)
+    zeros = jnp.zeros((count, 1, 3))
+    goal = Goal(
+        heading_position, direction, cross, q_open, zeros[:, 0], zeros[:, 0], zeros, zeros, jnp.zeros((count, 4))
+    )
+
+    def close(center: Array) -> Array:
+        position, quaternion = heading_wrist_pose(hand, goal, center)
+
+        def clear(fraction: Array) -> Array:
+            """(M, fingers) bool: fingers at this fraction of their way do not reach into the object."""
+            q = q_open + fraction * (q_closed - q_open)
+            own = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
+            here = rotations.transform(position, quaternion, jnp.broadcast_to(own, (count, *own.shape)))
+            nearest = jnp.argmin(squared_distances(here, jnp.broadcast_to(points, (count, *points.shape))), -1)
+            offset = here - points[nearest]
+            inside = jnp.sum(offset * normals[nearest], -1) < 0
+            gap = jnp.where(inside, -1.0, jnp.linalg.norm(offset, axis=-1)) - radii
+            return jnp.stack(
+                [jnp.all(jnp.where(point_finger == k, gap, 1.0) > 0, -1) for k in range(fingers)], -1
+            )
+
+        fractions = jnp.linspace(0.0, 1.0, _STEPS)
+        free = jax.lax.map(clear, fractions)
+        closed = jnp.sum(jnp.cumprod(free, 0), 0)  # steps before the first touch
+        fraction = fractions[jnp.clip(closed, 0, _STEPS - 1)]
+        return q_open + fraction[:, joint_finger] * (q_closed - q_open)
+
+    open_center = jnp.broadcast_to(jnp.array(kinematics.grasp_frame(hand).center), (count, 3))
+    q = close(open_center)
+    # Closing moves the hand centre; put the wrist back so that it lies on the heading position, and close again.
+    center = kinematics.hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)))
+    q = close(center)
+    position, quaternion = heading_wrist_pose(hand, goal, center)
+    return Poses(q, position, quaternion)
+
+
+def poses_from_grasps(q: Array, wrist: tuple[Array, Array], obj: tuple[Array, Array]) -> Poses:
+    """Reference poses from final states of successful grasps: world poses of wrist and object, (M, 3) and (M, 4)."""
+    position, quaternion = rotations.relative_pose(*obj, *wrist)
+    return Poses(q, position, quaternion)

@@ -1,0 +1,133 @@
+"""Forward kinematics by the product of exponentials, the grasp frame and the hand centre.
+
+Everything is in the wrist frame. A link's frame at zero has the wrist frame's orientation and its origin at
+`common.hands.spec.link_origin`.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from common import rotations
+from common.hands.spec import Hand, link_origin
+from common.task.types import Array
+
+_EXACT = jax.lax.Precision.HIGHEST
+
+
+class _Chain(NamedTuple):
+    """Joints grouped by depth: `levels[d]` holds joint indices whose parents (-1: the palm) are one level up."""
+
+    levels: tuple[tuple[int, ...], ...]
+    parents: tuple[int, ...]
+    link_joint: tuple[int, ...]  # the last joint that moves each link, -1 for the palm
+
+
+class GraspFrame(NamedTuple):
+    """The hand's local grasping coordinates in the wrist frame, from the open pose (paper, section Hand Modeling)."""
+
+    heading: np.ndarray
+    """(3,) v, unit: forward from the middle of the opening, orthogonal to w."""
+    cross: np.ndarray
+    """(3,) w, unit: from the thumb's tip to the mean of the other tips."""
+    center: np.ndarray
+    """(3,) the hand centre p of the open hand, m (the fixed centre of the paper's ablation)."""
+    opening: float
+    """Distance between the thumb's tip and the mean of the others, m."""
+
+
+@functools.cache
+def _chain(hand: Hand) -> _Chain:
+    index = {link.name: i for i, link in enumerate(hand.links)}
+    parents: list[int] = []
+    last: list[int] = []
+    depth: list[int] = []
+    for link in hand.links:
+        tail = last[index[link.parent]] if link.parent else -1
+        for _ in link.joints:
+            parents.append(tail)
+            depth.append(depth[tail] + 1 if tail >= 0 else 0)
+            tail = len(parents) - 1
+        last.append(tail)
+    levels = tuple(tuple(j for j, d in enumerate(depth) if d == level) for level in range(max(depth) + 1))
+    return _Chain(levels, tuple(parents), tuple(last))
+
+
+def link_transforms(hand: Hand, q: Array) -> tuple[Array, Array]:
+    """Motion of every link from the zero pose: x = rotation @ x0 + translation, for points x0 at zero.
+
+    Args:
+      hand: the hand.
+      q: (..., F) finger angles.
+
+    Returns:
+      Rotations (..., L, 3, 3) and translations (..., L, 3) in the wrist frame.
+    """
+    chain = _chain(hand)
+    axes = jnp.array([joint.axis for joint in hand.joints])
+    anchors = jnp.array([joint.anchor for joint in hand.joints])
+    local = rotations.axis_rotation(jnp.broadcast_to(axes, (*q.shape, 3)), q)
+    offset = anchors - jnp.einsum("...ij,...j->...i", local, anchors, precision=_EXACT)
+    batch = q.shape[:-1]
+    done_r = jnp.broadcast_to(jnp.eye(3), (*batch, 1, 3, 3))
+    done_t = jnp.zeros((*batch, 1, 3))
+    place = {-1: 0}
+    for level in chain.levels:
+        above = np.array([place[chain.parents[j]] for j in level])
+        parent_r, parent_t = done_r[..., above, :, :], done_t[..., above, :]
+        here = np.array(level)
+        r = jnp.matmul(parent_r, local[..., here, :, :], precision=_EXACT)
+        t = parent_t + jnp.einsum("...ij,...j->...i", parent_r, offset[..., here, :], precision=_EXACT)
+        place.update({j: done_t.shape[-2] + k for k, j in enumerate(level)})
+        done_r = jnp.concatenate([done_r, r], -3)
+        done_t = jnp.concatenate([done_t, t], -2)
+    order = np.array([place[j] for j in chain.link_joint])
+    return done_r[..., order, :, :], done_t[..., order, :]
+
+
+def keypoints(hand: Hand, transforms: tuple[Array, Array]) -> Array:
+    """(..., P, 3) link origins and fingertips, from `link_transforms`."""
+    rotation, translation = transforms
+    carrier = hand.keypoint_links
+    return (
+        jnp.einsum("...pij,pj->...pi", rotation[..., carrier, :, :], jnp.array(hand.keypoints), precision=_EXACT)
+        + translation[..., carrier, :]
+    )
+
+
+def link_poses(hand: Hand, q: Array) -> tuple[Array, Array]:
+    """Origins (..., L, 3) and orientations (..., L, 4) of the links' frames."""
+    rotation, translation = link_transforms(hand, q)
+    origins = jnp.array([link_origin(link) for link in hand.links])
+    return (
+        jnp.einsum("...lij,lj->...li", rotation, origins, precision=_EXACT) + translation,
+        rotations.from_matrix(rotation),
+    )
+
+
+def hand_center(hand: Hand, points: Array) -> Array:
+    """(..., 3) the dynamic hand centre: middle between the thumb's tip and the mean of the other tips.
+
+    Args:
+      hand: the hand.
+      points: (..., P, 3) from `keypoints`.
+    """
+    tips = points[..., len(hand.links) :, :]
+    return 0.5 * (tips[..., 0, :] + jnp.mean(tips[..., 1:, :], -2))
+
+
+@functools.cache
+def grasp_frame(hand: Hand) -> GraspFrame:
+    """The grasp frame of the open hand; v is the direction from the wrist to the centre, made orthogonal to w."""
+    with jax.ensure_compile_time_eval():
+        points = np.asarray(keypoints(hand, link_transforms(hand, jnp.array(hand.q_open))))
+        center = np.asarray(hand_center(hand, jnp.array(points)))
+    tips = points[len(hand.links) :]
+    across = tips[1:].mean(0) - tips[0]
+    opening = float(np.linalg.norm(across))
+    cross = across / opening
+    forward = center - (center @ cross) * cross
+    return GraspFrame(forward / np.linalg.norm(forward), cross, center, opening)

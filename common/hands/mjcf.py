@@ -1,0 +1,89 @@
+"""A hand as MuJoCo bodies: virtual wrist, links with capsules, and position actuators."""
+
+import mujoco
+import numpy as np
+
+from common.hands.spec import Hand, Link, link_origin
+
+HAND_CONTYPE = 1
+"""Collision bit of the hand: whatever collides with it has this bit in its conaffinity."""
+WRIST_JOINTS = ("wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz")
+
+
+def add_hand(spec: mujoco.MjSpec, hand: Hand) -> mujoco.MjsBody:
+    """Adds the hand under a fixed body `hand_base` and returns that body.
+
+    The base carries three slides (x, y, z) and three hinges (intrinsic x-y-z) of the first link; their origin is the
+    initial wrist pose, so that all six start at zero. Actuators are in the order of (u, q). Gravity on the hand is
+    compensated, because the wrist is a virtual mount.
+    """
+    base = spec.worldbody.add_body(name="hand_base")
+    bodies: dict[str, mujoco.MjsBody] = {}
+    for link in hand.links:
+        parent = bodies[link.parent] if link.parent else base
+        parent_origin = np.array(link_origin(next(x for x in hand.links if x.name == link.parent)) if link.parent else 0)
+        origin = np.array(link_origin(link))
+        body = parent.add_body(name=link.name, pos=origin - parent_origin, gravcomp=1.0)
+        bodies[link.name] = body
+        if not link.parent:
+            _add_wrist(spec, body, hand)
+        for joint in link.joints:
+            body.add_joint(
+                name=joint.name,
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=joint.axis,
+                pos=np.array(joint.anchor) - origin,
+                range=(joint.lower, joint.upper),
+                limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+                damping=joint.damping,
+                armature=joint.armature,
+            )
+            _add_position_actuator(spec, joint.name, joint.kp, joint.kv, joint.torque_limit)
+        _add_capsules(body, link, origin)
+    return base
+
+
+def _add_wrist(spec: mujoco.MjSpec, body: mujoco.MjsBody, hand: Hand) -> None:
+    gains = hand.wrist
+    for i, name in enumerate(WRIST_JOINTS):
+        slide = i < 3
+        body.add_joint(
+            name=name,
+            type=mujoco.mjtJoint.mjJNT_SLIDE if slide else mujoco.mjtJoint.mjJNT_HINGE,
+            axis=np.eye(3)[i % 3],
+            armature=gains.slide_armature if slide else gains.hinge_armature,
+        )
+        _add_position_actuator(
+            spec,
+            name,
+            gains.slide_kp if slide else gains.hinge_kp,
+            gains.slide_kv if slide else gains.hinge_kv,
+            gains.slide_limit if slide else gains.hinge_limit,
+        )
+
+
+def _add_position_actuator(spec: mujoco.MjSpec, joint: str, kp: float, kv: float, limit: float) -> None:
+    actuator = spec.add_actuator(
+        name=joint,
+        target=joint,
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        forcerange=(-limit, limit),
+        forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+    )
+    actuator.set_to_position(kp, kv=kv)
+
+
+def _add_capsules(body: mujoco.MjsBody, link: Link, origin: np.ndarray) -> None:
+    lengths = [np.linalg.norm(np.subtract(c.end, c.start)) + 4 / 3 * c.radius for c in link.capsules]
+    shares = np.array([length * c.radius**2 for length, c in zip(lengths, link.capsules, strict=True)])
+    for i, (capsule, share) in enumerate(zip(link.capsules, shares / shares.sum(), strict=True)):
+        body.add_geom(
+            name=f"{link.name}_{i}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=np.concatenate([np.subtract(capsule.start, origin), np.subtract(capsule.end, origin)]),
+            size=(capsule.radius, 0.0, 0.0),
+            mass=link.mass * share,
+            contype=HAND_CONTYPE,
+            conaffinity=0,
+            friction=(0.1, 0.005, 0.0001),  # MuJoCo takes the greater of two: the object's friction decides
+        )

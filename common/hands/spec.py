@@ -1,0 +1,153 @@
+"""What a hand is: data. Every length is in metres, every angle in radians, every mass in kilograms.
+
+All points and axes are given in the wrist frame with every joint at zero, so that forward kinematics is a product of
+exponentials (`common.hands.kinematics`) and the MJCF (`common.hands.mjcf`) follows from the same numbers.
+"""
+
+import dataclasses
+import functools
+
+import numpy as np
+
+Vector = tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """A hinge. `axis` and `anchor` in the wrist frame at zero; gains in N.m/rad, N.m.s/rad and N.m."""
+
+    name: str
+    axis: Vector
+    anchor: Vector
+    lower: float
+    upper: float
+    kp: float
+    kv: float
+    torque_limit: float
+    damping: float = 0.05
+    armature: float = 5e-4
+
+
+@dataclasses.dataclass(frozen=True)
+class Capsule:
+    """A collision capsule between two points of the wrist frame at zero."""
+
+    start: Vector
+    end: Vector
+    radius: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Link:
+    """A rigid body. The first link of a hand is its palm, whose frame is the wrist frame; it has no joints."""
+
+    name: str
+    parent: str
+    joints: tuple[Joint, ...]
+    capsules: tuple[Capsule, ...]
+    mass: float
+    contact_weight: float
+    """Relative share of this link in the contact reward."""
+    tip: Vector | None = None
+    """The fingertip, on the last link of a finger."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WristGains:
+    """Gains of the virtual wrist: slides in N/m, N.s/m, N; hinges in N.m/rad, N.m.s/rad, N.m."""
+
+    slide_kp: float
+    slide_kv: float
+    slide_limit: float
+    slide_armature: float
+    hinge_kp: float
+    hinge_kv: float
+    hinge_limit: float
+    hinge_armature: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hand:
+    """A dexterous hand with `F` finger joints, `L` links and `P` keypoints (link origins, then fingertips).
+
+    Hands are compared by identity, so that they can be static arguments of compiled functions.
+    """
+
+    name: str
+    links: tuple[Link, ...]
+    thumb: str
+    """Name of the thumb's last link; the other links with a tip are the non-thumb fingers."""
+    open_pose: dict[str, float]
+    """Finger angles at the start of a grasp without a reference pose; joints that are not named are at zero."""
+    closed_pose: dict[str, float]
+    """Finger angles of a fist, for pictures and for closing around an object."""
+    wrist: WristGains
+    object_scale: float = 1.0
+    """Factor on object sizes in the paper's comparison of hands."""
+
+    @functools.cached_property
+    def joints(self) -> tuple[Joint, ...]:
+        """Finger joints in the order of `q`."""
+        return tuple(joint for link in self.links for joint in link.joints)
+
+    @functools.cached_property
+    def lower(self) -> np.ndarray:
+        """(F,) lower joint limits."""
+        return np.array([joint.lower for joint in self.joints], np.float32)
+
+    @functools.cached_property
+    def upper(self) -> np.ndarray:
+        """(F,) upper joint limits."""
+        return np.array([joint.upper for joint in self.joints], np.float32)
+
+    @functools.cached_property
+    def q_open(self) -> np.ndarray:
+        """(F,) the partially open pose."""
+        return self._pose(self.open_pose)
+
+    @functools.cached_property
+    def q_closed(self) -> np.ndarray:
+        """(F,) the fist."""
+        return self._pose(self.closed_pose)
+
+    @functools.cached_property
+    def tip_links(self) -> tuple[int, ...]:
+        """Indices of the links with a fingertip, thumb first."""
+        tips = [i for i, link in enumerate(self.links) if link.tip is not None]
+        return tuple(sorted(tips, key=lambda i: self.links[i].name != self.thumb))
+
+    @functools.cached_property
+    def contact_weights(self) -> np.ndarray:
+        """(L,) shares of the links in the contact reward; they sum to one."""
+        weights = np.array([link.contact_weight for link in self.links], np.float32)
+        return weights / weights.sum()
+
+    @functools.cached_property
+    def keypoint_links(self) -> np.ndarray:
+        """(P,) index of the link that carries each keypoint."""
+        return np.array([*range(len(self.links)), *self.tip_links])
+
+    @functools.cached_property
+    def keypoints(self) -> np.ndarray:
+        """(P, 3) link origins and fingertips (thumb first) in the wrist frame at zero."""
+        tips = [self.links[i].tip for i in self.tip_links]
+        return np.array([*map(link_origin, self.links), *tips], np.float32)
+
+    @functools.cached_property
+    def keypoint_radii(self) -> np.ndarray:
+        """(P,) skin radius around each keypoint: that of its link's first capsule."""
+        return np.array([self.links[i].capsules[0].radius for i in self.keypoint_links], np.float32)
+
+    @functools.cached_property
+    def keypoint_weights(self) -> np.ndarray:
+        """(P,) weights of the keypoints in the distance reward: fingertips count four times; their mean is one."""
+        weights = np.concatenate([np.ones(len(self.links)), 4 * np.ones(len(self.tip_links))])
+        return (weights / weights.mean()).astype(np.float32)
+
+    def _pose(self, angles: dict[str, float]) -> np.ndarray:
+        return np.array([angles.get(joint.name, 0.0) for joint in self.joints], np.float32)
+
+
+def link_origin(link: Link) -> Vector:
+    """Origin of a link's frame in the wrist frame at zero: the anchor of its first joint, or the wrist."""
+    return link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0)

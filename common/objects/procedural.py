@@ -1,0 +1,119 @@
+"""Procedural objects: any number of them from a seed, no two alike, with part labels and resting poses."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from common.errors import CongraspError
+from common.objects import shapes
+from common.objects.families import BUILDERS, Draft
+from common.objects.resting import rest_poses
+from common.objects.spec import GraspObject
+from common.objects.surface import halves, mass_properties, sample_union
+
+FAMILIES: tuple[str, ...] = tuple(BUILDERS)
+EVALUATION_SEED = 1_000_000
+"""Objects of this seed and above are never trained on."""
+MASS_RANGE = (0.05, 0.5)
+"""Kilograms."""
+_SIZE_RANGE = (0.03, 0.25)
+_DENSITY_RANGE = (300.0, 1000.0)
+_LEAST_SHARE = 0.1
+_ATTEMPTS = 100
+
+
+def generate(seed: int, family: str | None = None) -> GraspObject:
+    """A random object, the same for the same seed and family.
+
+    Its largest side is between 3 and 25 cm, its mass between 0.05 and 0.5 kg, and both its graspable and its
+    non-graspable region cover at least a tenth of the surface. Mass and inertia are those of the sum of its pieces
+    (overlaps count twice), scaled together where the mass had to be brought into range.
+
+    Args:
+      seed: not negative; seeds from `EVALUATION_SEED` upward are kept for evaluation.
+      family: one of `FAMILIES`; chosen by the seed if not given.
+
+    Raises:
+      CongraspError: unknown family or negative seed.
+    """
+    _check(seed, () if family is None else (family,))
+    if family is None:
+        family = FAMILIES[np.random.default_rng((seed, len(FAMILIES))).integers(len(FAMILIES))]
+    rng = np.random.default_rng((seed, FAMILIES.index(family)))
+    for _ in range(_ATTEMPTS):
+        obj = _build(f"{family}_{seed}", family, BUILDERS[family](rng), rng)
+        if obj is not None:
+            return dataclasses.replace(obj, rest_poses=rest_poses(obj))
+    raise RuntimeError(f"family {family} gave no usable object for seed {seed}")
+
+
+def generate_many(count: int, seed: int, families: Sequence[str] = ()) -> list[GraspObject]:
+    """`count` objects of the seeds `seed`, `seed` + 1, ..., whose families take turns.
+
+    Args:
+      count: number of objects.
+      seed: the first seed.
+      families: some of `FAMILIES`; empty means all.
+
+    Raises:
+      CongraspError: unknown family or negative seed.
+    """
+    return [generate(seed + i, family) for i, family in enumerate(family_turns(count, seed, families))]
+
+
+def family_turns(count: int, seed: int, families: Sequence[str] = ()) -> list[str]:
+    """The families of the objects of `generate_many`, in their order."""
+    _check(seed, families)
+    chosen = tuple(families) or FAMILIES
+    return [chosen[(seed + i) % len(chosen)] for i in range(count)]
+
+
+def _check(seed: int, families: Sequence[str]) -> None:
+    if seed < 0:
+        raise CongraspError(f"The seed {seed} is negative.", "Seeds start at 0.")
+    for family in families:
+        if family not in BUILDERS:
+            raise CongraspError(f"There is no object family '{family}'.", f"Families: {', '.join(FAMILIES)}.")
+
+
+def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> GraspObject | None:
+    """The object of a draft without its resting poses, or None where its size or its parts are out of range."""
+    weight = np.array(draft.weight or [1.0] * max(1, len(draft.part_names)))
+    densities = rng.uniform(*_DENSITY_RANGE) * weight[[piece.part for piece in draft.pieces]]
+    mass, center, inertia = mass_properties(draft.pieces, densities)
+    pieces = tuple(
+        dataclasses.replace(piece, pos=tuple((np.array(piece.pos) - center).tolist())) for piece in draft.pieces
+    )
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    reach = np.max([shapes.support(piece, axes) for piece in pieces], axis=0)
+    size = (reach[:3] + reach[3:]).max()
+    points, normals, owner = sample_union(pieces, rng)
+    if draft.part_names:
+        part_names, graspable = draft.part_names, np.array(draft.graspable)
+        labels = np.array([piece.part for piece in pieces], np.int32)[owner]
+    else:
+        part_names, first = ("near half", "far half"), rng.random() < 0.5
+        graspable = np.array([first, not first])
+        labels = halves(points, rng.uniform(0.35, 0.65))
+    share = graspable[labels].mean()
+    if not (_SIZE_RANGE[0] <= size <= _SIZE_RANGE[1] and _LEAST_SHARE <= share <= 1 - _LEAST_SHARE):
+        return None
+    clipped = float(np.clip(mass, *MASS_RANGE))
+    meshes = [shapes.tessellate(piece) for piece in pieces]
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes[:-1])])
+    return GraspObject(
+        name=name,
+        family=family,
+        pieces=pieces,
+        part_names=part_names,
+        graspable=graspable,
+        mass=clipped,
+        inertia=inertia * clipped / mass,
+        points=points.astype(np.float32),
+        normals=normals.astype(np.float32),
+        labels=labels,
+        rest_poses=np.zeros((0, 7)),
+        visual_vertices=np.concatenate([vertices for vertices, _ in meshes]).astype(np.float32),
+        visual_faces=np.concatenate([f + s for (_, f), s in zip(meshes, starts, strict=True)]).astype(np.int32),
+    )

@@ -1,0 +1,228 @@
+"""Stable poses of an object on a table: found on its convex hull, then settled by physics."""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from common.objects import shapes
+from common.objects.mjcf import CONTACT, add_object
+from common.objects.spec import GraspObject, Piece
+
+MAX_POSES = 8
+_SAME_NORMAL = np.cos(np.radians(15))  # directions nearer than this count as one
+_SAME_KIND = 5e-4  # m; poses whose heights differ by less are turns of one another (a cylinder on its side)
+_PER_KIND = 4
+_LEAST_LIKELY = 0.02
+_STILL = 1e-3  # m/s
+_TILT, _DROP = 0.07, 5e-6  # rad, m; a pose whose centre of mass sinks by this much when tilted is not stable
+_ROUNDS = 6
+
+
+class Settled(NamedTuple):
+    """Where physics has taken an object."""
+
+    pose: np.ndarray
+    """(7,) position and quaternion in the world."""
+    speed: float
+    """Bound of its fastest point's speed at the end, m/s: linear plus angular speed times the object's radius."""
+    moved: float
+    """Distance of the centre of mass from its start, m."""
+
+
+class TableScene:
+    """An object above a table whose top is the plane z = 0, with the contact settings of the task (MuJoCo C)."""
+
+    def __init__(self, obj: GraspObject):
+        spec = mujoco.MjSpec()
+        spec.option.timestep = CONTACT.timestep
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.worldbody.add_geom(
+            name="table",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[1, 1, 0.1],
+            friction=CONTACT.friction,
+            condim=CONTACT.condim,
+            solref=CONTACT.solref,
+            solimp=CONTACT.solimp,
+        )
+        add_object(spec, obj)
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.radius = float(np.linalg.norm(obj.visual_vertices, axis=-1).max())
+
+    def settle(self, pose: np.ndarray, seconds: float, *, overdamped: bool = False) -> Settled:
+        """Lets the object move freely from rest.
+
+        Args:
+          pose: (7,) where it starts.
+          seconds: simulated time.
+          overdamped: damps rotation so much that rocking dies out at once; off, physics is the task's.
+        """
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = pose
+        damping = self.model.dof_damping.copy()
+        if overdamped:
+            # The critical damping of a pendulum with the object's weight, size and inertia.
+            inertia = self.model.body_inertia[1].max()
+            self.model.dof_damping[3:] += np.sqrt(self.model.body_mass[1] * 9.81 * self.radius * inertia)
+        mujoco.mj_step(self.model, self.data, nstep=max(1, round(seconds / CONTACT.timestep)))
+        self.model.dof_damping[:] = damping
+        linear, angular = np.linalg.norm(self.data.qvel.reshape(2, 3), axis=-1)
+        moved = np.linalg.norm(self.data.qpos[:3] - pose[:3])
+        return Settled(self.data.qpos.copy(), float(linear + self.radius * angular), float(moved))
+
+
+def settle(obj: GraspObject, pose: np.ndarray, seconds: float) -> Settled:
+    """Lets an object move freely on the table for some seconds, from rest in a pose (7,)."""
+    return TableScene(obj).settle(pose, seconds)
+
+
+def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
+    """Poses (R, 7), 1 <= R <= 8, in which the object rests still on the table, most likely first.
+
+    The quasi-static poses are settled by physics, for `seconds` or a few times as long where that is not enough;
+    those that do not come to rest, those that a small tilt would lower and those that end in a pose found before are
+    left out. If none is left, the most likely one is taken as far as it got.
+    """
+    candidates, _ = quasi_static_poses(obj.pieces)
+    scene = TableScene(obj)
+    found: list[np.ndarray] = []
+    moving: list[np.ndarray] = []
+    downs: list[np.ndarray] = []
+    for pose in candidates:
+        settled = scene.settle(pose, seconds, overdamped=True)
+        for _ in range(_ROUNDS):
+            down = -shapes.matrix(settled.pose[3:])[2]
+            if settled.speed < _STILL or any(down @ other > _SAME_NORMAL for other in downs):
+                break
+            settled = scene.settle(settled.pose, seconds, overdamped=True)
+        moving.append(settled.pose)
+        if settled.speed < _STILL and _stable(obj.pieces, down) and all(down @ other < _SAME_NORMAL for other in downs):
+            found.append(settled.pose)
+            downs.append(down)
+    poses = np.array(found or moving[:1])
+    poses[:, :2] = 0.0
+    return poses
+
+
+def quasi_static_poses(pieces: tuple[Piece, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Poses in which the object can lie still, from its convex hull, most likely first.
+
+    An object that touches the table with a facet beyond whose edge its centre of mass lies rolls over that edge onto
+    the next facet, until it lies on a facet below its centre of mass. A pose's likelihood is the solid angle, seen
+    from the centre of mass, of all the facets from which it ends there (quasi-static pose statistics; Goldberg et
+    al. 1999, "Part pose statistics: estimators and experiments"). Round pieces are faceted for this, and the
+    poses found are then moved to the lowest centre of mass nearby.
+
+    Args:
+      pieces: convex pieces in the object frame, whose origin is the centre of mass.
+
+    Returns:
+      Poses (R, 7), 1 <= R <= 8, on the table's top z = 0 with x = y = 0 and arbitrary heading, and their
+      likelihoods (R,), without those of the unlikely poses that were left out.
+    """
+    hull = shapes.hull_of(np.concatenate([shapes.tessellate(piece)[0] for piece in pieces]))
+    normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
+    corners = hull.points[hull.simplices]
+    # How far the foot of the centre of mass lies beyond the edge opposite to each corner.
+    foot = -offsets[:, None] * normals
+    start, along = np.roll(corners, -1, 1), np.roll(corners, -2, 1) - np.roll(corners, -1, 1)
+    outward = np.cross(along, normals[:, None])
+    outward /= np.linalg.norm(outward, axis=-1, keepdims=True) + 1e-12
+    outward *= np.sign(((start - corners) * outward).sum(-1, keepdims=True))
+    beyond = ((foot[:, None] - start) * outward).sum(-1)
+    rows, worst = np.arange(len(normals)), beyond.argmax(-1)
+    neighbor = hull.neighbors[rows, worst]
+    rolls = (beyond[rows, worst] > 1e-9) & (offsets[neighbor] > offsets - 1e-9)
+    target = np.where(rolls, neighbor, rows)
+    for _ in range(12):
+        target = target[target]
+    weights = np.bincount(target, _solid_angles(corners), len(normals)) / (4 * np.pi)
+    sinks = weights > 0
+    downs, weights = _merge(normals[sinks], weights[sinks])
+    if any(piece.kind in ("cylinder", "capsule", "ellipsoid") for piece in pieces):
+        downs, weights = _merge(_lowest_nearby(pieces, downs), weights)
+    heights = _height(pieces, downs)
+    chosen = _choose(heights, weights)
+    poses = np.array([[0.0, 0.0, heights[i], *_upright(downs[i])] for i in chosen])
+    return poses, weights[chosen]
+
+
+def _height(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
+    """Height (D,) of the centre of mass above a plane that the object touches with directions (D, 3) downwards."""
+    return np.max([shapes.support(piece, downs) for piece in pieces], axis=0)
+
+
+def _lowest_nearby(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
+    """Directions (D, 3) near to those given with a lower centre of mass, by pattern search on the sphere."""
+    best, height = downs, _height(pieces, downs)
+    columns = np.arange(len(best))
+    step = 0.1
+    for i in range(24):
+        tries = _cone(best, step, phase=i)
+        heights = _height(pieces, tries.reshape(-1, 3)).reshape(len(tries), -1)
+        pick = heights.argmin(0)
+        lower = heights[pick, columns] < height
+        best = np.where(lower[:, None], tries[pick, columns], best)
+        height = np.where(lower, heights[pick, columns], height)
+        step *= 0.8
+    return best
+
+
+def _stable(pieces: tuple[Piece, ...], down: np.ndarray) -> bool:
+    """Whether no small tilt lowers the centre of mass of an object with a direction (3,) downwards."""
+    tilted = _cone(down[None], _TILT, phase=0.0)[:, 0]
+    return bool(_height(pieces, tilted).min() > _height(pieces, down[None])[0] - _DROP)
+
+
+def _cone(axes: np.ndarray, slope: float, phase: float) -> np.ndarray:
+    """Eight unit directions (8, D, 3) around each axis (D, 3), the arc tangent of `slope` away from it."""
+    side = np.cross(axes, np.eye(3)[np.abs(axes).argmin(-1)])
+    side /= np.linalg.norm(side, axis=-1, keepdims=True)
+    turn = (np.pi / 4 * np.arange(8) + phase)[:, None, None]
+    directions = axes + slope * (np.cos(turn) * side + np.sin(turn) * np.cross(axes, side))
+    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def _solid_angles(corners: np.ndarray) -> np.ndarray:
+    """Solid angles (F,) of triangles (F, 3, 3) seen from the origin (Van Oosterom and Strackee 1983)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    la, lb, lc = np.linalg.norm(corners, axis=-1).T
+    triple = np.abs((a * np.cross(b, c)).sum(-1))
+    ab, bc, ca = ((x * y).sum(-1) for x, y in ((a, b), (b, c), (c, a)))
+    return 2 * np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb)
+
+
+def _merge(downs: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions and weights, likeliest first, after adding to each the weights of those close to it."""
+    order = np.argsort(-weights, kind="stable")
+    downs, weights = downs[order], weights[order].copy()
+    close = downs @ downs.T > _SAME_NORMAL
+    kept: list[int] = []
+    for i in range(len(downs)):
+        near = [k for k in kept if close[i, k]]
+        if near:
+            weights[near[0]] += weights[i]
+        else:
+            kept.append(i)
+    kept.sort(key=lambda i: -weights[i])
+    return downs[kept], weights[kept]
+
+
+def _choose(heights: np.ndarray, weights: np.ndarray) -> list[int]:
+    """Indices of at most eight poses, likely ones, not too many of which are turns of one another."""
+    chosen: list[int] = []
+    for i, (height, weight) in enumerate(zip(heights, weights, strict=True)):
+        alike = sum(abs(heights[k] - height) < _SAME_KIND for k in chosen)
+        if not chosen or (len(chosen) < MAX_POSES and alike < _PER_KIND and weight > _LEAST_LIKELY):
+            chosen.append(i)
+    return chosen
+
+
+def _upright(down: np.ndarray) -> np.ndarray:
+    """Quaternion (4,) of the smallest rotation that points a direction (3,) of the object downwards."""
+    if down[2] > 1 - 1e-9:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    q = np.array([1.0 - down[2], -down[1], down[0], 0.0])
+    return q / np.linalg.norm(q)

@@ -1,0 +1,260 @@
+"""Geometry of one convex piece: volume, inertia, containment, support, surface samples and a triangle mesh."""
+
+import functools
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull
+
+from common.objects.spec import Piece
+
+_SEGMENTS = 24
+
+
+def rotation(piece: Piece) -> np.ndarray:
+    """(3, 3) rotation from the piece's frame to the object frame."""
+    return matrix(piece.quat)
+
+
+def matrix(quat: Sequence[float] | np.ndarray) -> np.ndarray:
+    """(3, 3) rotation of a unit quaternion (w, x, y, z)."""
+    flat = np.empty(9)
+    mujoco.mju_quat2Mat(flat, np.asarray(quat, np.float64))
+    return flat.reshape(3, 3)
+
+
+def hull_of(vertices: np.ndarray) -> ConvexHull:
+    """Convex hull of (V, 3) points; its facets' `equations` point outwards. The last few hulls are remembered.
+
+    Raises:
+      scipy.spatial.QhullError: the points lie in a plane.
+    """
+    return _hull(np.ascontiguousarray(vertices, np.float64).tobytes())
+
+
+@functools.lru_cache(maxsize=32)
+def _hull(data: bytes) -> ConvexHull:
+    return ConvexHull(np.frombuffer(data).reshape(-1, 3))
+
+
+def triangulate(vertices: np.ndarray) -> trimesh.Trimesh:
+    """The convex hull of (V, 3) points as a closed mesh whose faces wind outwards; do not change it, it is shared."""
+    return _triangulated(np.ascontiguousarray(vertices, np.float64).tobytes())
+
+
+@functools.lru_cache(maxsize=32)
+def _triangulated(data: bytes) -> trimesh.Trimesh:
+    hull = _hull(data)
+    vertices, faces = hull.points, hull.simplices
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
+    faces = np.where(inward[:, None], faces[:, ::-1], faces)
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return trimesh.Trimesh(vertices[used], renumbered.reshape(-1, 3), process=False)
+
+
+def volume(piece: Piece) -> float:
+    """Volume in cubic metres."""
+    a, b, c = piece.size
+    if piece.kind == "box":
+        return 8 * a * b * c
+    if piece.kind == "cylinder":
+        return 2 * np.pi * a**2 * b
+    if piece.kind == "capsule":
+        return 2 * np.pi * a**2 * b + 4 / 3 * np.pi * a**3
+    if piece.kind == "ellipsoid":
+        return 4 / 3 * np.pi * a * b * c
+    return float(hull_of(_vertices(piece)).volume)
+
+
+def unit_inertia(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
+    """Centre of mass (3,) and inertia (3, 3) about it for one kilogram of uniform density, in the object frame."""
+    a, b, c = piece.size
+    if piece.kind == "mesh":
+        properties = triangulate(_vertices(piece)).mass_properties
+        center, local = np.asarray(properties["center_mass"]), np.asarray(properties["inertia"]) / properties["mass"]
+    else:
+        center = np.zeros(3)
+        if piece.kind == "box":
+            squares = np.array([a, b, c]) ** 2 / 3
+        elif piece.kind == "ellipsoid":
+            squares = np.array([a, b, c]) ** 2 / 5
+        elif piece.kind == "cylinder":
+            squares = np.array([a**2 / 4, a**2 / 4, b**2 / 3])
+        else:
+            # A cylinder and two half balls whose own centres are 3a/8 beyond its ends.
+            cylinder, ball = 2 * np.pi * a**2 * b, 4 / 3 * np.pi * a**3
+            axial = cylinder * b**2 / 3 + ball * (a**2 / 5 + b**2 + 3 * a * b / 4)
+            radial = cylinder * a**2 / 4 + ball * a**2 / 5
+            squares = np.array([radial, radial, axial]) / (cylinder + ball)
+        local = np.diag(squares.sum() - squares)
+    r = rotation(piece)
+    return np.asarray(piece.pos) + r @ center, r @ local @ r.T
+
+
+def contains(piece: Piece, points: np.ndarray) -> np.ndarray:
+    """(N,) whether points (N, 3) of the object frame lie inside the piece."""
+    x = (points - np.asarray(piece.pos)) @ rotation(piece)
+    a, b, c = piece.size
+    if piece.kind == "box":
+        return (np.abs(x) < [a, b, c]).all(-1)
+    if piece.kind == "cylinder":
+        return (np.hypot(x[:, 0], x[:, 1]) < a) & (np.abs(x[:, 2]) < b)
+    if piece.kind == "capsule":
+        x[:, 2] -= np.clip(x[:, 2], -b, b)
+        return (x**2).sum(-1) < a**2
+    if piece.kind == "ellipsoid":
+        return ((x / [a, b, c]) ** 2).sum(-1) < 1
+    equations = hull_of(_vertices(piece)).equations
+    return (x @ equations[:, :3].T + equations[:, 3] < 0).all(-1)
+
+
+def support(piece: Piece, directions: np.ndarray) -> np.ndarray:
+    """(D,) the largest coordinate of the piece along unit directions (D, 3) of the object frame."""
+    d = directions @ rotation(piece)
+    a, b, c = piece.size
+    if piece.kind == "box":
+        reach = np.abs(d) @ np.array([a, b, c])
+    elif piece.kind == "cylinder":
+        reach = a * np.hypot(d[:, 0], d[:, 1]) + b * np.abs(d[:, 2])
+    elif piece.kind == "capsule":
+        reach = a + b * np.abs(d[:, 2])
+    elif piece.kind == "ellipsoid":
+        reach = np.linalg.norm(d * [a, b, c], axis=-1)
+    else:
+        reach = (d @ _vertices(piece).T).max(-1)
+    return reach + directions @ np.asarray(piece.pos)
+
+
+def proposal_area(piece: Piece) -> float:
+    """Area from which `propose` draws; larger than the surface's area where `propose` thins its points out."""
+    a, b, c = piece.size
+    if piece.kind == "box":
+        return 8 * (a * b + b * c + c * a)
+    if piece.kind == "cylinder":
+        return 2 * np.pi * a * (a + 2 * b)
+    if piece.kind == "capsule":
+        return 4 * np.pi * a * (a + b)
+    if piece.kind == "ellipsoid":
+        return 4 * np.pi * a * b * c / min(a, b, c)
+    return float(hull_of(_vertices(piece)).area)
+
+
+def propose(piece: Piece, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points that are uniform on the piece's surface where `u` (N, 4) is uniform in the unit cube.
+
+    Returns:
+      Points (N, 3) and outward unit normals (N, 3) in the object frame, and (N,) which of them to keep (all of them
+      but for ellipsoids, where the map from the sphere is thinned out in proportion to its stretch of area).
+    """
+    a, b, c = piece.size
+    keep = np.ones(len(u), bool)
+    if piece.kind == "box":
+        x, n = _propose_box(np.array([a, b, c]), u)
+    elif piece.kind == "cylinder":
+        x, n = _propose_cylinder(a, b, u)
+    elif piece.kind == "capsule":
+        x, n = _propose_capsule(a, b, u)
+    elif piece.kind == "ellipsoid":
+        unit = _sphere(u)
+        radii = np.array([a, b, c])
+        gradient = unit / radii
+        stretch = np.linalg.norm(gradient, axis=-1)
+        keep = u[:, 3] * (1 / radii.min()) < stretch
+        x, n = unit * radii, gradient / stretch[:, None]
+    else:
+        x, n = _propose_mesh(_vertices(piece), u)
+    r = rotation(piece)
+    return x @ r.T + np.asarray(piece.pos), n @ r.T, keep
+
+
+def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) in the object frame, on the surface, and faces (F, 3) winding outwards."""
+    a, b, c = piece.size
+    if piece.kind == "mesh":
+        mesh = triangulate(_vertices(piece))
+        x, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    else:
+        unit, faces = _template(piece.kind)
+        if piece.kind == "capsule":
+            x = unit * a + np.sign(unit[:, 2:]) * [0, 0, b]
+        else:
+            x = unit * ([a, a, b] if piece.kind == "cylinder" else [a, b, c])
+    return x @ rotation(piece).T + np.asarray(piece.pos), faces
+
+
+@functools.cache
+def _template(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    if kind == "box":
+        mesh = trimesh.creation.box((2, 2, 2))
+    elif kind == "cylinder":
+        mesh = trimesh.creation.cylinder(1.0, 2.0, sections=_SEGMENTS)
+    else:
+        # An even number of rings leaves none on the equator, where a capsule is cut in two.
+        mesh = trimesh.creation.uv_sphere(1.0, count=(9 if kind == "capsule" else 10, _SEGMENTS // 2))
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def _vertices(piece: Piece) -> np.ndarray:
+    if piece.vertices is None:
+        raise ValueError(f"a {piece.kind} piece has no vertices")
+    return piece.vertices
+
+
+def _sphere(u: np.ndarray) -> np.ndarray:
+    z = 2 * u[:, 0] - 1
+    ring, turn = np.sqrt(1 - z**2), 2 * np.pi * u[:, 1]
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], -1)
+
+
+def _propose_box(half: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    areas = np.prod(half) / half
+    edges = np.cumsum(areas) / areas.sum()
+    axis = np.searchsorted(edges[:2], u[:, 0], side="right")
+    start = np.concatenate([[0.0], edges[:2]])[axis]
+    side = np.where((u[:, 0] - start) / (edges[axis] - start) < 0.5, -1.0, 1.0)
+    x = np.empty((len(u), 3))
+    rows = np.arange(len(u))
+    x[rows, axis] = side
+    x[rows, (axis + 1) % 3] = 2 * u[:, 1] - 1
+    x[rows, (axis + 2) % 3] = 2 * u[:, 2] - 1
+    normals = np.zeros_like(x)
+    normals[rows, axis] = side
+    return x * half, normals
+
+
+def _propose_cylinder(radius: float, half: float, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    share = 2 * half / (2 * half + radius)
+    turn = 2 * np.pi * u[:, 1]
+    around = np.stack([np.cos(turn), np.sin(turn), np.zeros(len(u))], -1)
+    on_side = u[:, 0] < share
+    along = np.where(on_side, u[:, 0] / share, (u[:, 0] - share) / (1 - share))
+    end = np.where(along < 0.5, -1.0, 1.0)[:, None] * [0.0, 0.0, 1.0]
+    side = radius * around + (half * (2 * along - 1))[:, None] * [0.0, 0.0, 1.0]
+    cap = (radius * np.sqrt(u[:, 2]))[:, None] * around + half * end
+    return np.where(on_side[:, None], side, cap), np.where(on_side[:, None], around, end)
+
+
+def _propose_capsule(radius: float, half: float, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    # A sphere's area is uniform along its axis, as is a cylinder's: one coordinate runs over both.
+    along = (2 * u[:, 0] - 1) * (radius + half)
+    center = np.clip(along, -half, half)
+    z = (along - center) / radius
+    ring, turn = np.sqrt(1 - z**2), 2 * np.pi * u[:, 1]
+    normals = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], -1)
+    return radius * normals + center[:, None] * [0.0, 0.0, 1.0], normals
+
+
+def _propose_mesh(vertices: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    mesh = triangulate(vertices)
+    edges = np.cumsum(mesh.area_faces)
+    face = np.searchsorted(edges, u[:, 0] * edges[-1], side="right").clip(max=len(edges) - 1)
+    corners = np.asarray(mesh.triangles)[face]
+    root = np.sqrt(u[:, 1])
+    weights = np.stack([1 - root, root * (1 - u[:, 2]), root * u[:, 2]], -1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.einsum("ni,nij->nj", weights, corners), normals

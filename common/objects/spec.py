@@ -1,0 +1,70 @@
+"""What an object is to this project: convex pieces, a labelled surface, mass and resting poses.
+
+The object frame has its origin at the centre of mass; its orientation is the author's. Quaternions are (w, x, y, z).
+"""
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+
+PieceKind = Literal["box", "cylinder", "capsule", "ellipsoid", "mesh"]
+SURFACE_POINTS = 512
+PRIMITIVE_SLOTS = {"box": 3, "cylinder": 2, "capsule": 3, "ellipsoid": 2}
+"""Most pieces of each kind in a primitive object: the geoms that a batched physics world keeps for its object."""
+MAX_MESH_PIECES = 8
+"""Most convex pieces of an object with mesh pieces."""
+MAX_MESH_VERTICES = 32
+"""Most vertices of a mesh piece."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """A convex collision piece in the object frame.
+
+    `size` follows MuJoCo: half extents of a box; radius and half length (along z) of a cylinder or capsule; radii of
+    an ellipsoid; zeros for a mesh, whose `vertices` (V, 3) are in the piece's own frame (`pos`, `quat`).
+    """
+
+    kind: PieceKind
+    size: tuple[float, float, float]
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    vertices: np.ndarray | None = None
+    part: int = 0
+    """Index into the object's `part_names`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GraspObject:
+    """An entry of the catalogue.
+
+    Shapes: `points`, `normals` (512, 3), outward unit normals; `labels` (512,) part index of each surface point;
+    `graspable` (parts,) bool, the default partition into O+ and O-; `inertia` (3, 3) about the centre of mass,
+    kg.m^2; `rest_poses` (R, 7) position and quaternion in the world with the table's top at z = 0;
+    `visual_vertices` (V, 3), `visual_faces` (F, 3) for pictures, in the object frame.
+    """
+
+    name: str
+    family: str
+    pieces: tuple[Piece, ...]
+    part_names: tuple[str, ...]
+    graspable: np.ndarray
+    mass: float
+    inertia: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    labels: np.ndarray
+    rest_poses: np.ndarray
+    visual_vertices: np.ndarray
+    visual_faces: np.ndarray
+
+    @property
+    def primitive(self) -> bool:
+        """Whether the object has no mesh piece (it then fits into `PRIMITIVE_SLOTS`)."""
+        return all(piece.kind != "mesh" for piece in self.pieces)
+
+    @property
+    def non_graspable_points(self) -> np.ndarray:
+        """(512,) whether each surface point belongs to O-."""
+        return ~self.graspable[self.labels]

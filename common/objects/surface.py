@@ -1,0 +1,84 @@
+"""Labelled points on the outer surface of a union of convex pieces, and its mass properties."""
+
+import numpy as np
+
+from common.objects import shapes
+from common.objects.spec import SURFACE_POINTS, Piece
+
+_SEAM = 2e-4  # m; a point is outside if it still is after this step along its normal
+# The generalised golden ratio of four dimensions: the positive root of x^5 = x + 1 (Roberts' R4 sequence).
+_STRIDE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
+
+
+def sample_union(
+    pieces: tuple[Piece, ...], rng: np.random.Generator, count: int = SURFACE_POINTS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points that are evenly spread over the outer surface of the pieces' union.
+
+    The points follow a low-discrepancy sequence with a random start, so that the first few of them cover the
+    surface as well as all of them. Points of one piece inside another are left out.
+
+    Args:
+      pieces: the convex pieces, in the object frame.
+      rng: draws the start of the sequence.
+      count: number of points N.
+
+    Returns:
+      Points (N, 3) and outward unit normals (N, 3) in the object frame, and (N,) index of each point's piece.
+    """
+    edges = np.cumsum([shapes.proposal_area(piece) for piece in pieces])
+    starts = np.concatenate([[0.0], edges[:-1]])
+    offset = rng.random(4)
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    total, drawn = 0, 0
+    while total < count:
+        index = np.arange(drawn, drawn + 2 * count)
+        drawn += 2 * count
+        u = (offset + index[:, None] * _STRIDE) % 1.0
+        area = u[:, 0] * edges[-1]
+        owner = np.searchsorted(edges, area, side="right").clip(max=len(pieces) - 1)
+        u[:, 0] = (area - starts[owner]) / (edges - starts)[owner]
+        points, normals, keep = np.empty((len(u), 3)), np.empty((len(u), 3)), np.empty(len(u), bool)
+        for i, piece in enumerate(pieces):
+            own = owner == i
+            points[own], normals[own], keep[own] = shapes.propose(piece, u[own])
+        outside = points + _SEAM * normals
+        for i, piece in enumerate(pieces):
+            keep &= (owner == i) | ~shapes.contains(piece, outside)
+        found.append((points[keep], normals[keep], owner[keep]))
+        total += int(keep.sum())
+    points, normals, owner = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+    return points, normals, owner
+
+
+def halves(points: np.ndarray, cut: float) -> np.ndarray:
+    """Labels (N,) 0 and 1 of points (N, 3) on the two sides of a plane across their longest principal axis.
+
+    Args:
+      points: surface points.
+      cut: share of the points with label 0.
+    """
+    centered = points - points.mean(0)
+    axis = np.linalg.eigh(centered.T @ centered)[1][:, -1]
+    axis = axis * np.sign(axis[np.abs(axis).argmax()])
+    along = centered @ axis
+    return (along > np.quantile(along, cut)).astype(np.int32)
+
+
+def mass_properties(pieces: tuple[Piece, ...], densities: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass (kg), centre of mass (3,) and inertia (3, 3) about it, in the frame of the pieces.
+
+    The object is taken as the sum of its pieces: where pieces overlap, their densities add up.
+
+    Args:
+      pieces: the convex pieces.
+      densities: (pieces,) kg/m^3.
+    """
+    masses = densities * [shapes.volume(piece) for piece in pieces]
+    centers, inertias = zip(*(shapes.unit_inertia(piece) for piece in pieces), strict=True)
+    mass = float(masses.sum())
+    center = masses @ np.array(centers) / mass
+    inertia = np.zeros((3, 3))
+    for m, c, own in zip(masses, np.array(centers) - center, inertias, strict=True):
+        inertia += m * (own + (c @ c) * np.eye(3) - np.outer(c, c))
+    return mass, center, inertia

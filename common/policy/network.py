@@ -1,0 +1,150 @@
+"""The policy and the critic: two networks that share a shape and no weights, and the policy's diagonal Gaussian.
+
+State and heading are always active and go straight into the trunk; each optional constraint has an encoder of its own
+whose output is multiplied by the constraint's mask bit, so that an inactive constraint reaches the trunk as zeros.
+
+Everything here is a pure function of its arguments. `params` is a nested dict with the entries `actor` and `critic`;
+observations are already normalised (`common.policy.normalizer`) and have any leading axes.
+
+The actor's matrix products are true float32 on every backend: an actor process and the learner must agree on a log
+probability, where an error of the mean is amplified by 1/std and then exponentiated. The critic, whose output is only
+regressed on, uses the backend's default (TF32 on NVIDIA GPUs), which halves the price.
+"""
+
+import itertools
+import math
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from common.config import NetworkConfig
+from common.errors import CongraspError
+from common.task.types import MASKS, Array
+
+Layout = tuple[tuple[str, int], ...]
+"""Names and sizes of an observation's blocks, in order (`common.task.observation.layout`)."""
+Params = dict[str, Any]
+"""Flax parameters: nested dicts of arrays."""
+
+_TRUNK = ("state", "heading", "mask")
+_HIDDEN_GAIN = math.sqrt(2.0)
+_ACTION_GAIN = 0.01  # first actions are noise around zero, whatever the observation
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+def check_layout(layout: Layout) -> None:
+    """Raises `CongraspError` unless the layout has exactly the blocks that the networks are made for."""
+    names = [name for name, _ in layout]
+    if sorted(names) != sorted((*_TRUNK, *MASKS)) or dict(layout)["mask"] != len(MASKS):
+        raise CongraspError(f"The observation layout {names} does not fit the network.", "Use this version's layout.")
+
+
+def split(layout: Layout, observation: Array) -> dict[str, Array]:
+    """Blocks of observations (..., D) by name."""
+    ends = itertools.accumulate(size for _, size in layout)
+    return {name: observation[..., end - size : end] for (name, size), end in zip(layout, ends, strict=True)}
+
+
+class GatedNetwork(nn.Module):
+    """A multi-layer perceptron on the trunk's blocks and the gated codes of the optional blocks.
+
+    Attributes:
+      layout: names and sizes of the observation's blocks.
+      hidden: units of the trunk's layers.
+      encoder: units of each optional block's encoder.
+      outputs: units of the linear output layer.
+      output_gain: gain of the output layer's orthogonal initialisation.
+      precision: of the matrix products.
+    """
+
+    layout: Layout
+    hidden: tuple[int, ...]
+    encoder: int
+    outputs: int
+    output_gain: float
+    precision: jax.lax.Precision | None
+
+    @nn.compact
+    def __call__(self, observation: Array) -> Array:
+        """Maps normalised observations (..., D) to (..., outputs)."""
+        blocks = split(self.layout, observation)
+        inputs = [blocks[name] for name in _TRUNK]
+        for bit, name in enumerate(MASKS):
+            code = nn.elu(self._dense(self.encoder, _HIDDEN_GAIN, name)(blocks[name]))
+            inputs.append(code * blocks["mask"][..., bit : bit + 1])
+        x = jnp.concatenate(inputs, -1)
+        for depth, units in enumerate(self.hidden):
+            x = nn.elu(self._dense(units, _HIDDEN_GAIN, f"trunk_{depth}")(x))
+        return self._dense(self.outputs, self.output_gain, "output")(x)
+
+    def _dense(self, units: int, gain: float, name: str) -> nn.Dense:
+        initial = nn.initializers.orthogonal(gain)
+        return nn.Dense(units, kernel_init=initial, precision=self.precision, name=name)
+
+
+def _actor(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
+    return GatedNetwork(layout, hidden, encoder, outputs, _ACTION_GAIN, jax.lax.Precision.HIGHEST)
+
+
+def _critic(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
+    return GatedNetwork(layout, hidden, encoder, outputs, 1.0, None)
+
+
+def _sizes(tree: Params) -> tuple[tuple[int, ...], int, int]:
+    """Hidden, encoder and output units of a network, read off its kernels' shapes."""
+    depth = sum(name.startswith("trunk_") for name in tree)
+    hidden = tuple(tree[f"trunk_{i}"]["kernel"].shape[-1] for i in range(depth))
+    return hidden, tree[MASKS[0]]["kernel"].shape[-1], tree["output"]["kernel"].shape[-1]
+
+
+def init(key: Array, layout: Layout, action_size: int, config: NetworkConfig) -> Params:
+    """Orthogonal weights and zero biases: `{"actor": {"network", "log_std"}, "critic": {...}}`."""
+    check_layout(layout)
+    actor_key, critic_key = jax.random.split(key)
+    observation = jnp.zeros((1, sum(size for _, size in layout)), jnp.float32)
+    actor = _actor(layout, config.hidden, config.encoder, action_size)
+    critic = _critic(layout, config.hidden, config.encoder, 1)
+    return {
+        "actor": {
+            "network": actor.init(actor_key, observation)["params"],
+            "log_std": jnp.full((action_size,), math.log(config.initial_std), jnp.float32),
+        },
+        "critic": critic.init(critic_key, observation)["params"],
+    }
+
+
+def policy(params: Params, layout: Layout, observation: Array) -> tuple[Array, Array]:
+    """Mean (..., A) and log standard deviation (A,), which does not depend on the observation, of the action."""
+    actor = params["actor"]
+    return _actor(layout, *_sizes(actor["network"])).apply({"params": actor["network"]}, observation), actor["log_std"]
+
+
+def value(params: Params, layout: Layout, observation: Array) -> Array:
+    """The critic's estimate (...,) of the normalised return."""
+    critic = params["critic"]
+    return _critic(layout, *_sizes(critic)).apply({"params": critic}, observation)[..., 0]
+
+
+def log_probability(mean: Array, log_std: Array, action: Array) -> Array:
+    """Log density (...,) of actions (..., A) under the Gaussian, in nats."""
+    scaled = (action - mean) * jnp.exp(-log_std)
+    return -0.5 * jnp.sum(scaled * scaled + 2.0 * log_std + _LOG_2PI, -1)
+
+
+def sample(key: Array, mean: Array, log_std: Array) -> Array:
+    """An action (..., A) drawn from the Gaussian."""
+    return mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, mean.dtype)
+
+
+def entropy(log_std: Array) -> Array:
+    """Differential entropy of the Gaussian, in nats."""
+    return jnp.sum(log_std + 0.5 * (1.0 + _LOG_2PI), -1)
+
+
+def kl_divergence(mean: Array, log_std: Array, mean_other: Array, log_std_other: Array) -> Array:
+    """KL(p || other) (...,) between two diagonal Gaussians, in nats."""
+    variance_ratio = jnp.exp(2.0 * (log_std - log_std_other))
+    shift = (mean - mean_other) * jnp.exp(-log_std_other)
+    return 0.5 * jnp.sum(variance_ratio + shift * shift - 1.0 - 2.0 * (log_std - log_std_other), -1)

@@ -1,0 +1,117 @@
+"""Running statistics of observations and returns.
+
+A batch is summarised on its device as count, mean and M2 (the sum of squared deviations from the mean) in float32; these
+few hundred numbers travel to the host, where they are merged into the running statistics in float64 (Chan et al. 1979).
+So counts beyond 2^24 stay exact and small updates of an old mean are not lost, without 64-bit mode on the device.
+Merging is associative up to float64 rounding: the deltas of several learner ranks, merged in rank order on every rank,
+give every rank the same bits.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from common.policy.network import Layout
+from common.task.types import MASKS, Array
+
+LIMIT = 10.0
+"""Normalised observations are clipped to plus and minus this."""
+_SMALLEST_STD = 1e-3
+
+
+class Statistics(NamedTuple):
+    """Moments of what was seen so far; float64 arrays on the host."""
+
+    count: Array
+    """() number of samples."""
+    mean: Array
+    """(...) mean of each entry."""
+    m2: Array
+    """(...) sum of squared deviations from the mean."""
+
+
+class Affine(NamedTuple):
+    """A frozen normalisation x -> (x - shift) * scale in float32."""
+
+    shift: Array
+    scale: Array
+
+
+def empty(shape: tuple[int, ...] = ()) -> Statistics:
+    """Statistics of nothing."""
+    return Statistics(np.zeros(()), np.zeros(shape), np.zeros(shape))
+
+
+@functools.partial(jax.jit, static_argnames="event_axes")
+def moments(samples: Array, event_axes: int = 0) -> Statistics:
+    """Float32 statistics of a batch over all axes but the last `event_axes`.
+
+    Two passes with the compensation of the mean's rounding (Chan, Golub and LeVeque 1983, equation 1.7).
+    """
+    axes = tuple(range(samples.ndim - event_axes))
+    count = np.prod([samples.shape[axis] for axis in axes], dtype=np.float64)
+    estimate = jnp.mean(samples, axes, dtype=jnp.float32)
+    deviation = samples.astype(jnp.float32) - estimate
+    error = jnp.mean(deviation, axes)
+    m2 = jnp.sum(deviation * deviation, axes) - jnp.float32(count) * error * error
+    return Statistics(jnp.float32(count), estimate + error, jnp.maximum(m2, 0.0))
+
+
+def merge(*parts: Statistics) -> Statistics:
+    """Statistics of the union of disjoint samples, in float64 on the host."""
+    total = empty(np.shape(parts[0].mean))
+    for part in parts:
+        count, mean, m2 = (np.asarray(entry, np.float64) for entry in part)
+        if count == 0:
+            continue
+        combined = total.count + count
+        shift = mean - total.mean
+        total = Statistics(
+            combined,
+            total.mean + shift * (count / combined),
+            total.m2 + m2 + shift * shift * (total.count * count / combined),
+        )
+    return total
+
+
+def _std(statistics: Statistics) -> np.ndarray:
+    return np.maximum(np.sqrt(statistics.m2 / statistics.count), _SMALLEST_STD)
+
+
+def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
+    """Normalisation of observations (..., D); the identity while nothing was seen.
+
+    `state` and `heading` are centred and divided by their standard deviation. Optional blocks are divided by their root
+    mean square and not centred: zero, which stands for "inactive", stays exactly zero, and a feature that hardly varies
+    is not blown up against the clip. Mask bits are left alone.
+    """
+    size = sum(width for _, width in layout)
+    shift, scale = np.zeros(size), np.ones(size)
+    start = 0
+    for name, width in layout:
+        block = slice(start, start + width)
+        start += width
+        if statistics.count == 0 or name == "mask":
+            continue
+        part = Statistics(statistics.count, statistics.mean[block], statistics.m2[block])
+        if name in MASKS:
+            mean_square = part.mean**2 + part.m2 / part.count
+            scale[block] = 1.0 / np.maximum(np.sqrt(mean_square), _SMALLEST_STD)
+        else:
+            shift[block], scale[block] = part.mean, 1.0 / _std(part)
+    return Affine(shift.astype(np.float32), scale.astype(np.float32))
+
+
+def apply(affine: Affine, observation: Array) -> Array:
+    """Normalised observations (..., D) in float32, clipped to `LIMIT`; before gating, so inactive blocks stay zero."""
+    return jnp.clip((observation.astype(jnp.float32) - affine.shift) * affine.scale, -LIMIT, LIMIT)
+
+
+def value_affine(statistics: Statistics) -> Affine:
+    """Normalisation of returns by mean and standard deviation; the identity while nothing was seen."""
+    if statistics.count == 0:
+        return Affine(np.float32(0.0), np.float32(1.0))
+    return Affine(np.float32(statistics.mean), np.float32(1.0 / _std(statistics)))

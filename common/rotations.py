@@ -1,0 +1,149 @@
+"""Rotations: unit quaternions (w, x, y, z), matrices and intrinsic x-y-z angles, over any leading axes."""
+
+import jax
+import jax.numpy as jnp
+
+from common.task.types import Array
+
+
+def multiply(a: Array, b: Array) -> Array:
+    """Hamilton product of quaternions (..., 4): first `b`, then `a`."""
+    aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
+    bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )
+
+
+def conjugate(q: Array) -> Array:
+    """Inverse of unit quaternions (..., 4)."""
+    return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
+    w, axis = q[..., :1], q[..., 1:]
+    t = 2.0 * jnp.cross(axis, v)
+    return v + w * t + jnp.cross(axis, t)
+
+
+def to_matrix(q: Array) -> Array:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    w, x, y, z = jnp.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
+def from_matrix(m: Array) -> Array:
+    """Unit quaternions (..., 4) with w >= 0 of rotation matrices (..., 3, 3), stable for every rotation."""
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    diagonal = jnp.stack([trace, m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], -1)
+    skew = jnp.stack(
+        [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]],
+        -1,
+    )
+    # Row k holds 4 q_k q: build the four candidates and take the one with the largest component.
+    w_row = jnp.concatenate([1.0 + trace[..., None], skew], -1)
+    symmetric = m + jnp.swapaxes(m, -1, -2)
+    squares = 1.0 - trace[..., None] + 2.0 * diagonal[..., 1:]
+    off_diagonal = symmetric * (1.0 - jnp.eye(3, dtype=m.dtype))
+    axis_rows = jnp.concatenate([skew[..., :, None], off_diagonal + squares[..., None] * jnp.eye(3, dtype=m.dtype)], -1)
+    rows = jnp.concatenate([w_row[..., None, :], axis_rows], -2)
+    best = jnp.argmax(diagonal, -1)
+    q = jnp.take_along_axis(rows, best[..., None, None], -2)[..., 0, :]
+    q = q / jnp.linalg.norm(q, axis=-1, keepdims=True)
+    return jnp.where(q[..., :1] < 0, -q, q)
+
+
+def angle(a: Array, b: Array) -> Array:
+    """Geodesic distance in radians (...,) between unit quaternions (..., 4)."""
+    relative = multiply(conjugate(a), b)
+    # The sine is floored so that gradients and values stay finite at zero.
+    sine = jnp.sqrt(jnp.sum(relative[..., 1:] ** 2, -1) + 1e-14)
+    return 2.0 * jnp.arctan2(sine, jnp.abs(relative[..., 0]))
+
+
+def from_axis_angle(axis: Array, theta: Array) -> Array:
+    """Quaternions (..., 4) about unit axes (..., 3) by angles (...,)."""
+    half = 0.5 * theta[..., None]
+    return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1)
+
+
+def axis_rotation(axis: Array, theta: Array) -> Array:
+    """Rotation matrices (..., 3, 3) about unit axes (..., 3) by angles (...,), by Rodrigues' formula."""
+    zero = jnp.zeros_like(axis[..., 0])
+    x, y, z = jnp.moveaxis(axis, -1, 0)
+    k = jnp.stack(
+        [jnp.stack([zero, -z, y], -1), jnp.stack([z, zero, -x], -1), jnp.stack([-y, x, zero], -1)],
+        -2,
+    )
+    s, c = jnp.sin(theta)[..., None, None], jnp.cos(theta)[..., None, None]
+    return jnp.eye(3, dtype=axis.dtype) + s * k + (1.0 - c) * (k @ k)
+
+
+def euler_to_quaternion(angles: Array) -> Array:
+    """Quaternions of intrinsic x-y-z angles (..., 3): R = Rx Ry Rz, the order of the wrist's hinges."""
+    half = 0.5 * angles
+    zero = jnp.zeros_like(half[..., 0])
+    c, s = jnp.cos(half), jnp.sin(half)
+    qx = jnp.stack([c[..., 0], s[..., 0], zero, zero], -1)
+    qy = jnp.stack([c[..., 1], zero, s[..., 1], zero], -1)
+    qz = jnp.stack([c[..., 2], zero, zero, s[..., 2]], -1)
+    return multiply(multiply(qx, qy), qz)
+
+
+def quaternion_to_euler(q: Array) -> Array:
+    """Intrinsic x-y-z angles (..., 3) of quaternions (..., 4); singular where the y angle is +-90 degrees."""
+    m = to_matrix(q)
+    x = jnp.arctan2(-m[..., 1, 2], m[..., 2, 2])
+    y = jnp.arcsin(jnp.clip(m[..., 0, 2], -1.0, 1.0))
+    z = jnp.arctan2(-m[..., 0, 1], m[..., 0, 0])
+    return jnp.stack([x, y, z], -1)
+
+
+def frame_from_axes(primary: Array, secondary: Array) -> Array:
+    """Quaternions (..., 4) of the frame with columns (primary, secondary', primary x secondary').
+
+    `primary` (..., 3) is kept, `secondary` (..., 3) is made orthogonal to it.
+    """
+    first = primary / jnp.linalg.norm(primary, axis=-1, keepdims=True)
+    second = secondary - jnp.sum(secondary * first, -1, keepdims=True) * first
+    second = second / jnp.linalg.norm(second, axis=-1, keepdims=True)
+    return from_matrix(jnp.stack([first, second, jnp.cross(first, second)], -1))
+
+
+def transform(position: Array, quaternion: Array, points: Array) -> Array:
+    """Points (..., N, 3) of a body's frame into the frame in which the body's pose (..., 3), (..., 4) is given."""
+    return jnp.matmul(points, jnp.swapaxes(to_matrix(quaternion), -1, -2), precision=jax.lax.Precision.HIGHEST) + (
+        position[..., None, :]
+    )
+
+
+def inverse_transform(position: Array, quaternion: Array, points: Array) -> Array:
+    """The inverse of `transform`: points (..., N, 3) into the body's frame."""
+    return jnp.matmul(points - position[..., None, :], to_matrix(quaternion), precision=jax.lax.Precision.HIGHEST)
+
+
+def relative_pose(
+    position: Array, quaternion: Array, other_position: Array, other_quaternion: Array
+) -> tuple[Array, Array]:
+    """Pose of `other` seen from the frame of the first pose (..., 3), (..., 4)."""
+    inverse = conjugate(quaternion)
+    return rotate(inverse, other_position - position), multiply(inverse, other_quaternion)
+
+
+def compose_pose(
+    position: Array, quaternion: Array, local_position: Array, local_quaternion: Array
+) -> tuple[Array, Array]:
+    """A pose given in the frame of the first pose, in the frame in which the first pose is given."""
+    return position + rotate(quaternion, local_position), multiply(quaternion, local_quaternion)

@@ -1,0 +1,296 @@
+"""One update of policy, critic and normalisers from a batch of rollouts.
+
+The batch keeps its world axis: arrays are (T, N, ...) with the worlds of all rollouts side by side, on whatever device
+they were made. Everything between the batch and the new weights is one compiled program; the hyperparameters are traced, so
+that other settings need no other compilation. The optimiser's moments are donated to it, the weights are not: the bundle
+that was published with them may still be in use in this process. The host keeps the running statistics
+(`common.policy.normalizer`) and the counters, and sees scalars alone.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from common.config import NetworkConfig, PPOConfig
+from common.errors import PhysicsError
+from common.policy import network, normalizer
+from common.policy.network import Layout, Params
+from common.policy.normalizer import Affine, Statistics
+from common.task.types import Array
+from learner import gae, losses
+
+FIELDS = ("observation", "last_observation", "action", "log_probability", "reward", "terminal")
+"""Arrays of a batch: (T, N, D), (N, D), (T, N, A), (T, N), (T, N) and (T, N)."""
+_CHECKED_INPUTS = FIELDS[:-1]
+_CHECKED = (
+    *_CHECKED_INPUTS,
+    "value",
+    "policy loss",
+    "value loss",
+    "KL divergence",
+    "actor gradient",
+    "critic gradient",
+)
+_FINE = -1  # no term was non-finite; otherwise an index into _CHECKED
+_RATE_FACTOR = 1.5
+_ADAM = optax.scale_by_adam(eps=1e-5)
+
+
+class TrainState(NamedTuple):
+    """Everything that training needs to go on; a pytree whose first four entries live on the device."""
+
+    params: Params
+    optimizer: optax.OptState
+    learning_rate: Array
+    key: Array
+    """(2,) uint32 random key."""
+    observation: Statistics
+    """Of observations (D,), on the host."""
+    value: Statistics
+    """Of lambda-returns (), on the host."""
+    version: int
+    """Updates so far."""
+    transitions: int
+    """Environment steps consumed so far."""
+
+
+class NonFiniteUpdate(PhysicsError):
+    """A term of the update was not finite.
+
+    Attributes:
+      state: the training state before the first minibatch that failed.
+    """
+
+    def __init__(self, term: str, state: TrainState):
+        source = "in the rollouts" if term in _CHECKED_INPUTS else "in the optimisation"
+        super().__init__(f"Not finite {source} of update {state.version + 1}: {term}.")
+        self.state = state
+
+
+def init_state(seed: int, layout: Layout, action_size: int, sizes: NetworkConfig, ppo: PPOConfig) -> TrainState:
+    """The state before the first update."""
+    network_key, key = jax.random.split(jax.random.PRNGKey(seed))
+    params = network.init(network_key, layout, action_size, sizes)
+    size = sum(width for _, width in layout)
+    return TrainState(
+        params,
+        _ADAM.init(params),
+        jnp.float32(ppo.learning_rate),
+        key,
+        normalizer.empty((size,)),
+        normalizer.empty(),
+        version=0,
+        transitions=0,
+    )
+
+
+def update(
+    state: TrainState, batch: Mapping[str, Array], layout: Layout, ppo: PPOConfig
+) -> tuple[TrainState, dict[str, float]]:
+    """Runs PPO on a batch and returns the next state with the update's metrics; the given state's optimiser is
+    consumed.
+
+    The normalisers are frozen during the update and take the batch in afterwards; only the first batch is also what the
+    first update normalises by. The critic's output layer is adapted to the moved value statistics so that its
+    estimates do not change with them (van Hasselt et al. 2016, arXiv 1602.07714).
+
+    Args:
+      state: the training state.
+      batch: arrays `FIELDS`; others are ignored. Rewards are not scaled yet.
+      layout: of the observation.
+      ppo: hyperparameters.
+
+    Raises:
+      NonFiniteUpdate: naming the first term that was not finite.
+    """
+    arrays = {name: batch[name] for name in FIELDS}
+    seen = normalizer.moments(arrays["observation"], event_axes=1)
+    frozen = state.observation if state.observation.count else normalizer.merge(seen)
+    learnt, returns, failure, scalars = _optimise(
+        state.params,
+        state.optimizer,
+        state.learning_rate,
+        state.key,
+        arrays,
+        normalizer.observation_affine(frozen, layout),
+        normalizer.value_affine(state.value),
+        {name: value for name, value in dataclasses.asdict(ppo).items() if isinstance(value, float | tuple)},
+        layout=layout,
+        epochs=ppo.epochs,
+        minibatches=ppo.minibatches,
+    )
+    seen, returns, failure, scalars = jax.device_get((seen, returns, failure, scalars))
+    state = TrainState(*learnt, *state[len(learnt) :])
+    if failure != _FINE:
+        raise NonFiniteUpdate(_CHECKED[failure], state)
+    value = normalizer.merge(state.value, returns)
+    state = state._replace(
+        params=_preserve_values(state.params, normalizer.value_affine(state.value), normalizer.value_affine(value)),
+        observation=normalizer.merge(state.observation, seen),
+        value=value,
+        version=state.version + 1,
+        transitions=state.transitions + arrays["reward"].size,
+    )
+    return state, {name: float(scalar) for name, scalar in scalars.items()}
+
+
+@functools.partial(jax.jit, static_argnames=("layout", "epochs", "minibatches"), donate_argnames="optimizer")
+def _optimise(
+    params: Params,
+    optimizer: optax.OptState,
+    learning_rate: Array,
+    key: Array,
+    batch: dict[str, Array],
+    normalization: Affine,
+    returns_normalization: Affine,
+    hyper: dict[str, Array],
+    *,
+    layout: Layout,
+    epochs: int,
+    minibatches: int,
+) -> tuple[tuple[Params, optax.OptState, Array, Array], Statistics, Array, dict[str, Array]]:
+    """Epochs over the batch; returns the state's first entries, moments of the returns, the failed term and metrics."""
+    log_std = params["actor"]["log_std"]
+    observation = normalizer.apply(normalization, batch["observation"])
+    mean, _ = network.policy(params, layout, observation)
+    log_proximal = network.log_probability(mean, log_std, batch["action"])
+    weight = losses.importance_weight(log_proximal, batch["log_probability"], hyper["importance_max"])
+
+    def values(normalised: Array) -> Array:
+        return network.value(params, layout, normalised) / returns_normalization.scale + returns_normalization.shift
+
+    value = values(observation)
+    last_value = values(normalizer.apply(normalization, batch["last_observation"]))
+    reward = batch["reward"] * hyper["reward_scale"]
+    advantage, returns = gae.advantages(
+        reward, value, last_value, batch["terminal"], hyper["gamma"], hyper["gae_lambda"]
+    )
+    samples = losses.Sample(
+        observation,
+        batch["action"],
+        log_proximal,
+        mean,
+        weight,
+        (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8),
+        (returns - returns_normalization.shift) * returns_normalization.scale,
+    )
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+    inputs = [batch[name] for name in _CHECKED_INPUTS]
+    failure = _first_failure(jnp.int32(_FINE), 0, *inputs, value)
+    key, epochs_key = jax.random.split(key)
+    params, optimizer, failure, (terms, norms) = _epochs(
+        params,
+        optimizer,
+        learning_rate,
+        jax.random.split(epochs_key, epochs),
+        failure,
+        flat,
+        log_std,
+        hyper,
+        layout,
+        minibatches,
+    )
+
+    kl = jnp.mean(terms.kl[-1])
+    metrics = {name: jnp.mean(term) for name, term in terms._asdict().items()}
+    metrics |= {f"{name}_grad_norm": jnp.mean(norm) for name, norm in norms.items()}
+    metrics |= {
+        "kl": kl,
+        "learning_rate": learning_rate,
+        "action_std": jnp.mean(jnp.exp(params["actor"]["log_std"])),
+        "importance_mean": jnp.mean(weight),
+        "importance_max": jnp.max(weight),
+        "importance_truncated": jnp.mean((weight >= hyper["importance_max"]).astype(jnp.float32)),
+        "behaviour_kl": jnp.mean(batch["log_probability"] - log_proximal),
+        "explained_variance": 1.0 - jnp.var(returns - value) / (jnp.var(returns) + 1e-8),
+        "reward_mean": jnp.mean(batch["reward"]),
+        "return_mean": jnp.mean(returns),
+        "value_mean": jnp.mean(value),
+        "advantage_std": jnp.std(advantage),
+    }
+    learnt = params, optimizer, _adapt_rate(learning_rate, kl, hyper), key
+    return learnt, normalizer.moments(returns), failure, metrics
+
+
+def _epochs(
+    params: Params,
+    optimizer: optax.OptState,
+    learning_rate: Array,
+    keys: Array,
+    failure: Array,
+    samples: losses.Sample,
+    log_std_proximal: Array,
+    hyper: dict[str, Array],
+    layout: Layout,
+    minibatches: int,
+) -> tuple[Params, optax.OptState, Array, tuple[losses.Terms, dict[str, Array]]]:
+    """Shuffled minibatches, each sample at most once an epoch; the remainder of the division sits an epoch out."""
+    count = samples.advantage.shape[0]
+    size = count // minibatches
+    coefficients = losses.Coefficients(hyper["clip"], hyper["entropy"], hyper["value_coefficient"])
+    gradient = jax.value_and_grad(losses.objective, has_aux=True)
+
+    def step(carry: tuple[Params, optax.OptState, Array], rows: Array):
+        params, optimizer, failure = carry
+        minibatch = jax.tree.map(lambda x: x[rows], samples)
+        (_, terms), gradients = gradient(params, layout, log_std_proximal, minibatch, coefficients)
+        # The networks share no weight, so one's large gradient must not shrink the other's.
+        norms = {name: optax.global_norm(tree) for name, tree in gradients.items()}
+        shrink = {
+            name: hyper["max_grad_norm"] / jnp.maximum(norm, hyper["max_grad_norm"]) for name, norm in norms.items()
+        }
+        gradients = {name: jax.tree.map(lambda g, s=shrink[name]: g * s, tree) for name, tree in gradients.items()}
+        failure = _first_failure(
+            failure,
+            len(_CHECKED_INPUTS) + 1,
+            terms.policy_loss,
+            terms.value_loss,
+            terms.kl,
+            norms["actor"],
+            norms["critic"],
+        )
+        direction, moved_optimizer = _ADAM.update(gradients, optimizer)
+        moved = jax.tree.map(lambda p, d: p - learning_rate * d, params, direction)
+        params, optimizer = jax.tree.map(
+            lambda new, old: jnp.where(failure == _FINE, new, old), (moved, moved_optimizer), (params, optimizer)
+        )
+        return (params, optimizer, failure), (terms, norms)
+
+    def epoch(carry: tuple[Params, optax.OptState, Array], key: Array):
+        order = jax.random.permutation(key, count)[: size * minibatches]
+        return jax.lax.scan(step, carry, order.reshape(minibatches, size))
+
+    (params, optimizer, failure), metrics = jax.lax.scan(epoch, (params, optimizer, failure), keys)
+    return params, optimizer, failure, metrics
+
+
+def _first_failure(failure: Array, offset: int, *terms: Array) -> Array:
+    """`failure` if it names a term already, else `offset` plus the index of the first term that is not finite."""
+    bad = jnp.stack([~jnp.all(jnp.isfinite(term)) for term in terms])
+    found = jnp.where(jnp.any(bad), offset + jnp.argmax(bad).astype(jnp.int32), _FINE)
+    return jnp.where(failure == _FINE, found, failure)
+
+
+def _adapt_rate(rate: Array, kl: Array, hyper: dict[str, Array]) -> Array:
+    """The next update's learning rate from the mean KL to the proximal policy over the last epoch."""
+    target = hyper["kl_target"]
+    factor = jnp.where(kl > 2.0 * target, 1.0 / _RATE_FACTOR, jnp.where(kl < target / 2.0, _RATE_FACTOR, 1.0))
+    return jnp.clip(rate * factor, *hyper["learning_rate_range"])
+
+
+@jax.jit
+def _preserve_values(params: Params, before: Affine, after: Affine) -> Params:
+    """The critic with its output layer changed such that its estimates stay the same under another normalisation."""
+    output = params["critic"]["output"]
+    ratio = after.scale / before.scale
+    moved = {
+        "kernel": output["kernel"] * ratio,
+        "bias": output["bias"] * ratio + (before.shift - after.shift) * after.scale,
+    }
+    return {**params, "critic": {**params["critic"], "output": moved}}

@@ -1,0 +1,122 @@
+"""`congrasp COMMAND …`: finds the command's module, runs it, and turns errors into one line and an exit code."""
+
+import importlib
+import inspect
+import os
+import pathlib
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from common.errors import CongraspError
+from services.shutdown import follow_parent, on_signal
+
+COMMANDS = {
+    "train": "train a policy: a learner and its actors on this machine",
+    "learner": "the learner alone; actors connect to it, from this machine or others",
+    "actor": "one actor that works for a learner elsewhere",
+    "serve": "answer live queries with a run's newest policy or a policy file",
+    "query": "ask a policy server for one action, or measure its latency",
+    "objects": "generate, import, list and show objects",
+    "record": "record a run to MCAP, from this machine or another",
+    "plot": "draw a run's learning curves and reward terms",
+    "render": "draw the hand, or an episode of a run",
+    "status": "who works on a run, and how it goes",
+    "doctor": "what is wrong with this machine or installation",
+}
+"""Commands in the order of the help; `services.cli.<name>` is the module."""
+
+USAGE_ERROR = 2
+EXTRAS = {"foxglove": "viz", "imageio_ffmpeg": "viz", "matplotlib": "viz", "warp": "cuda"}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the `congrasp` script; ends the process with the command's exit code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    follow_parent()
+    debug = "--debug" in arguments
+    if debug:
+        arguments.remove("--debug")
+    try:
+        code = run(arguments)
+    except CongraspError as error:
+        code = _complain(str(error), error.exit_code, debug)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in ("common", "actors", "learner", "services"):
+            raise
+        package = (error.name or "").partition(".")[0]
+        extra = EXTRAS.get(package, "train")
+        code = _complain(f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug)
+    sys.stdout.flush()
+    sys.exit(code)
+
+
+def run(arguments: list[str]) -> int:
+    """Runs one command; returns its exit code, 130 after Ctrl-C and 143 after SIGTERM."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage())
+        return 0
+    name, *rest = arguments
+    if name == "--version":
+        import importlib.metadata
+
+        print(importlib.metadata.version("congrasp"))
+        return 0
+    if name not in COMMANDS:
+        raise CongraspError(f"There is no command '{name}'.", f"Choose one of: {', '.join(COMMANDS)}.")
+    _prepare_environment()
+    with on_signal(interrupt=True) as stop:
+        try:
+            result = load(name)(rest)
+        except KeyboardInterrupt:
+            result = None
+        return stop.exit_code or (result if isinstance(result, int) else 0)
+
+
+def load(name: str) -> Callable[[list[str]], Any]:
+    """The command's module as a function of its arguments."""
+    module = importlib.import_module(f"services.cli.{name}")
+    if hasattr(module, "parse"):
+        return lambda rest: module.parse(rest)()
+    import tyro
+
+    prog = f"congrasp {name}"
+    if hasattr(module, "COMMANDS"):
+        description = inspect.getdoc(module)
+        return lambda rest: tyro.extras.subcommand_cli_from_dict(
+            module.COMMANDS, prog=prog, description=description, args=rest
+        )
+    return lambda rest: tyro.cli(module.COMMAND, prog=prog, args=rest)
+
+
+def usage() -> str:
+    """The text of `congrasp --help`."""
+    width = max(map(len, COMMANDS))
+    rows = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
+    return (
+        "usage: congrasp COMMAND [options]\n\n"
+        "Dexterous grasping under constraints: distributed training and a live policy.\n\n"
+        f"{rows}\n\n"
+        "Options of every command: --help, and --debug for the trace of an error.\n"
+        "First steps: 'congrasp train --preset quickstart', then 'congrasp plot runs/…'.\n"
+    )
+
+
+def _prepare_environment() -> None:
+    """Keeps compiled programs between runs, and the compilers' chatter off the screen; what the user set stays."""
+    cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "jax"
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def _complain(text: str, code: int, debug: bool) -> int:
+    if debug:
+        traceback.print_exc()
+    print(f"congrasp: error: {text}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    main()

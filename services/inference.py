@@ -1,0 +1,98 @@
+"""The policy as one compiled function from a batch of flat queries to joint targets."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from common.config import TaskConfig
+from common.constraints.priority import Request, explain, resolve
+from common.errors import CongraspError
+from common.hands.spec import Hand
+from common.policy import network, normalizer
+from common.task import control, observation
+from common.task.features import features
+from common.task.types import MASKS, Goal, SceneState, Surface
+from services.requests import Layout, Query
+
+BATCH_SIZES = (1, 8, 64)
+"""Batches are padded to one of these, so that nothing compiles after the warm-up."""
+
+
+class Answer(NamedTuple):
+    """What the policy says to one query."""
+
+    action: np.ndarray
+    """(A,) mean of the policy, in units of action."""
+    q_target: np.ndarray
+    """(F,) finger joint targets, rad."""
+    u_target: np.ndarray
+    """(6,) virtual wrist joint targets, m and rad."""
+    words: tuple[str, ...]
+    """Which constraints are active, and why."""
+
+
+class Weights(NamedTuple):
+    """What a bundle contributes to the compiled function: arrays on the device."""
+
+    params: Any
+    affine: normalizer.Affine
+
+
+class PolicyFunction:
+    """The policy of one hand, task and network size, for any weights.
+
+    Attributes:
+      layout: how queries are laid out.
+    """
+
+    def __init__(self, hand: Hand, task: TaskConfig):
+        self.layout = Layout(hand, task)
+        self._compiled = jax.jit(self._infer)
+
+    def warm_up(self, weights: Weights) -> None:
+        """Compiles every batch size."""
+        for size in BATCH_SIZES:
+            jax.block_until_ready(self._compiled(weights, np.zeros((size, self.layout.size), np.float32)))
+
+    def __call__(self, weights: Weights, queries: Sequence[Query]) -> list[Answer | Exception]:
+        """Answers at most `BATCH_SIZES[-1]` queries; a query that cannot be answered gets its own error."""
+        size = next(size for size in BATCH_SIZES if size >= len(queries))
+        batch = np.zeros((size, self.layout.size), np.float32)
+        batch[: len(queries)] = [query.vector for query in queries]
+        rows = np.asarray(self._compiled(weights, batch))[: len(queries)]
+        return [self._answer(query, row) for query, row in zip(queries, rows, strict=True)]
+
+    def _infer(self, weights: Weights, vectors: jax.Array) -> jax.Array:
+        """(B, A + F + 6 + 2): action, targets, and the flags redirected and aligned, of flat queries (B, S)."""
+        hand, task = self.layout.hand, self.layout.task
+        fields = self.layout.unpack(vectors)
+        flags = {name: fields[name] > 0.5 for name in ("contact_found", "table", "surface_minus", "asked")}
+        state = SceneState(**{name: {**fields, **flags}[name] for name in SceneState._fields})
+        surface = Surface(fields["surface_points"], flags["surface_minus"])
+        mask = jnp.zeros((len(vectors), len(MASKS)))
+        asked = Goal(**{name: mask if name == "mask" else fields[name] for name in Goal._fields})
+        resolution = resolve(hand, surface, Request(asked, *jnp.moveaxis(flags["asked"], -1, 0)))
+        seen = features(hand, task, state, surface, resolution.goal)
+        observed = observation.observe(task, state, seen, resolution.goal)
+        mean, _ = network.policy(
+            weights.params, observation.layout(hand, task), normalizer.apply(weights.affine, observed)
+        )
+        action = control.decode(hand, task.control, state, seen, resolution.goal, mean)
+        notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
+        return jnp.concatenate([mean, action.q_target, action.u_target, notes], -1)
+
+    def _answer(self, query: Query, row: np.ndarray) -> Answer | Exception:
+        fingers = len(self.layout.hand.joints)
+        action, q_target, u_target, (redirected, aligned) = np.split(row, np.cumsum([fingers + 6, fingers, 6]))
+        if not np.isfinite(row).all():
+            return CongraspError("The policy's answer to this query is not finite.", "Check the state's magnitudes.")
+        if not aligned:
+            return CongraspError(
+                "The constraints contradict each other: the trajectory ends nearer to O- than to O+ of the affordance.",
+                "Change the trajectory or the affordance.",
+            )
+        asked = {name: name in query.asked for name in ("affordance", "pose", "trajectory")}
+        return Answer(action, q_target, u_target, tuple(explain(**asked, redirected=bool(redirected))))

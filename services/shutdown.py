@@ -1,0 +1,86 @@
+"""Ctrl-C and SIGTERM: drain, but never for longer than a few seconds."""
+
+import contextlib
+import ctypes
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+GRACE = 4.0
+"""Seconds between a signal and the end of the process at the latest."""
+PARENT_VARIABLE = "CONGRASP_PARENT"
+"""Environment variable by which a process tells its children that they must not outlive it."""
+
+
+class Stop(threading.Event):
+    """Set by the first SIGINT or SIGTERM; loops poll it or wait on it.
+
+    Attributes:
+      signal: number of the signal that came, or None.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.signal: int | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """What the shell expects of a process that a signal ended; zero if none came."""
+        return 128 + self.signal if self.signal else 0
+
+
+@contextlib.contextmanager
+def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop]:
+    """A `Stop` that signals set while the block runs; only in the main thread.
+
+    Python runs its handlers between two bytecodes of the main thread, which may sit in a compiler for a minute. The
+    interpreter's wake-up file descriptor is written at once, so a thread that reads it sets the event, and ends the
+    process if it has not ended by itself within `grace` seconds.
+
+    Args:
+      grace: seconds from the signal to the forced end.
+      interrupt: also raise KeyboardInterrupt in the main thread, for code that polls nothing.
+    """
+    stop = Stop()
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+
+    def watch() -> None:
+        number = reader.recv(1)
+        if not number:
+            return
+        stop.signal = number[0]
+        stop.set()
+        time.sleep(grace)
+        os._exit(stop.exit_code)
+
+    def handle(number: int, frame: object) -> None:
+        if interrupt:
+            raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=watch, daemon=True, name="signals").start()
+    try:
+        yield stop
+    finally:
+        signal.set_wakeup_fd(wakeup)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        if not stop.is_set():
+            writer.close()
+
+
+def follow_parent() -> None:
+    """Asks the kernel for SIGTERM when the parent dies, if the parent wants that (Linux; elsewhere nothing happens)."""
+    parent = os.environ.pop(PARENT_VARIABLE, None)
+    if parent is None or not sys.platform.startswith("linux"):
+        return
+    pr_set_pdeathsig = 1
+    ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)
+    if os.getppid() != int(parent):
+        os.kill(os.getpid(), signal.SIGTERM)

@@ -1,0 +1,34 @@
+"""Fixtures that several test folders share."""
+
+import os
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import pathlib
+import socket
+from collections.abc import Callable
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def shared_objects() -> pathlib.Path:
+    """Folder of the 24 scanned objects, which lies beside the repository where it is present."""
+    folder = ROOT.parent / "shared" / "objects"
+    if not folder.is_dir():
+        pytest.skip("the scanned objects are not here (../shared/objects)")
+    return folder
+
+
+@pytest.fixture
+def free_port() -> Callable[[], int]:
+    """A function that names a TCP port of the loopback interface that nobody listens on."""
+
+    def find() -> int:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            return probe.getsockname()[1]
+
+    return find
