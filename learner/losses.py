@@ -1,9 +1,9 @@
 """Decoupled proximal policy optimisation (Hilton et al. 2021, arXiv 2110.00641).
 
-Three policies take part: the behaviour policy acted, possibly some versions ago; the proximal policy is the learner's at
-the start of the update; the current one is being optimised. The trust region is around the proximal policy, so that old
-data do not use it up before learning begins; an importance weight corrects for who acted. With the proximal policy equal
-to the behaviour policy the weight is exactly one and the objective is that of plain PPO.
+Three policies take part: the behaviour policy acted, possibly some versions ago; the proximal policy is the learner's
+at the start of the update; the current one is being optimised. The trust region is around the proximal policy, so that
+old data do not use it up before learning begins; an importance weight corrects for who acted. With the proximal policy
+equal to the behaviour policy the weight is exactly one and the objective is that of plain PPO.
 """
 
 from typing import NamedTuple

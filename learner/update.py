@@ -1,9 +1,9 @@
 """One update of policy, critic and normalisers from a batch of rollouts.
 
 The batch keeps its world axis: arrays are (T, N, ...) with the worlds of all rollouts side by side, on whatever device
-they were made. Everything between the batch and the new weights is one compiled program; the hyperparameters are traced, so
-that other settings need no other compilation. The optimiser's moments are donated to it, the weights are not: the bundle
-that was published with them may still be in use in this process. The host keeps the running statistics
+they were made. Everything between the batch and the new weights is one compiled program; hyperparameters are traced, so
+that other settings need no other compilation. The optimiser's moments are donated to it, the weights are not: the
+bundle that was published with them may still be in use in this process. The host keeps the running statistics
 (`common.policy.normalizer`) and the counters, and sees scalars alone.
 """
 
@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from common.config import NetworkConfig, PPOConfig
@@ -93,9 +92,9 @@ def init_state(seed: int, layout: Layout, action_size: int, sizes: NetworkConfig
 def update(
     state: TrainState, batch: Mapping[str, Array], layout: Layout, ppo: PPOConfig
 ) -> tuple[TrainState, dict[str, float]]:
-    """Runs PPO on a batch and returns the next state with the update's metrics; the given state's optimiser is
-    consumed.
+    """Runs PPO on a batch and returns the next state with the update's metrics.
 
+    The given state must not be used again: its optimiser's arrays are consumed.
     The normalisers are frozen during the update and take the batch in afterwards; only the first batch is also what the
     first update normalises by. The critic's output layer is adapted to the moved value statistics so that its
     estimates do not change with them (van Hasselt et al. 2016, arXiv 1602.07714).

@@ -5,12 +5,16 @@ comes from one soft key light and a dome; shadows are found by casting rays from
 """
 
 import dataclasses
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import Literal
 
 import mujoco
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+
+from services.smooth import SmoothNormals
 
 Kind = Literal["box", "sphere", "capsule", "cylinder", "ellipsoid", "mesh"]
 
@@ -27,10 +31,9 @@ _TYPES = {
 _SOLID, _GLASS = 0, 1  # geom groups
 _FAR = 4.0  # distance of the lamps from what they light, m
 _KEY = np.array([-0.45, -0.55, 1.0])  # direction towards the key light, in the camera's turned frame
-_KEY_STRENGTH, _DOME_STRENGTH, _BOUNCE = 0.62, 0.44, 0.05
+_KEY_STRENGTH, _DOME_STRENGTH, _BOUNCE = 0.72, 0.46, 0.05
 _KEY_LAMPS, _DOME_LAMPS = 3, 8  # in each of four sets that neighbouring pixels take turns with
 _SKIN = 4e-4  # how far shadow rays may end before the surface, m
-_CREASE = np.cos(np.radians(35.0))
 _TOP, _BOTTOM = np.array([0.93, 0.945, 0.965]), np.array([0.80, 0.82, 0.85])  # background, sRGB
 
 
@@ -147,12 +150,16 @@ class _Scene:
                 geom["size"] = shape.size
             spec.worldbody.add_geom(**geom)
         self.model = spec.compile()
-        self.data = mujoco.MjData(self.model)
-        mujoco.mj_kinematics(self.model, self.data)
-        self.smooth = {i: _SmoothNormals(s) for i, s in enumerate(shapes) if s.kind == "mesh"}
+        # Ray casts keep scratch memory in their data: one for each thread.
+        self.data = [mujoco.MjData(self.model) for _ in range(4)]
+        for data in self.data:
+            mujoco.mj_kinematics(self.model, data)
+        self.smooth = {i: SmoothNormals(s.vertices, s.faces) for i, s in enumerate(shapes) if s.kind == "mesh"}
         self.paint = {i: cKDTree(s.paint_points) for i, s in enumerate(shapes) if s.paint_points is not None}
 
-    def cast(self, origin: np.ndarray, rays: np.ndarray, group: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def cast(
+        self, origin: np.ndarray, rays: np.ndarray, group: int, thread: int = 0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Shape index (-1: none), distance and normal of the first hits of unit rays (..., 3) of one group."""
         count = rays.size // 3
         index, distance, normal = np.full(count, -1, np.int32), np.full(count, -1.0), np.zeros(3 * count)
@@ -160,7 +167,7 @@ class _Scene:
         groups[group] = 1
         if count:
             mujoco.mj_multiRay(
-                self.model, self.data, np.asarray(origin, float), np.ravel(rays), groups, True, -1,
+                self.model, self.data[thread], np.asarray(origin, float), np.ravel(rays), groups, True, -1,
                 index, distance, normal, count, mujoco.mjMAXVAL,
             )  # fmt: skip
         shape = rays.shape[:-1]
@@ -232,7 +239,11 @@ class _Scene:
         key = key / np.linalg.norm(key)
         lamp_set = ((pixel % grid[1]) % 2 + 2 * ((pixel // grid[1]) % 2) + sample) % 4
         seen, sky = self._light(point + 2 * _SKIN * normal, bent, key, lamp_set)
-        seen, sky = _blur(np.stack([seen, sky], -1), index, normal, np.where(sample == 0, pixel, -1), grid).T
+        place = np.where(sample == 0, pixel, -1)
+        softened = np.stack([seen, sky], -1)
+        for _ in range(2):
+            softened = _blur(softened, index, normal, place, grid)
+        seen, sky = softened.T
         half = key - ray
         half = half / np.linalg.norm(half, axis=1, keepdims=True)
         gloss = shine * seen * np.clip((bent * half).sum(1), 0, None) ** 60
@@ -245,92 +256,31 @@ class _Scene:
         """Share of the key light (n,) and light of the sky (n,) at points (n, 3), each lit by one of four lamp sets."""
         seen, sky = np.zeros(len(start)), np.zeros(len(start))
         keys, dome = _disc(key, 4 * _KEY_LAMPS, 0.14), _dome(4 * _DOME_LAMPS)
-        for one in range(4):
-            here = lamp_set == one
+
+        def light(one: int) -> None:
+            mine = np.flatnonzero(lamp_set == one)
+            towards_key = mine[normal[mine] @ key > 0]
             for lamp in keys[one::4]:
-                seen[here] += self._lit(start[here], lamp) / _KEY_LAMPS
+                seen[towards_key] += self._lit(start[towards_key], lamp, one) / _KEY_LAMPS
             for lamp in dome[one::4]:
                 # Wrapped Lambert: a lamp of the dome stands for a patch of sky.
-                facing = np.clip(0.75 * (normal[here] @ lamp) + 0.25, 0, None)
-                sky[here] += 2 / _DOME_LAMPS * self._lit(start[here], lamp) * facing
+                facing = 0.75 * (normal[mine] @ lamp) + 0.25
+                here, facing = mine[facing > 0], facing[facing > 0]
+                sky[here] += 2 / _DOME_LAMPS * self._lit(start[here], lamp, one) * facing
+
+        with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+            list(pool.map(light, range(4)))
         return seen, sky
 
-    def _lit(self, point: np.ndarray, lamp: np.ndarray) -> np.ndarray:
+    def _lit(self, point: np.ndarray, lamp: np.ndarray, thread: int) -> np.ndarray:
         """(n,) whether a lamp in direction (3,) of the unit sphere is seen from points (n, 3)."""
         if not len(point):
             return np.zeros(0)
         origin = point.mean(0) + _FAR * lamp
         rays = point - origin
         length = np.linalg.norm(rays, axis=1, keepdims=True)
-        _, distance, _ = self.cast(origin, rays / length, _SOLID)
+        _, distance, _ = self.cast(origin, rays / length, _SOLID, thread)
         return (distance < 0) | (distance > length[:, 0] - _SKIN)
-
-
-class _SmoothNormals:
-    """Interpolated vertex normals of a mesh, sharp where two faces meet at more than the crease angle."""
-
-    _NEAREST = 6
-
-    def __init__(self, shape: Shape):
-        vertices, faces = np.asarray(shape.vertices, float), np.asarray(shape.faces)
-        corners = vertices[faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(cross, axis=1)
-        good = area > 1e-14
-        faces, corners, cross, area = faces[good], corners[good], cross[good], area[good]
-        self.normals = cross / area[:, None]
-        self.corners = corners
-        # Vertices at one place are one vertex, whatever the file says.
-        _, place = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
-        self.corner_normals = self._corner_normals(place.ravel()[faces], cross)
-        self.scale = float(np.ptp(vertices, axis=0).max())
-        offset = (self.normals * corners[:, 0]).sum(1)
-        centre = corners.mean(1)
-        self.tree = cKDTree(np.column_stack([self.normals * 10, offset / self.scale * 10, centre / self.scale]))
-        self.reach = len(faces)
-
-    def _corner_normals(self, faces: np.ndarray, cross: np.ndarray) -> np.ndarray:
-        """(F, 3, 3) mean of the area-weighted normals around each corner that are within the crease angle."""
-        order = np.argsort(faces.ravel(), kind="stable")
-        owner = order // 3
-        starts = np.flatnonzero(np.r_[True, np.diff(faces.ravel()[order]) > 0])
-        sizes = np.diff(np.r_[starts, len(order)])
-        result = np.zeros((len(order), 3))
-        for size in np.unique(sizes):
-            groups = starts[sizes == size][:, None] + np.arange(size)
-            around = owner[groups]  # (groups, size) faces that share a vertex
-            near = np.einsum("gik,gjk->gij", self.normals[around], self.normals[around]) > _CREASE
-            result[order[groups]] = np.einsum("gij,gjk->gik", near, cross[around])
-        result = result.reshape(-1, 3, 3)
-        return result / np.linalg.norm(result, axis=-1, keepdims=True)
-
-    def __call__(self, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """(n, 3) smooth normals at points (n, 3) of the surface with flat normals (n, 3), in the mesh's frame."""
-        offset = (normal * point).sum(1)
-        key = np.column_stack([normal * 10, offset / self.scale * 10, point / self.scale])
-        near = self.tree.query(key, k=min(self._NEAREST, self.reach))[1].reshape(len(point), -1)
-        a, b, c = np.moveaxis(self.corners[near], -2, 0)
-        weights = _barycentric(point[:, None], a, b, c)
-        best = np.argmax(weights.min(-1), 1)
-        rows = np.arange(len(point))
-        face = near[rows, best]
-        weight = np.clip(weights[rows, best], 0, 1)
-        smooth = (weight[:, :, None] * self.corner_normals[face]).sum(1)
-        # Meshes that wind inwards are lit from the side that is seen.
-        smooth *= np.sign((smooth * normal).sum(1, keepdims=True))
-        found = weights.min(-1).max(1) > -0.05
-        smooth = np.where(found[:, None], smooth, normal)
-        return smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
-
-
-def _barycentric(point: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """(..., 3) barycentric coordinates of points in the planes of triangles, all (..., 3)."""
-    u, v, w = b - a, c - a, point - a
-    uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
-    wu, wv = (w * u).sum(-1), (w * v).sum(-1)
-    det = uu * vv - uv * uv
-    second, third = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
-    return np.stack([1 - second - third, second, third], -1)
 
 
 def _painted(tree: cKDTree, colours: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -346,7 +296,7 @@ def _blur(
 ) -> np.ndarray:
     """Averages value (n, c) over the 3 x 3 pixels around, among points of one shape that face the same way.
 
-    The binomial filter weighs the four interleaved lamp sets equally. Points whose `pixel` is negative stay as they are.
+    The binomial filter weighs the four interleaved lamp sets equally. Points with a negative `pixel` stay as they are.
     """
     pixels, width = grid
     place = np.full(pixels, -1)

@@ -59,8 +59,7 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     table = spec.worldbody.add_body(name="table", mocap=True)
     table.add_geom(
         name="table",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=(0.0, 0.0, -0.05),
+        type=mujoco.mjtGeom.mjGEOM_PLANE,  # MJX-JAX collides a cylinder with a plane, but not with a box
         size=(0.6, 0.6, 0.05),
         contype=0,
         conaffinity=OBJECT_CONTYPE | (HAND_CONTYPE if task.hand_table_collision else 0),

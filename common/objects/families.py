@@ -4,6 +4,7 @@ A family is a function of a random generator that returns a `Draft`. Sizes are i
 (`common.objects.procedural`) weighs, recentres and checks what it gets, and asks again where it does not like it.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -325,7 +326,7 @@ def ring(rng: Rng) -> Draft:
     profile = np.stack([major + thick * np.cos(rim), high * np.sin(rim)], -1)
     turns = 2 * np.pi / 8 * np.arange(9)
     ends = [np.array([_polar(r, turn, z) for r, z in profile]) for turn in turns]
-    return Draft(tuple(_mesh(np.concatenate(pair)) for pair in zip(ends[:-1], ends[1:], strict=True)))
+    return Draft(tuple(_mesh(np.concatenate(pair)) for pair in itertools.pairwise(ends)))
 
 
 @_family
@@ -346,7 +347,7 @@ def _vessel(bottom: float, top: float, height: float, wall: float) -> Draft:
     turns = 2 * np.pi / 7 * np.arange(8)
     floor = np.array([_polar(bottom, turn, z) for turn in turns[:-1] for z in (0.0, wall)])
     pieces = [_mesh(floor)]
-    for pair in zip(turns[:-1], turns[1:], strict=True):
+    for pair in itertools.pairwise(turns):
         corners = [(bottom - wall, wall), (bottom, wall), (top - wall, height), (top, height)]
         pieces.append(_mesh(np.array([_polar(r, turn, z) for turn in pair for r, z in corners])))
     return Draft(tuple(pieces))

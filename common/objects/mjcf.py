@@ -32,7 +32,7 @@ class ContactSettings:
 
 
 CONTACT = ContactSettings()
-_GEOM = {
+GEOM_TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -75,7 +75,7 @@ def add_object(
         geom_name = f"{name}_{index}"
         geom = body.add_geom(
             name=geom_name,
-            type=_GEOM[piece.kind],
+            type=GEOM_TYPES[piece.kind],
             pos=piece.pos,
             quat=piece.quat,
             contype=contype,

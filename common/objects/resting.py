@@ -15,8 +15,8 @@ _SAME_KIND = 5e-4  # m; poses whose heights differ by less are turns of one anot
 _PER_KIND = 4
 _LEAST_LIKELY = 0.02
 _STILL = 1e-3  # m/s
-_TILT, _DROP = 0.07, 5e-6  # rad, m; a pose whose centre of mass sinks by this much when tilted is not stable
-_ROUNDS = 6
+_TILT, _DROP = 0.03, 1.5e-6  # rad, m; a pose whose centre of mass sinks by this much when tilted is not stable
+_ROUNDS = 4
 
 
 class Settled(NamedTuple):
@@ -57,15 +57,15 @@ class TableScene:
         Args:
           pose: (7,) where it starts.
           seconds: simulated time.
-          overdamped: damps rotation so much that rocking dies out at once; off, physics is the task's.
+          overdamped: damps rotation so much that rocking dies out quickly; off, physics is the task's.
         """
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = pose
         damping = self.model.dof_damping.copy()
         if overdamped:
-            # The critical damping of a pendulum with the object's weight, size and inertia.
+            # A good part of the critical damping of a pendulum with the object's weight, size and inertia.
             inertia = self.model.body_inertia[1].max()
-            self.model.dof_damping[3:] += np.sqrt(self.model.body_mass[1] * 9.81 * self.radius * inertia)
+            self.model.dof_damping[3:] += 0.25 * np.sqrt(self.model.body_mass[1] * 9.81 * self.radius * inertia)
         mujoco.mj_step(self.model, self.data, nstep=max(1, round(seconds / CONTACT.timestep)))
         self.model.dof_damping[:] = damping
         linear, angular = np.linalg.norm(self.data.qvel.reshape(2, 3), axis=-1)
@@ -83,25 +83,27 @@ def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
 
     The quasi-static poses are settled by physics, for `seconds` or a few times as long where that is not enough;
     those that do not come to rest, those that a small tilt would lower and those that end in a pose found before are
-    left out. If none is left, the most likely one is taken as far as it got.
+    left out. If none is left, the object is let go in the most likely one until it has come to rest.
     """
     candidates, _ = quasi_static_poses(obj.pieces)
     scene = TableScene(obj)
     found: list[np.ndarray] = []
-    moving: list[np.ndarray] = []
     downs: list[np.ndarray] = []
     for pose in candidates:
-        settled = scene.settle(pose, seconds, overdamped=True)
         for _ in range(_ROUNDS):
-            down = -shapes.matrix(settled.pose[3:])[2]
-            if settled.speed < _STILL or any(down @ other > _SAME_NORMAL for other in downs):
+            settled = scene.settle(pose, seconds, overdamped=True)
+            pose = settled.pose
+            down = -shapes.matrix(pose[3:])[2]
+            if any(down @ other > _SAME_NORMAL for other in downs):
                 break
-            settled = scene.settle(settled.pose, seconds, overdamped=True)
-        moving.append(settled.pose)
-        if settled.speed < _STILL and _stable(obj.pieces, down) and all(down @ other < _SAME_NORMAL for other in downs):
-            found.append(settled.pose)
-            downs.append(down)
-    poses = np.array(found or moving[:1])
+            if settled.speed < _STILL and _stable(obj.pieces, down):
+                found.append(pose)
+                downs.append(down)
+                break
+    if not found:
+        tumbled = scene.settle(candidates[0], 20 * seconds)
+        found.append(scene.settle(tumbled.pose, 20 * seconds, overdamped=True).pose)
+    poses = np.array(found)
     poses[:, :2] = 0.0
     return poses
 
@@ -159,28 +161,28 @@ def _lowest_nearby(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
     best, height = downs, _height(pieces, downs)
     columns = np.arange(len(best))
     step = 0.1
-    for i in range(24):
-        tries = _cone(best, step, phase=i)
+    for i in range(12):
+        tries = _cone(best, step, count=8, phase=i)
         heights = _height(pieces, tries.reshape(-1, 3)).reshape(len(tries), -1)
         pick = heights.argmin(0)
         lower = heights[pick, columns] < height
         best = np.where(lower[:, None], tries[pick, columns], best)
         height = np.where(lower, heights[pick, columns], height)
-        step *= 0.8
+        step *= 0.65
     return best
 
 
 def _stable(pieces: tuple[Piece, ...], down: np.ndarray) -> bool:
     """Whether no small tilt lowers the centre of mass of an object with a direction (3,) downwards."""
-    tilted = _cone(down[None], _TILT, phase=0.0)[:, 0]
+    tilted = _cone(down[None], _TILT, count=64)[:, 0]
     return bool(_height(pieces, tilted).min() > _height(pieces, down[None])[0] - _DROP)
 
 
-def _cone(axes: np.ndarray, slope: float, phase: float) -> np.ndarray:
-    """Eight unit directions (8, D, 3) around each axis (D, 3), the arc tangent of `slope` away from it."""
+def _cone(axes: np.ndarray, slope: float, count: int, phase: float = 0.0) -> np.ndarray:
+    """Unit directions (count, D, 3) around each axis (D, 3), the arc tangent of `slope` away from it."""
     side = np.cross(axes, np.eye(3)[np.abs(axes).argmin(-1)])
     side /= np.linalg.norm(side, axis=-1, keepdims=True)
-    turn = (np.pi / 4 * np.arange(8) + phase)[:, None, None]
+    turn = (2 * np.pi / count * np.arange(count) + phase)[:, None, None]
     directions = axes + slope * (np.cos(turn) * side + np.sin(turn) * np.cross(axes, side))
     return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 

@@ -124,7 +124,8 @@ def policy(params: Params, layout: Layout, observation: Array) -> tuple[Array, A
 def value(params: Params, layout: Layout, observation: Array) -> Array:
     """The critic's estimate (...,) of the normalised return."""
     critic = params["critic"]
-    return _critic(layout, *_sizes(critic)).apply({"params": critic}, observation)[..., 0]
+    output: Array = _critic(layout, *_sizes(critic)).apply({"params": critic}, observation)
+    return output[..., 0]
 
 
 def log_probability(mean: Array, log_std: Array, action: Array) -> Array:

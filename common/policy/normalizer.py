@@ -1,7 +1,7 @@
 """Running statistics of observations and returns.
 
-A batch is summarised on its device as count, mean and M2 (the sum of squared deviations from the mean) in float32; these
-few hundred numbers travel to the host, where they are merged into the running statistics in float64 (Chan et al. 1979).
+A batch is summarised on its device as count, mean and M2 (the sum of squared deviations from the mean) in float32;
+these few hundred numbers go to the host, which merges them into the running statistics in float64 (Chan et al. 1979).
 So counts beyond 2^24 stay exact and small updates of an old mean are not lost, without 64-bit mode on the device.
 Merging is associative up to float64 rounding: the deltas of several learner ranks, merged in rank order on every rank,
 give every rank the same bits.

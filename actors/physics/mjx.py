@@ -1,0 +1,192 @@
+"""MJX, in its two implementations: `warp` (NVIDIA kernels, also runs on a CPU for tests) and `jax` (XLA, any device).
+
+The state is a pytree and every call can be traced, so that a whole rollout compiles into one program.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from actors.physics.engine import Readout, World
+from actors.physics.readout import diverged, readout
+from actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, addresses
+from actors.physics.slots import build_pool
+from common.config import TaskConfig
+from common.hands.spec import Hand
+from common.objects.spec import GraspObject
+from common.task.types import CONTACTS_PER_LINK, Array
+
+CONTACTS_PER_WORLD = 40
+"""Contacts that warp's shared list holds for each world on average."""
+CONSTRAINTS_PER_WORLD = 320
+"""Constraint rows that warp holds for each world."""
+
+
+class MjxState(NamedTuple):
+    """Batched data, the leaves of each world's model, and what a diverged world is put back to."""
+
+    data: Any
+    leaves: dict[str, Array]
+    qpos_start: Array
+
+
+class MjxPhysics:
+    """A batch of worlds in MJX."""
+
+    compiled = True
+
+    def __init__(
+        self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], implementation: Literal["warp", "jax"]
+    ):
+        """Puts the pool's model on the device.
+
+        Args:
+          hand: the hand.
+          task: timing and collision settings.
+          objects: the pool that `World.object_index` points into.
+          implementation: `warp` or `jax`.
+        """
+        self.name = implementation
+        self._task = task
+        pool = build_pool(hand, task, objects)
+        self._where = addresses(pool.model, hand)
+        self._links = np.array([pool.model.body(link.name).id for link in hand.links])
+        self._nq, self._nv, self._nu = pool.model.nq, pool.model.nv, pool.model.nu
+        if implementation == "jax":
+            # MJX-JAX has no contact sensor between bodies; its contacts are read from the contact list instead.
+            pool.model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
+            pool.model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN
+        self._host_model = pool.model
+        self._body_of_geom = np.array(pool.model.geom_bodyid)
+        self._model = mjx.put_model(pool.model, impl=implementation)
+        self._object_leaves = {
+            name: jnp.asarray(value, jnp.float32).reshape(len(objects), *getattr(self._model, name).shape)
+            for name, value in pool.leaves.items()
+        }
+        self._geoms = np.flatnonzero(pool.model.geom_bodyid == self._where.object_body)
+        self._shared = {
+            name: jnp.asarray(getattr(pool.model, name), jnp.float32)
+            for name in ("body_pos", "body_quat", "geom_friction")
+        }
+        axes = dict.fromkeys([*self._object_leaves, *self._shared], 0)
+        self._axes = jax.tree.map(lambda _: None, self._model).replace(**axes)
+        self._object_body = self._where.object_body
+
+    def start(self, world: World) -> MjxState:
+        """Fresh worlds; see `Physics.start`."""
+        batch = world.object_index.shape[0]
+        if self.name == "warp":
+            sizes = {"naconmax": CONTACTS_PER_WORLD * batch, "njmax": CONSTRAINTS_PER_WORLD}
+        else:
+            sizes = {}
+        data = mjx.make_data(self._host_model, impl=self.name, **sizes)
+        data = jax.vmap(lambda q: data.replace(qpos=q))(jnp.zeros((batch, self._nq)))
+        return self._place(data, world)
+
+    def reset(self, state: MjxState, mask: Array, world: World) -> MjxState:
+        """Starts the masked worlds anew; see `Physics.reset`."""
+        fresh = self._place(state.data, world)
+
+        def pick(new: Array, old: Array) -> Array:
+            return jnp.where(mask.reshape(-1, *([1] * (new.ndim - 1))), new, old)
+
+        names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "mocap_pos", "mocap_quat", "eq_active", "time")
+        merged = {name: pick(getattr(fresh.data, name), getattr(state.data, name)) for name in names}
+        leaves = {name: pick(fresh.leaves[name], state.leaves[name]) for name in state.leaves}
+        return MjxState(state.data.replace(**merged), leaves, pick(fresh.qpos_start, state.qpos_start))
+
+    def step(self, state: MjxState, target: Array, table: Array) -> tuple[MjxState, Readout]:
+        """One control step; see `Physics.step`."""
+        where = self._where
+        height = jnp.where(table, 0.0, TABLE_AWAY[2])
+        data = state.data.replace(
+            ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height)
+        )
+        model = self._model.replace(**state.leaves)
+        step = jax.vmap(mjx.step, in_axes=(self._axes, 0))
+        data, _ = jax.lax.scan(
+            lambda carry, _: (step(model, carry), None), data, None, length=self._task.substeps
+        )
+        bad = diverged(jnp, data.qpos, data.qvel)[:, None]
+        data = data.replace(
+            qpos=jnp.where(bad, state.qpos_start, data.qpos),
+            qvel=jnp.where(bad, 0.0, data.qvel),
+            qacc_warmstart=jnp.where(bad, 0.0, data.qacc_warmstart),
+        )
+        sensors = jnp.where(bad, 0.0, self._contacts(data))
+        state = state._replace(data=data)
+        return state, readout(jnp, where, data.qpos, data.qvel, sensors, bad[:, 0])
+
+    def read(self, state: MjxState) -> Readout:
+        """The worlds as they are, without contacts; see `Physics.read`."""
+        data = state.data
+        batch = data.qpos.shape[0]
+        none = jnp.zeros((batch, len(self._links) * CONTACTS_PER_LINK * SENSOR_WIDTH))
+        return readout(jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool))
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _place(self, data: Any, world: World) -> MjxState:
+        where, batch = self._where, world.object_index.shape[0]
+        body = self._object_body
+        leaves = {name: value[world.object_index] for name, value in self._object_leaves.items()}
+        for name in ("body_mass", "body_inertia"):
+            scale = world.mass_scale.reshape(-1, *([1] * (leaves[name].ndim - 2)))
+            leaves[name] = leaves[name].at[:, body].multiply(scale)
+        tiled = {name: jnp.tile(value, (batch, *([1] * value.ndim))) for name, value in self._shared.items()}
+        leaves["body_pos"] = tiled["body_pos"].at[:, where.base_body].set(world.base_position)
+        leaves["body_quat"] = tiled["body_quat"].at[:, where.base_body].set(world.base_quaternion)
+        leaves["geom_friction"] = tiled["geom_friction"].at[:, self._geoms, 0].set(world.friction[:, None])
+        qpos = jnp.zeros((batch, self._nq))
+        qpos = qpos.at[:, where.finger_qpos].set(world.q)
+        qpos = qpos.at[:, where.object_qpos].set(
+            jnp.concatenate([world.object_position, world.object_quaternion], -1)
+        )
+        data = data.replace(
+            qpos=qpos,
+            qvel=jnp.zeros((batch, self._nv)),
+            ctrl=jnp.zeros((batch, self._nu)),
+            qacc_warmstart=jnp.zeros((batch, self._nv)),
+            mocap_pos=data.mocap_pos.at[:, where.table_mocap]
+            .set(0.0)
+            .at[:, where.anchor_mocap]
+            .set(world.object_position),
+            mocap_quat=data.mocap_quat.at[:, where.anchor_mocap].set(world.object_quaternion),
+            eq_active=data.eq_active.at[:, where.weld].set(world.stationary.astype(data.eq_active.dtype)),
+        )
+        return MjxState(data, leaves, qpos)
+
+    def _contacts(self, data: Any) -> Array:
+        """(B, L * C * 13) in the layout of the contact sensors."""
+        if self.name == "warp":
+            return data.sensordata
+        return jax.vmap(functools.partial(_strongest_contacts, self._body_of_geom, self._links, self._object_body))(data)
+
+
+def _strongest_contacts(body_of_geom: np.ndarray, links: np.ndarray, object_body: int, data: Any) -> Array:
+    """The contact sensors' values from MJX-JAX's contact list, for one world."""
+    contact = data._impl.contact
+    body = jnp.asarray(body_of_geom)[contact.geom]
+    index = np.asarray(contact.efc_address)
+    rows = jnp.where((index >= 0)[:, None], data._impl.efc_force[index[:, None] + np.arange(4)], 0.0)
+    # A pyramidal contact of dimension 3 has four edges: two along each tangent (MuJoCo's documentation, "Cones").
+    mu = contact.friction[:, :2]
+    force = jnp.stack([rows.sum(-1), (rows[:, 0] - rows[:, 1]) * mu[:, 0], (rows[:, 2] - rows[:, 3]) * mu[:, 1]], -1)
+    # Normals point from the first geom to the second; the sensors want them from the link to the object.
+    sign = jnp.where(body[:, 1] == object_body, 1.0, -1.0)[:, None]
+    found = (contact.dist < contact.includemargin).astype(jnp.float32)[:, None]
+    local = jnp.concatenate([force[:, :2], force[:, 2:] * sign], -1)
+    axes = contact.frame
+    values = jnp.concatenate([found, local, contact.pos, axes[:, 0] * sign, axes[:, 1] * sign], -1)
+    strength = jnp.where(found[:, 0] > 0, jnp.linalg.norm(force, axis=-1), -1.0)
+    touches_object = jnp.any(body == object_body, -1)
+    mine = touches_object & jnp.any(body == links[:, None, None], -1)
+    best_strength, best = jax.lax.top_k(jnp.where(mine, strength, -1.0), CONTACTS_PER_LINK)
+    return jnp.where(best_strength[..., None] >= 0, values[best], 0.0).reshape(-1)

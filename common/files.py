@@ -1,0 +1,39 @@
+"""Files that are either the old ones or the new ones, whatever happens in between."""
+
+import contextlib
+import os
+import pathlib
+
+from common.errors import CongraspError
+
+
+def write_atomically(path: pathlib.Path, data: bytes) -> None:
+    """Replaces a file's content: written beside it, flushed to the disk, renamed over it.
+
+    Raises:
+      CongraspError: naming the file, when it cannot be written; what was there before is intact.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+        sync_directory(path.parent)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise CongraspError(
+            f"{path} could not be written: {error.strerror}.", "Free space or choose another folder; nothing was lost."
+        ) from None
+
+
+def sync_directory(path: pathlib.Path) -> None:
+    """Makes renames inside a directory survive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,32 @@
+"""Poses of a hand's links by MuJoCo alone, so that recorders and pictures start no JAX backend."""
+
+import functools
+
+import mujoco
+import numpy as np
+
+from common.hands.mjcf import add_hand
+from common.hands.spec import Hand
+
+
+@functools.cache
+def _model(hand: Hand) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    add_hand(spec, hand)
+    return spec.compile()
+
+
+def link_poses(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (L, 3) and orientations (L, 4) of the links' frames in the wrist frame.
+
+    Args:
+      hand: the hand.
+      q: (F,) finger angles, rad.
+    """
+    model = _model(hand)
+    data = mujoco.MjData(model)
+    for joint, angle in zip(hand.joints, q, strict=True):
+        data.joint(joint.name).qpos[0] = angle
+    mujoco.mj_kinematics(model, data)
+    bodies = [model.body(link.name).id for link in hand.links]
+    return data.xpos[bodies], data.xquat[bodies]

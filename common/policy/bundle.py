@@ -1,0 +1,220 @@
+"""The policy bundle: weights, critic and normalisers of one version, as one immutable unit.
+
+It is what the learner publishes, what actors and the policy server act with, and what is shipped as a file. Acting
+normalises with the bundle's own statistics, so that a log probability belongs to exactly one bundle.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import pathlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import dacite
+import flax.traverse_util
+import jax
+import numpy as np
+
+from common.config import NetworkConfig, TaskConfig
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.hands import get_hand
+from common.policy import network, normalizer
+from common.policy.network import Layout, Params
+from common.policy.normalizer import Affine, Statistics
+from common.task import observation as task_observation
+from common.task.types import Array
+from common.wire.codec import Message, decode, encode
+
+FORMAT = 1
+_REMEDY = "Use a bundle made by 'congrasp train' of this version."
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicySpec:
+    """What a policy's arrays mean: whose observation goes in, whose action comes out, and the networks between."""
+
+    hand: str
+    """Name of the hand."""
+    layout: Layout
+    """Names and sizes of the observation's blocks."""
+    action_size: int
+    """A."""
+    network: NetworkConfig
+    """Sizes of the networks."""
+
+    @functools.cached_property
+    def schema(self) -> str:
+        """Sixteen hex digits that two policies share if one can stand in for the other."""
+        sizes = [self.network.hidden, self.network.encoder]
+        text = json.dumps([FORMAT, self.hand, self.layout, self.action_size, sizes])
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    def require(self, spec: "PolicySpec", source: str) -> None:
+        """Raises `CongraspError` unless `spec`, which is that of `source`, is this one."""
+        if spec.schema != self.schema:
+            raise CongraspError(
+                f"The policy {source} is for hand '{spec.hand}' (schema {spec.schema}), but hand '{self.hand}' "
+                f"(schema {self.schema}) is needed.",
+                "Choose a policy of this hand, task and network, or change them.",
+            )
+
+
+def policy_spec(task: TaskConfig, sizes: NetworkConfig) -> PolicySpec:
+    """The spec of a task's policy."""
+    hand = get_hand(task.hand)
+    return PolicySpec(hand.name, task_observation.layout(hand, task), len(hand.joints) + 6, sizes)
+
+
+class Acting(NamedTuple):
+    """The part of a bundle that acting needs; the first argument of `mean_action` and `sample_action`."""
+
+    params: Params
+    normalization: Affine
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PolicyBundle:
+    """One version of a policy with everything needed to act or to go on training."""
+
+    spec: PolicySpec
+    """What the arrays mean."""
+    task: TaskConfig
+    """The task that it was trained on."""
+    params: Params
+    """Actor and critic (`common.policy.network`)."""
+    observation: Statistics
+    """Of observations."""
+    value: Statistics
+    """Of returns."""
+    version: int
+    """Updates since the run began."""
+    epoch: str
+    """Identity of the run's beginning: another one when training restarts from scratch, the same after a resume."""
+    transitions: int
+    """Environment steps that it was trained on."""
+
+    @functools.cached_property
+    def acting(self) -> Acting:
+        """The actor and the frozen normalisation, on the default device."""
+        affine = normalizer.observation_affine(self.observation, self.spec.layout)
+        return Acting(*jax.device_put(({"actor": self.params["actor"]}, affine)))
+
+    def to_message(self) -> Message:
+        """The bundle as arrays and meta data; arrays are shared, not copied."""
+        tree = {**self.params, "observation": self.observation._asdict(), "value": self.value._asdict()}
+        meta = {
+            "format": FORMAT,
+            "version": self.version,
+            "epoch": self.epoch,
+            "updates": self.version,
+            "transitions": self.transitions,
+            "schema": self.spec.schema,
+            "hand": self.spec.hand,
+            "layout": [[name, size] for name, size in self.spec.layout],
+            "action_size": self.spec.action_size,
+            "network": dataclasses.asdict(self.spec.network),
+            "task": dataclasses.asdict(self.task),
+        }
+        return Message(flax.traverse_util.flatten_dict(tree, sep="/"), meta)
+
+    @staticmethod
+    def from_message(message: Message, source: str = "bundle") -> "PolicyBundle":
+        """The inverse of `to_message`.
+
+        Args:
+          message: a bundle.
+          source: what to call it in errors.
+
+        Raises:
+          CongraspError: if entries are missing, of another shape, or not finite, naming the first.
+        """
+        meta = message.meta
+        if meta.get("format") != FORMAT:
+            raise CongraspError(f"The policy {source} has format {meta.get('format')}, not {FORMAT}.", _REMEDY)
+        try:
+            spec = PolicySpec(
+                hand=str(meta["hand"]),
+                layout=tuple((str(name), int(size)) for name, size in meta["layout"]),
+                action_size=int(meta["action_size"]),
+                network=_dataclass(NetworkConfig, meta["network"]),
+            )
+            task = _dataclass(TaskConfig, meta["task"])
+            version, epoch, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
+            shapes = _shapes(spec)
+        except (KeyError, TypeError, ValueError, dacite.DaciteError) as error:
+            raise CongraspError(f"The policy {source} has bad meta data: {error}.", _REMEDY) from None
+        if meta.get("schema") != spec.schema:
+            raise CongraspError(f"The policy {source} names a schema that is not its own.", _REMEDY)
+        _check_arrays(message.arrays, shapes, source)
+        tree = flax.traverse_util.unflatten_dict(dict(message.arrays), sep="/")
+        observation, value = (Statistics(**tree.pop(name)) for name in ("observation", "value"))
+        return PolicyBundle(spec, task, tree, observation, value, version, epoch, transitions)
+
+
+def content_hash(encoded: bytes) -> str:
+    """Sixteen hex digits that identify an encoded bundle's content."""
+    return hashlib.sha256(encoded).hexdigest()[:16]
+
+
+def save(bundle: PolicyBundle, path: pathlib.Path) -> None:
+    """Writes a bundle to a `.safetensors` file, atomically."""
+    write_atomically(path, encode(bundle.to_message()))
+
+
+def load(path: pathlib.Path) -> PolicyBundle:
+    """Reads a bundle from a file; errors name it."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CongraspError(f"The policy {path} cannot be read: {error.strerror}.") from None
+    try:
+        message = decode(data)
+    except CongraspError as error:
+        raise CongraspError(f"The policy {path} is damaged: {error}") from None
+    return PolicyBundle.from_message(message, str(path))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def mean_action(layout: Layout, acting: Acting, observation: Array) -> Array:
+    """The deterministic action (..., A) for raw observations (..., D)."""
+    mean, _ = network.policy(acting.params, layout, normalizer.apply(acting.normalization, observation))
+    return mean
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def sample_action(layout: Layout, acting: Acting, observation: Array, key: Array) -> tuple[Array, Array]:
+    """A drawn action (..., A) for raw observations (..., D), and its log probability (...,)."""
+    mean, log_std = network.policy(acting.params, layout, normalizer.apply(acting.normalization, observation))
+    action = network.sample(key, mean, log_std)
+    return action, network.log_probability(mean, log_std, action)
+
+
+def _dataclass(cls: type, fields: Any) -> Any:
+    return dacite.from_dict(cls, fields, dacite.Config(strict=True, cast=[tuple, float]))
+
+
+@functools.lru_cache(maxsize=8)
+def _shapes(spec: PolicySpec) -> dict[str, tuple[int, ...]]:
+    """The shape of every array in a bundle."""
+    params = jax.eval_shape(
+        lambda key: network.init(key, spec.layout, spec.action_size, spec.network), jax.random.PRNGKey(0)
+    )
+    size = sum(width for _, width in spec.layout)
+    statistics = {"observation": normalizer.empty((size,))._asdict(), "value": normalizer.empty()._asdict()}
+    flat = flax.traverse_util.flatten_dict({**params, **statistics}, sep="/")
+    return {name: tuple(leaf.shape) for name, leaf in flat.items()}
+
+
+def _check_arrays(arrays: Mapping[str, Array], expected: Mapping[str, tuple[int, ...]], source: str) -> None:
+    if odd := sorted(expected.keys() ^ arrays.keys()):
+        raise CongraspError(f"The policy {source} lacks or should not have '{odd[0]}'.", _REMEDY)
+    for name, shape in expected.items():
+        array = arrays[name]
+        if tuple(array.shape) != shape:
+            raise CongraspError(f"The policy {source} has '{name}' of shape {array.shape}, not {shape}.", _REMEDY)
+        # Arrays on a device never left this process; those from a file or the wire are NumPy's.
+        if isinstance(array, np.ndarray) and not (array.dtype.kind == "f" and np.isfinite(array).all()):
+            raise CongraspError(f"The policy {source} has values in '{name}' that are not finite numbers.", _REMEDY)

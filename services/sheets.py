@@ -1,0 +1,81 @@
+"""Contact sheets, PNG files and videos."""
+
+import io
+import pathlib
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from common.errors import CongraspError
+from common.files import write_atomically
+
+_INK, _QUIET, _PAPER = (38, 43, 53), (96, 103, 116), (251, 251, 252)
+_MARGIN, _LABEL, _TITLE = 10, 24, 44  # pixels
+
+
+def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: int, title: str = "") -> np.ndarray:
+    """Pictures in rows, each with its label below it, under a title.
+
+    Args:
+      images: (height, width, 3) uint8, all of one size.
+      labels: one for each picture.
+      columns: pictures in a row.
+      title: one line; shrunk until it fits.
+
+    Returns:
+      (H, W, 3) uint8.
+    """
+    if not images or len(images) != len(labels):
+        raise CongraspError(f"{len(images)} pictures and {len(labels)} labels do not make a contact sheet.")
+    height, width = images[0].shape[:2]
+    rows = -(-len(images) // columns)
+    top = _TITLE if title else _MARGIN
+    sheet = Image.new(
+        "RGB", (columns * (width + _MARGIN) + _MARGIN, top + rows * (height + _LABEL) + _MARGIN), _PAPER
+    )
+    draw = ImageDraw.Draw(sheet)
+    if title:
+        font = _font(title, 19, sheet.width - 2 * _MARGIN)
+        draw.text((_MARGIN + 2, _TITLE // 2), title, _INK, font, anchor="lm")
+    for i, (image, label) in enumerate(zip(images, labels, strict=True)):
+        x, y = _MARGIN + i % columns * (width + _MARGIN), top + i // columns * (height + _LABEL)
+        sheet.paste(Image.fromarray(image), (x, y))
+        draw.text((x + 2, y + height + _LABEL // 2), label, _QUIET, _font(label, 14, width), anchor="lm")
+    return np.asarray(sheet)
+
+
+def _font(text: str, size: int, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    font = ImageFont.load_default(size)
+    while size > 8 and font.getlength(text) > width:
+        size -= 1
+        font = ImageFont.load_default(size)
+    return font
+
+
+def save_png(path: pathlib.Path, image: np.ndarray) -> None:
+    """Writes (H, W, 3) uint8 as PNG, whole or not at all; a CongraspError names a path that cannot be written."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", optimize=True)
+    write_atomically(path, buffer.getvalue())
+
+
+def save_video(path: pathlib.Path, frames: Iterable[np.ndarray], size: tuple[int, int], frame_rate: float) -> None:
+    """Writes pictures (height, width, 3) uint8 of `size` (width, height, both even) as an MP4 (H.264).
+
+    Raises:
+      CongraspError: the package for videos is absent, or the file cannot be written.
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise CongraspError("Videos need the package 'imageio-ffmpeg'.", "Run: pip install 'congrasp[viz]'") from None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer = imageio_ffmpeg.write_frames(str(path), size, fps=frame_rate, quality=8, macro_block_size=2)
+        writer.send(None)
+        for frame in frames:
+            writer.send(np.ascontiguousarray(frame))
+        writer.close()
+    except OSError as error:
+        raise CongraspError(f"{path} could not be written: {error.strerror or error}.") from None

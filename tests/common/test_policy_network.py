@@ -1,0 +1,102 @@
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from common.config import NetworkConfig
+from common.errors import CongraspError
+from common.policy import network
+from common.task.types import MASKS
+
+LAYOUT = (
+    ("state", 7),
+    ("heading", 3),
+    ("affordance", 5),
+    ("pose_finger", 4),
+    ("pose_wrist", 2),
+    ("trajectory", 6),
+    ("mask", 4),
+)
+SIZE = sum(size for _, size in LAYOUT)
+ACTIONS = 3
+CONFIG = NetworkConfig(hidden=(16, 8), encoder=4, initial_std=0.6)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return network.init(jax.random.PRNGKey(0), LAYOUT, ACTIONS, CONFIG)
+
+
+def observations(mask: tuple[int, ...], seed: int = 0) -> np.ndarray:
+    x = np.random.default_rng(seed).normal(size=(6, SIZE)).astype(np.float32)
+    x[:, -len(MASKS) :] = mask
+    return x
+
+
+def test_sizes_come_from_the_configuration(params):
+    actor = params["actor"]["network"]
+    assert actor["affordance"]["kernel"].shape == (5, 4)
+    assert actor["trunk_0"]["kernel"].shape == (7 + 3 + 4 + 4 * 4, 16)
+    assert actor["output"]["kernel"].shape == (8, ACTIONS)
+    assert params["critic"]["output"]["kernel"].shape == (8, 1)
+    np.testing.assert_allclose(np.exp(params["actor"]["log_std"]), 0.6, rtol=1e-6)
+
+
+def test_weights_start_orthogonal(params):
+    kernel = np.asarray(params["critic"]["trunk_1"]["kernel"])
+    np.testing.assert_allclose(kernel.T @ kernel, 2.0 * np.eye(8), atol=1e-5)
+
+
+def test_leading_axes_are_free(params):
+    x = observations((1, 0, 1, 0))
+    mean, _ = network.policy(params, LAYOUT, x)
+    stacked, _ = network.policy(params, LAYOUT, x.reshape(2, 3, SIZE))
+    np.testing.assert_allclose(stacked.reshape(6, ACTIONS), mean, rtol=1e-5, atol=1e-7)
+    assert network.value(params, LAYOUT, x.reshape(2, 3, SIZE)).shape == (2, 3)
+
+
+@pytest.mark.parametrize("mask", list(itertools.product((0, 1), repeat=4)))
+def test_a_block_matters_exactly_while_its_bit_is_set(params, mask):
+    # Biases that are not zero: an encoder's output is then not zero by itself for a zero block.
+    params = jax.tree.map(lambda leaf: leaf + 0.1, params)
+    x = observations(mask)
+    base = network.policy(params, LAYOUT, x)[0], network.value(params, LAYOUT, x)
+    start = 0
+    for name, size in LAYOUT[:-1]:
+        changed = x.copy()
+        changed[:, start : start + size] += 1.0
+        start += size
+        other = network.policy(params, LAYOUT, changed)[0], network.value(params, LAYOUT, changed)
+        active = name not in MASKS or mask[MASKS.index(name)]
+        for before, after in zip(base, other, strict=True):
+            assert bool(jnp.any(before != after)) == bool(active)
+
+
+def test_gaussian_against_scipy():
+    rng = np.random.default_rng(1)
+    mean, log_std, action = rng.normal(size=(5, 4)), rng.normal(size=4) * 0.3, rng.normal(size=(5, 4))
+    expected = scipy.stats.norm.logpdf(action, mean, np.exp(log_std)).sum(-1)
+    np.testing.assert_allclose(network.log_probability(mean, log_std, action), expected, rtol=1e-5)
+    np.testing.assert_allclose(network.entropy(log_std), scipy.stats.norm.entropy(scale=np.exp(log_std)).sum(), rtol=1e-5)
+
+
+def test_kl_divergence_by_hand():
+    # One dimension: KL(N(0,1) || N(1,2^2)) = ln 2 + (1 + 1)/8 - 1/2.
+    kl = network.kl_divergence(jnp.zeros((1, 1)), jnp.zeros(1), jnp.ones((1, 1)), jnp.log(jnp.array([2.0])))
+    np.testing.assert_allclose(kl, [np.log(2.0) + 0.25 - 0.5], rtol=1e-6)
+
+
+def test_samples_have_the_gaussians_moments():
+    mean, log_std = jnp.broadcast_to(jnp.array([1.0, -2.0]), (40_000, 2)), jnp.log(jnp.array([0.5, 0.1]))
+    draws = np.asarray(network.sample(jax.random.PRNGKey(3), mean, log_std))
+    np.testing.assert_allclose(draws.mean(0), [1.0, -2.0], atol=4 * 0.5 / np.sqrt(40_000))
+    np.testing.assert_allclose(draws.std(0), [0.5, 0.1], rtol=0.02)
+
+
+@pytest.mark.parametrize("layout", [LAYOUT[:-1], (*LAYOUT[:-1], ("mask", 5)), (("extra", 1), *LAYOUT), LAYOUT[1:]])
+def test_foreign_layouts_are_refused(layout):
+    with pytest.raises(CongraspError, match="layout"):
+        network.init(jax.random.PRNGKey(0), layout, ACTIONS, CONFIG)

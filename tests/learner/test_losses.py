@@ -1,0 +1,117 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from common.config import NetworkConfig
+from common.policy import network
+from learner import losses
+
+LAYOUT = (
+    ("state", 3),
+    ("heading", 1),
+    ("affordance", 1),
+    ("pose_finger", 1),
+    ("pose_wrist", 1),
+    ("trajectory", 1),
+    ("mask", 4),
+)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "weight", "loss"),
+    [
+        (1.1, 2.0, 1.0, -2.2),  # inside the range
+        (1.5, 2.0, 1.0, -2.4),  # gains no more than the clip gives
+        (0.5, 2.0, 1.0, -1.0),  # the worse of both: not clipped
+        (0.5, -2.0, 1.0, 1.6),  # clipped from below
+        (1.5, -2.0, 1.0, 3.0),
+        (1.5, 2.0, 0.25, -0.6),  # the importance weight scales the clipped term
+    ],
+)
+def test_surrogate_by_hand(ratio, advantage, weight, loss):
+    got = losses.surrogate(jnp.log(ratio), jnp.array(advantage), jnp.array(weight), 0.2)
+    np.testing.assert_allclose(got, loss, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("log_proximal", "log_behaviour", "weight"),
+    [(-3.0, -3.0, 1.0), (-3.0 + np.log(2.0), -3.0, 2.0), (-1.0, -5.0, 4.0), (0.0, -500.0, 4.0), (-500.0, 0.0, 0.0)],
+)
+def test_importance_weight_is_truncated_and_never_overflows(log_proximal, log_behaviour, weight):
+    got = losses.importance_weight(jnp.float32(log_proximal), jnp.float32(log_behaviour), 4.0)
+    np.testing.assert_allclose(got, weight, rtol=1e-5, atol=1e-30)
+
+
+def test_importance_weight_has_no_gradient():
+    assert jax.grad(lambda x: losses.importance_weight(x, jnp.float32(0.0), 4.0))(jnp.float32(0.5)) == 0.0
+
+
+@pytest.fixture(scope="module")
+def case():
+    params = network.init(jax.random.PRNGKey(0), LAYOUT, 2, NetworkConfig(hidden=(8,), encoder=2))
+    rng = np.random.default_rng(1)
+    observation = rng.normal(size=(64, 12)).astype(np.float32)
+    mean, log_std = network.policy(params, LAYOUT, observation)
+    action = np.asarray(mean) + rng.normal(size=(64, 2)).astype(np.float32) * 0.6
+    log_proximal = network.log_probability(mean, log_std, action)
+    sample = losses.Sample(
+        observation,
+        action,
+        log_proximal,
+        mean,
+        losses.importance_weight(log_proximal, log_proximal, 4.0),
+        rng.normal(size=64).astype(np.float32),
+        rng.normal(size=64).astype(np.float32),
+    )
+    return params, log_std, sample
+
+
+def plain_ppo(params, sample, log_behaviour, clip=0.2, value=0.5, entropy=0.01):
+    """Schulman et al. 2017, equations 7 and 9, written out for this test alone."""
+    mean, log_std = network.policy(params, LAYOUT, sample.observation)
+    ratio = jnp.exp(network.log_probability(mean, log_std, sample.action) - log_behaviour)
+    bounded = jnp.minimum(jnp.maximum(ratio, 1 - clip), 1 + clip)
+    gain = jnp.mean(jnp.minimum(ratio * sample.advantage, bounded * sample.advantage))
+    error = jnp.mean((network.value(params, LAYOUT, sample.observation) - sample.target) ** 2)
+    return -gain + value * error - entropy * network.entropy(log_std)
+
+
+def test_fresh_data_reduce_it_to_plain_ppo(case):
+    params, log_std, sample = case
+    coefficients = losses.Coefficients(clip=0.2, entropy=0.01, value=0.5)
+    moved = jax.tree.map(lambda leaf: leaf + 0.05, params)  # away from the proximal policy, so that some are clipped
+    (loss, terms), gradient = jax.value_and_grad(losses.objective, has_aux=True)(
+        moved, LAYOUT, log_std, sample, coefficients
+    )
+    expected, expected_gradient = jax.value_and_grad(plain_ppo)(moved, sample, sample.log_proximal)
+    assert 0.0 < terms.clip_fraction < 1.0
+    np.testing.assert_allclose(loss, expected, rtol=1e-6)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), gradient, expected_gradient)
+
+
+def test_at_the_proximal_policy_nothing_is_clipped_and_there_is_no_divergence(case):
+    params, log_std, sample = case
+    _, terms = losses.objective(params, LAYOUT, log_std, sample, losses.Coefficients(0.2, 0.0, 0.5))
+    assert terms.clip_fraction == 0.0
+    np.testing.assert_allclose(terms.kl, 0.0, atol=1e-6)
+    np.testing.assert_allclose(terms.policy_loss, -np.mean(sample.advantage), rtol=1e-4, atol=1e-6)
+
+
+def test_stale_data_do_not_use_up_the_trust_region(case):
+    """The behaviour policy was far away: plain PPO clips such samples at once, the decoupled objective does not."""
+    params, log_std, sample = case
+    log_behaviour = sample.log_proximal - jnp.log(1.5)
+    stale = sample._replace(
+        weight=losses.importance_weight(sample.log_proximal, log_behaviour, 4.0), advantage=np.ones(64, np.float32)
+    )
+
+    def loss(params):
+        return losses.objective(params, LAYOUT, log_std, stale, losses.Coefficients(0.2, 0.0, 0.0))[0]
+
+    def norm(gradient):
+        return float(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient["actor"])))
+
+    assert norm(jax.grad(loss)(params)) > 1e-3
+    plain = jax.grad(lambda p: plain_ppo(p, stale, log_behaviour, value=0.0, entropy=0.0))(params)
+    assert norm(plain) == 0.0

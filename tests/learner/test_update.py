@@ -1,0 +1,150 @@
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from common.errors import PhysicsError
+from common.policy import bundle as bundles
+from common.policy import network, normalizer
+from learner import update as updates
+from tests.learner import toy
+
+
+def fresh(seed: int = 0) -> updates.TrainState:
+    return updates.init_state(seed, toy.LAYOUT, 1, toy.SPEC.network, toy.PPO)
+
+
+def rollout(bundle: bundles.PolicyBundle, seed: int, worlds: int = 64) -> dict[str, np.ndarray]:
+    keys = iter(jax.random.split(jax.random.PRNGKey(seed), toy.STEPS))
+
+    def act(observation):
+        return bundles.sample_action(toy.LAYOUT, bundle.acting, observation, next(keys))
+
+    return toy.episode(act, worlds, np.random.default_rng(seed))
+
+
+step = functools.partial(updates.update, layout=toy.LAYOUT, ppo=toy.PPO)
+
+
+def leaves(state: updates.TrainState) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
+
+
+@pytest.mark.parametrize("lag", [0, 2])
+def test_it_learns_to_reach(lag):
+    """From worse than standing still to better than halving the distance at every step, also from stale rollouts."""
+    state = fresh()
+    published = [toy.bundle_of(state)]
+    assert toy.mean_return(published[0]) < toy.STANDING_STILL + 0.5
+    for seed in range(60):
+        batch = rollout(published[max(0, len(published) - 1 - lag)], seed)
+        state, metrics = step(state, batch)
+        published.append(toy.bundle_of(state))
+    assert toy.mean_return(published[-1]) > toy.HALVING
+    assert metrics["explained_variance"] > 0.5
+    if lag == 0:
+        assert metrics["importance_mean"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_counters_and_normalisers_follow_the_batch():
+    state = fresh()
+    batch = rollout(toy.bundle_of(state), 0)
+    state, _ = step(state, batch)
+    state, _ = step(state, rollout(toy.bundle_of(state), 1))
+    assert (state.version, state.transitions) == (2, 2 * 64 * toy.STEPS)
+    assert state.observation.count == state.value.count == 2 * 64 * toy.STEPS
+    assert state.observation.mean.dtype == np.float64
+
+
+def test_the_normaliser_moves_after_the_epochs():
+    """The second update must see the statistics of the first batch alone: its proximal policy is the behaviour's."""
+    state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 0))
+    batch = rollout(toy.bundle_of(state), 1)
+    batch["observation"][:, :, 1] += 0.0
+    _, metrics = step(state, batch)
+    assert metrics["importance_mean"] == pytest.approx(1.0, abs=1e-4)
+    assert metrics["importance_max"] == pytest.approx(1.0, abs=1e-3)
+    assert metrics["behaviour_kl"] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_moving_the_value_statistics_does_not_move_the_values():
+    """In rewards' units the critic says the same before and after its normaliser took the batch in."""
+    frozen = dataclasses.replace(toy.PPO, learning_rate=0.0, learning_rate_range=(0.0, 0.0))
+    state = updates.init_state(0, toy.LAYOUT, 1, toy.SPEC.network, frozen)
+    batch = rollout(toy.bundle_of(state), 0)
+    probe = normalizer.apply(
+        normalizer.observation_affine(normalizer.empty((11,)), toy.LAYOUT), batch["last_observation"]
+    )
+
+    def values(state):
+        affine = normalizer.value_affine(state.value)
+        return np.asarray(network.value(state.params, toy.LAYOUT, probe)) / affine.scale + affine.shift
+
+    before = values(state)
+    after, _ = updates.update(state, batch, toy.LAYOUT, frozen)
+    assert after.value.count > 0
+    np.testing.assert_allclose(values(after), before, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("kl", "rate"),
+    [(0.05, 2e-3 / 1.5), (0.004, 3e-3), (0.02, 2e-3), (0.006, 2e-3), (float("inf"), 2e-3 / 1.5)],
+)
+def test_learning_rate_follows_the_divergence(kl, rate):
+    hyper = {"kl_target": 0.012, "learning_rate_range": (1e-5, 1.0)}
+    np.testing.assert_allclose(updates._adapt_rate(jnp.float32(2e-3), jnp.float32(kl), hyper), rate, rtol=1e-6)
+
+
+def test_learning_rate_stays_in_its_range():
+    hyper = {"kl_target": 0.012, "learning_rate_range": (1e-4, 3e-4)}
+    assert updates._adapt_rate(jnp.float32(2.5e-4), jnp.float32(0.0), hyper) == jnp.float32(3e-4)
+    assert updates._adapt_rate(jnp.float32(1.2e-4), jnp.float32(1.0), hyper) == jnp.float32(1e-4)
+
+
+@pytest.mark.parametrize("field", ["observation", "last_observation", "action", "log_probability", "reward"])
+def test_a_value_that_is_not_finite_is_named_and_changes_nothing(field):
+    state = fresh()
+    batch = rollout(toy.bundle_of(state), 0)
+    batch[field].flat[17] = np.nan
+    params = jax.tree.map(np.asarray, state.params)
+    with pytest.raises(PhysicsError, match=f"rollouts of update 1: {field}") as caught:
+        step(state, batch)
+    jax.tree.map(np.testing.assert_array_equal, caught.value.state.params, params)
+    assert caught.value.state.version == 0
+
+
+def test_an_optimisation_that_breaks_is_named_and_keeps_the_last_finite_weights():
+    state = fresh()
+    batch = rollout(toy.bundle_of(state), 0)
+    with pytest.raises(updates.NonFiniteUpdate, match="optimisation of update 1: value loss") as caught:
+        updates.update(state, batch, toy.LAYOUT, dataclasses.replace(toy.PPO, reward_scale=1e25))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(caught.value.state.params))
+
+
+def test_other_hyperparameters_do_not_compile_again():
+    state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 0))
+    compiled = updates._optimise._cache_size()
+    for seed, clip in enumerate((0.1, 0.3)):
+        ppo = dataclasses.replace(toy.PPO, clip=clip, entropy=0.01, gamma=0.5)
+        state, _ = updates.update(state, rollout(toy.bundle_of(state), seed), toy.LAYOUT, ppo)
+    assert updates._optimise._cache_size() == compiled
+
+
+def test_same_seed_and_data_give_the_same_bits():
+    batch = rollout(toy.bundle_of(fresh()), 0)
+    first, second = step(fresh(), batch)[0], step(fresh(), batch)[0]
+    other = step(fresh(1), batch)[0]
+    assert all(np.array_equal(a, b) for a, b in zip(leaves(first), leaves(second), strict=True))
+    assert not np.array_equal(first.params["actor"]["log_std"], other.params["actor"]["log_std"])
+
+
+def test_published_weights_outlive_the_next_update():
+    """In one process a bundle shares the learner's arrays, which the next update must not take away."""
+    state = fresh()
+    bundle = toy.bundle_of(state)
+    step(state, rollout(bundle, 0))
+    assert np.isfinite(np.asarray(bundle.params["actor"]["log_std"])).all()
+    assert np.isfinite(np.asarray(bundle.acting.normalization.scale)).all()

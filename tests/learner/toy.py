@@ -1,0 +1,62 @@
+"""A continuous-control task of a few numbers, for tests of learning: a point on a line moves to its goal.
+
+The action in [-1, 1] moves the point by half of it; the reward is minus the distance after the move; an episode has ten
+steps. The goal is uniform in [-1, 1]. Standing still returns -10 E|g| = -5; halving the distance at every step returns
+-E|g| (1 - 2^-10), about -0.5; the best possible is -E[max(|g| - 1/2, 0)] = -0.125.
+"""
+
+import numpy as np
+
+from common.config import NetworkConfig, PPOConfig, TaskConfig
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle, PolicySpec
+from learner.update import TrainState
+
+STANDING_STILL = -5.0
+HALVING = -0.5
+STEPS = 10
+LAYOUT = (
+    ("state", 2),
+    ("heading", 1),
+    ("affordance", 1),
+    ("pose_finger", 1),
+    ("pose_wrist", 1),
+    ("trajectory", 1),
+    ("mask", 4),
+)
+SPEC = PolicySpec("toy", LAYOUT, 1, NetworkConfig(hidden=(32, 32), encoder=2, initial_std=0.6))
+PPO = PPOConfig(epochs=4, minibatches=4, gamma=0.9, reward_scale=1.0, learning_rate=1e-3)
+
+
+def observe(position: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    observation = np.zeros((len(position), sum(size for _, size in LAYOUT)), np.float32)
+    observation[:, 0], observation[:, 1], observation[:, 2] = position, 7.0 + 100.0 * goal, goal - position
+    return observation
+
+
+def episode(act, worlds: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """A batch of whole episodes; `act` maps observations to actions and log probabilities."""
+    goal, position = rng.uniform(-1, 1, worlds), np.zeros(worlds)
+    rows = []
+    for step in range(STEPS):
+        observation = observe(position, goal)
+        action, log_probability = (np.asarray(x) for x in act(observation))
+        position = position + 0.5 * np.clip(action[:, 0], -1, 1)
+        terminal = np.full(worlds, step == STEPS - 1)
+        rows.append((observation, action, log_probability, -np.abs(goal - position).astype(np.float32), terminal))
+    names = ("observation", "action", "log_probability", "reward", "terminal")
+    batch = {name: np.stack(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+    return {**batch, "last_observation": observe(position, goal)}
+
+
+def bundle_of(state: TrainState, epoch: str = "toy") -> PolicyBundle:
+    return PolicyBundle(
+        SPEC, TaskConfig(), state.params, state.observation, state.value, state.version, epoch, state.transitions
+    )
+
+
+def mean_return(bundle: PolicyBundle, worlds: int = 200) -> float:
+    def act(observation):
+        return bundles.mean_action(SPEC.layout, bundle.acting, observation), np.zeros(len(observation))
+
+    return float(episode(act, worlds, np.random.default_rng(123))["reward"].sum(0).mean())
