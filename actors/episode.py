@@ -1,0 +1,89 @@
+"""One world's episode as a message for logs, pictures and exports."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from actors.rollout import Trace
+from common import rotations
+from common.config import TaskConfig
+from common.hands.kinematics import link_poses
+from common.hands.spec import Hand
+from common.objects.spec import GraspObject
+from common.task.reward import TERMS
+from common.task.types import Goal, Surface
+from common.wire.codec import Message
+
+PIECE_KINDS = ("box", "cylinder", "capsule", "ellipsoid", "mesh")
+
+
+def episode_message(
+    hand: Hand,
+    task: TaskConfig,
+    trace: Trace,
+    goal: Goal,
+    surface: Surface,
+    obj: GraspObject,
+    meta: dict[str, Any],
+) -> Message:
+    """The episode up to its end within the trace, or the whole trace where it goes on.
+
+    Args:
+      hand: the hand.
+      task: its control step is written down.
+      trace: T steps of one world.
+      goal: that world's goal, without a batch axis.
+      surface: its surface, without a batch axis.
+      obj: its object.
+      meta: further entries: version, actor, success, metrics.
+    """
+    ends = np.flatnonzero(np.asarray(trace.terminal))
+    steps = int(ends[0]) + 1 if len(ends) else len(np.asarray(trace.terminal))
+    cut = Trace(*(np.asarray(field)[:steps] for field in trace))
+    local_position, local_quaternion = link_poses(hand, jnp.asarray(cut.q))
+    position, quaternion = rotations.compose_pose(
+        jnp.asarray(cut.wrist_position)[:, None],
+        jnp.broadcast_to(jnp.asarray(cut.wrist_quaternion)[:, None], local_quaternion.shape),
+        local_position,
+        local_quaternion,
+    )
+    arrays = {
+        "link_position": position,
+        "link_quaternion": quaternion,
+        "object_position": cut.object_position,
+        "object_quaternion": cut.object_quaternion,
+        "contact_force": cut.contact_force,
+        "q": cut.q,
+        "u": cut.u,
+        "q_target": cut.q_target,
+        "u_target": cut.u_target,
+        "action": cut.action,
+        "table": cut.table,
+        **{f"reward/{name}": cut.terms[:, i] for i, name in enumerate(TERMS)},
+        **{f"goal/{name}": value for name, value in goal._asdict().items()},
+        "surface_points": surface.points,
+        "surface_minus": surface.minus,
+        **_geometry(obj),
+    }
+    return Message(
+        {name: _plain(np.asarray(value)) for name, value in arrays.items()},
+        {"hand": hand.name, "object": obj.name, "control_dt": task.control_dt, **meta},
+    )
+
+
+def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
+    pieces = obj.pieces
+    return {
+        "piece_kind": np.array([PIECE_KINDS.index(piece.kind) for piece in pieces], np.int32),
+        "piece_size": np.array([piece.size for piece in pieces]),
+        "piece_pos": np.array([piece.pos for piece in pieces]),
+        "piece_quat": np.array([piece.quat for piece in pieces]),
+        "piece_part": np.array([piece.part for piece in pieces], np.int32),
+        "visual_vertices": obj.visual_vertices,
+        "visual_faces": obj.visual_faces.astype(np.int32),
+    }
+
+
+def _plain(array: np.ndarray) -> np.ndarray:
+    return array.astype(np.float32) if array.dtype == np.float64 else array

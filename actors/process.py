@@ -1,0 +1,148 @@
+"""The actor process: pulls weights, steps worlds, uploads rollouts, until the run ends."""
+
+import functools
+import threading
+import time
+import zlib
+
+import numpy as np
+
+from actors.environment import EnvironmentState
+from actors.episode import episode_message
+from actors.link import ActorLink, RunEnded, Ticket
+from actors.physics import make_physics
+from actors.rollout import Rollout, RolloutWorker, finished_episodes, goal_of_world
+from actors.taskset import build_taskset
+from common.config import PhysicsName, RunConfig, run_config_from_json
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects.pool import load_pool
+from common.policy.bundle import PolicyBundle, policy_spec, sample_action
+from common.task.types import Surface
+from common.transport.base import Transport
+from common.wire.codec import Message
+
+
+def run_actor(
+    transport: Transport,
+    *,
+    run: str,
+    actor: str,
+    stop: threading.Event,
+    physics: PhysicsName | None = None,
+    threads: int = 1,
+    patience: float = 60.0,
+) -> None:
+    """Acts for the learner of `run` until it ends or `stop` is set.
+
+    Args:
+      transport: connected to the learner.
+      run: name of the run.
+      actor: this actor's name, unique in the run; it also decides on its objects and random numbers.
+      stop: ends the actor between two rollouts.
+      physics: engine, where it is not to be the run's.
+      threads: threads of the `native` engine.
+      patience: seconds without a learner after which the actor gives up.
+
+    Raises:
+      CongraspError: the learner is gone, or refuses this actor's rollouts.
+    """
+    link = ActorLink(transport, run=run, actor=actor, patience=patience)
+    try:
+        config = run_config_from_json(link.config())
+        _Actor(config, link, physics or config.physics, threads).act(stop)
+    except RunEnded:
+        return
+    finally:
+        link.close()
+
+
+class _Actor:
+    """Worlds, policy and counters of one actor."""
+
+    def __init__(self, config: RunConfig, link: ActorLink, physics: PhysicsName, threads: int):
+        self._config, self._link = config, link
+        self._hand = get_hand(config.task.hand)
+        number = zlib.crc32(link.actor.encode())
+        self._objects = load_pool(config.objects, number)
+        taskset = build_taskset(self._hand, config.task, self._objects, config.seed + number)
+        self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
+        self._spec = policy_spec(config.task, config.network)
+        self._worker = RolloutWorker(
+            self._hand,
+            config.task,
+            self._physics,
+            taskset,
+            functools.partial(sample_action, self._spec.layout),
+            batch=config.environments,
+            # Another incarnation must not repeat the episodes of the one that it replaces.
+            seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
+            half=config.half_observations,
+        )
+        self._bundle: PolicyBundle | None = None
+        self._rollouts = 0
+
+    def act(self, stop: threading.Event) -> None:
+        """Rollouts until `stop` is set or the run ends."""
+        try:
+            while (ticket := self._link.acquire_ticket(stop)) is not None:
+                self._refresh(ticket)
+                assert self._bundle is not None
+                self._rollout(self._bundle, ticket)
+        finally:
+            self._physics.close()
+
+    def _refresh(self, ticket: Ticket) -> None:
+        version = -1 if self._bundle is None else self._bundle.version
+        if ticket.version <= version:
+            return
+        message = self._link.weights(version)
+        if message is not None:
+            bundle = PolicyBundle.from_message(message, "of the learner")
+            self._spec.require(bundle.spec, "of the learner")
+            self._bundle = bundle
+        if self._bundle is None:
+            raise CongraspError("The learner granted a rollout before it had a policy.")
+
+    def _rollout(self, bundle: PolicyBundle, ticket: Ticket) -> None:
+        config, env = self._config, self._worker.env
+        began = time.time()
+        started_fresh = bool(np.asarray(env.time)[0] == 0)
+        rollout = self._worker.collect(bundle.acting, config.rollout_steps)
+        steps = config.rollout_steps * config.environments
+        names = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
+        arrays = {name: np.asarray(getattr(rollout, name)) for name in names} | finished_episodes(rollout)
+        meta = {"version": bundle.version, "schema": self._spec.schema, "steps": steps}
+        self._link.upload(Message(arrays, meta), ticket)
+        seconds = time.time() - began
+        self._link.publish(
+            "metrics",
+            Message(
+                {},
+                {
+                    "time": time.time(),
+                    "version": bundle.version,
+                    "values": {"steps_per_second": steps / seconds, "rollouts": self._rollouts + 1.0},
+                },
+            ),
+        )
+        if self._rollouts % config.episode_every == 0 and started_fresh:
+            self._publish_episode(bundle, rollout, env)
+        self._rollouts += 1
+
+    def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, env: EnvironmentState) -> None:
+        """World 0's episode, from the rollout that it began in."""
+        episodes = dict(zip(finished_episodes(rollout), np.asarray(rollout.episodes)[0], strict=True))
+        metrics = {name.removeprefix("episode/"): float(v) for name, v in episodes.items() if "episode/" in name}
+        surface = Surface(*(np.asarray(field)[0] for field in env.surface))
+        obj = self._objects[int(np.asarray(env.world.object_index)[0])]
+        goal = goal_of_world(env.goal)
+        meta = {
+            "time": time.time(),
+            "version": bundle.version,
+            "actor": self._link.actor,
+            "success": metrics["success"] > 0,
+            "metrics": metrics,
+        }
+        message = episode_message(self._hand, self._config.task, rollout.trace, goal, surface, obj, meta)
+        self._link.publish("episode", message)

@@ -1,0 +1,229 @@
+"""Heading sets: from where and how a hand may come to an object (paper, section Constraint Setup)."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from common.objects.shapes import matrix
+from common.objects.spec import GraspObject
+
+COUNT = 256
+"""Headings of an object."""
+INWARD = 0.02
+"""Metres from the surface to the heading position, along the heading direction."""
+MAX_WIDTH = 0.12
+"""Metres; the object may not be wider along the cross-finger axis."""
+BACK_OFF = 0.15
+"""Metres from the heading position back to the start of the approach."""
+_BREADTH = 0.03  # half the breadth of the slab in which the local width is measured: a hand is some 6 cm broad
+_BEYOND = 0.01  # the slab ends this far beyond the heading position, where the fingertips close
+_TUBE = 0.01  # radius around the approach in which nothing may stand before the surface point
+_MARGIN = 0.01  # an approach stays this far from O-
+_ROLLS = 4
+_BATCH = 384
+_PREFERENCE = 0.015  # m of width for which a roll becomes e times less likely
+_WIDTH_POINTS = 256
+
+
+class Headings(NamedTuple):
+    """H headings in the object frame."""
+
+    position: np.ndarray
+    """(H, 3) p-bar, where the hand centre should be, m."""
+    direction: np.ndarray
+    """(H, 3) v-bar, unit: the way the hand moves, into the surface."""
+    cross: np.ndarray
+    """(H, 3) unit, orthogonal to the direction: along the hand's cross-finger axis w."""
+
+
+def sample_headings(
+    obj: GraspObject,
+    rng: np.random.Generator,
+    *,
+    use_affordance: bool,
+    count: int = COUNT,
+    cone: float = np.radians(30),
+    inward: float = INWARD,
+    max_width: float = MAX_WIDTH,
+    back_off: float = BACK_OFF,
+    attempts: int = 6,
+) -> Headings:
+    """Samples an object's heading set by the paper's rules.
+
+    A surface point of O+ (or of the whole surface) and a direction in the cone around its inward normal give the
+    heading position, `inward` along the direction. The cross-finger axis is the best of a few random rolls, narrow
+    ones being preferred. A candidate is rejected if
+
+    * the object's local width along the cross-finger axis exceeds `max_width`; it is measured on the surface points
+      that the closing fingers sweep (3 cm to both sides of the hand's middle plane, down to 1 cm beyond the position);
+    * another part of the object stands before the surface point (the point would not be the first one hit);
+    * with affordance, the approach comes within 1 cm of O-, or the position lies nearer to O- than to O+.
+
+    If fewer than `count` remain after `attempts` batches, those found are repeated. If none remains, the candidates
+    that break the fewest of the last two rules are taken, among them the narrowest.
+
+    Args:
+      obj: the object.
+      rng: random generator.
+      use_affordance: restricts the headings to O+.
+      count: number of headings H.
+      cone: half angle of the cone around the inward normal, rad.
+      inward: metres from the surface point to the heading position.
+      max_width: largest local width, m.
+      back_off: length of the approach that is checked, m.
+      attempts: batches of candidates.
+
+    Returns:
+      H headings, float32.
+    """
+    minus = obj.non_graspable_points & use_affordance
+    sources = np.flatnonzero(~minus)
+    if len(sources) == 0:
+        sources = np.arange(len(minus))
+    points = obj.points.astype(np.float32)
+    found: list[Headings] = []
+    scores: list[np.ndarray] = []
+    total = 0
+    for _ in range(attempts):
+        surface = rng.choice(sources, _BATCH)
+        direction = _in_cone(-obj.normals[surface], cone, rng)
+        position = points[surface] + inward * direction
+        offset = points - position[:, None]
+        depth = np.einsum("npi,ni->np", offset, direction)
+        cross, width = _roll(offset[:, :_WIDTH_POINTS], depth[:, :_WIDTH_POINTS], direction, rng)
+        faults = _occluded(offset, depth, inward, back_off).astype(int)
+        if minus.any():
+            faults = faults + _approaches(offset, depth, minus, back_off)
+        found.append(Headings(position, direction, cross))
+        scores.append(faults + np.where(width > max_width, width, 0.0))
+        total += int((scores[-1] == 0).sum())
+        if total >= count:
+            break
+    candidates = Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    score = np.concatenate(scores)
+    # Faults count whole numbers and a width in metres less than one, so that sorting puts the rules in order.
+    good = np.flatnonzero(score == 0) if total else np.argsort(score, kind="stable")[: max(1, _BATCH // 16)]
+    chosen = np.resize(good, count)
+    return Headings(*(part[chosen].astype(np.float32) for part in candidates))
+
+
+def clear_table(
+    headings: Headings, rest_pose: np.ndarray, *, clearance: float = 0.01, limit: float = INWARD
+) -> Headings:
+    """Moves positions that lie too near to the table back along their direction, by `limit` at most.
+
+    Two centimetres into a flat object may be inside the table; this keeps such an object graspable from above. A
+    heading that cannot be cleared is left as it is, and `feasible` is false for it.
+
+    Args:
+      headings: in the object frame.
+      rest_pose: (7,) the object's pose, with the table's top at z = 0.
+      clearance: least height of a position above the table, m.
+      limit: longest way back, m.
+    """
+    height, direction_z, _ = _in_world(headings, rest_pose)
+    needed = np.maximum(clearance - height, 0.0) / np.maximum(-direction_z, 1e-6)
+    back = np.where(needed <= limit, needed, 0.0)
+    # A micrometre more, so that rounding does not leave a position just below the clearance.
+    back = np.where(back > 0, back + 1e-6, 0.0)
+    return headings._replace(position=(headings.position - back[:, None] * headings.direction).astype(np.float32))
+
+
+def feasible(
+    headings: Headings,
+    rest_pose: np.ndarray,
+    *,
+    clearance: float = 0.01,
+    back_off: float = BACK_OFF,
+    steepest_up: float = 0.1,
+) -> np.ndarray:
+    """(H,) bool, which headings can be followed while the object lies on the table in a resting pose.
+
+    The approach must come from above or level (its direction rises by at most `steepest_up` per metre), and the hand
+    centre must stay `clearance` above the table at its start and at the heading position. It may be false for all
+    headings of a thin object: see `clear_table`.
+
+    Args:
+      headings: in the object frame.
+      rest_pose: (7,) the object's pose, with the table's top at z = 0.
+      clearance: least height of the hand centre above the table, m.
+      back_off: length of the approach, m.
+      steepest_up: largest upward component of a direction.
+    """
+    height, direction_z, start = _in_world(headings, rest_pose, back_off)
+    return (direction_z <= steepest_up) & (height >= clearance) & (start >= clearance)
+
+
+def above(headings: Headings, rest_pose: np.ndarray, cone: float = np.radians(30)) -> np.ndarray:
+    """(H,) bool, which directions are within `cone` (rad) of straight down for an object in a resting pose (7,)."""
+    return _in_world(headings, rest_pose)[1] <= -np.cos(cone)
+
+
+def _in_world(
+    headings: Headings, rest_pose: np.ndarray, back_off: float = BACK_OFF
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """World heights (H,) of the positions, z of the directions, and heights of the approaches' starts."""
+    up = matrix(rest_pose[3:])[2]
+    height = headings.position @ up + rest_pose[2]
+    direction_z = headings.direction @ up
+    return height, direction_z, height - back_off * direction_z
+
+
+def _in_cone(axes: np.ndarray, cone: float, rng: np.random.Generator) -> np.ndarray:
+    """Unit vectors (N, 3), uniform in the cone (rad) around each axis (N, 3)."""
+    cosine = rng.uniform(np.cos(cone), 1.0, len(axes))
+    side, other = _frame(axes)
+    around = _spin(side, other, rng.uniform(0, 2 * np.pi, len(axes)))
+    return (cosine[:, None] * axes + np.sqrt(1 - cosine**2)[:, None] * around).astype(np.float32)
+
+
+def _frame(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (N, 3) that are orthogonal to each axis (N, 3) and to one another."""
+    side = np.cross(axes, np.eye(3, dtype=axes.dtype)[np.abs(axes).argmin(-1)])
+    side /= np.linalg.norm(side, axis=-1, keepdims=True)
+    return side, np.cross(axes, side)
+
+
+def _spin(side: np.ndarray, other: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    return np.cos(turn)[..., None] * side + np.sin(turn)[..., None] * other
+
+
+def _roll(
+    offset: np.ndarray, depth: np.ndarray, direction: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cross-finger axes (N, 3), one of a few evenly spaced rolls each, and the object's local widths (N,) along them.
+
+    Args:
+      offset: (N, P, 3) surface points from the heading position.
+      depth: (N, P) along the direction.
+      direction: (N, 3).
+      rng: draws the rolls.
+    """
+    side, other = _frame(direction)
+    turn = rng.uniform(0, np.pi, len(direction))[:, None] + np.pi / _ROLLS * np.arange(_ROLLS)
+    axes = _spin(side[:, None], other[:, None], turn).astype(np.float32)
+    along = offset @ np.swapaxes(axes, 1, 2)
+    # The slab's other axis is the roll a right angle further on: with the rolls spread over a half turn, the one
+    # half of them later (the sign does not matter).
+    within = (depth < _BEYOND)[..., None] & (np.abs(np.roll(along, -_ROLLS // 2, -1)) < _BREADTH)
+    width = np.where(within, along, -np.inf).max(1) - np.where(within, along, np.inf).min(1)
+    # Gumbel's trick draws a roll with probability exp(-width / preference).
+    pick = (rng.gumbel(size=width.shape) - width / _PREFERENCE).argmax(-1)
+    rows = np.arange(len(width))
+    sign = rng.choice(np.array([-1.0, 1.0], np.float32), len(width))
+    return sign[:, None] * axes[rows, pick], width[rows, pick]
+
+
+def _occluded(offset: np.ndarray, depth: np.ndarray, inward: float, back_off: float) -> np.ndarray:
+    """(N,) whether a part of the object stands on the approach, clearly before the surface point."""
+    aside = (offset**2).sum(-1) - depth**2
+    return ((aside < _TUBE**2) & (depth < -inward - 1.5 * _TUBE) & (depth > -back_off - inward)).any(-1)
+
+
+def _approaches(offset: np.ndarray, depth: np.ndarray, minus: np.ndarray, back_off: float) -> np.ndarray:
+    """(N,) whether the approach comes too near to O-, or ends nearer to O- than to O+."""
+    squared = (offset**2).sum(-1)
+    past = depth - depth.clip(-back_off, 0.0)
+    to_approach = squared - depth**2 + past**2
+    near = (to_approach[:, minus] < _MARGIN**2).any(-1)
+    return near | (squared[:, minus].min(-1) < squared[:, ~minus].min(-1))

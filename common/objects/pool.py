@@ -1,0 +1,35 @@
+"""The objects of one actor or of one evaluation, from a run's configuration."""
+
+import pathlib
+
+from common.config import ObjectsConfig
+from common.errors import CongraspError
+from common.objects import procedural
+from common.objects.spec import GraspObject
+from common.objects.store import Catalogue
+
+HELD_OUT_SEED = 1_000_000
+"""Seeds from here upward are never trained on."""
+_STRIDE = 100_000
+
+
+def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:
+    """Objects of a folder, or procedural ones.
+
+    Args:
+      config: which objects.
+      shift: number of the actor: every actor has procedural objects of its own.
+
+    Raises:
+      CongraspError: the folder holds no object, or the count is not positive.
+    """
+    if config.folder:
+        catalogue = Catalogue(pathlib.Path(config.folder))
+        objects = [catalogue.get(name) for name in catalogue.list()]
+        if not objects:
+            raise CongraspError(f"The folder {config.folder} holds no object.", "Fill it with 'congrasp objects import'.")
+        return objects
+    if config.count < 1:
+        raise CongraspError(f"A pool of {config.count} objects is empty.", "Set --objects.count to at least 1.")
+    first = config.seed + (shift * _STRIDE) % HELD_OUT_SEED if config.seed < HELD_OUT_SEED else config.seed
+    return procedural.generate_many(config.count, first, config.families)
