@@ -1,10 +1,11 @@
-"""Complete checkpoints: a pytree's arrays by path, and JSON for the rest, in one safetensors file each.
+"""Complete checkpoints: a pytree's arrays by path and JSON for the rest, in one safetensors file each.
 
 A checkpoint is written beside its final name, flushed, renamed, and only then pointed at by the link `latest`; so
 `latest` always names a whole file, whenever the process or the machine dies.
 """
 
 import contextlib
+import json
 import os
 import pathlib
 from typing import Any
@@ -17,6 +18,7 @@ from common.files import sync_directory, write_atomically
 from common.wire.codec import Message, decode, encode
 
 _LATEST = "latest"
+_META = "meta"
 _PATTERN = "checkpoint_*.safetensors"
 
 
@@ -39,7 +41,8 @@ class Checkpoints:
           CongraspError: if the disk is full; the previous checkpoints are intact.
         """
         path = self._directory / f"checkpoint_{version:09d}.safetensors"
-        write_atomically(path, encode(Message(flatten(jax.device_get(tree)), meta)))
+        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)  # as an array: a header's length is limited
+        write_atomically(path, encode(Message({**flatten(jax.device_get(tree)), _META: text}, {"version": version})))
         link = self._directory / f".{_LATEST}.{os.getpid()}.tmp"
         try:
             link.unlink(missing_ok=True)
@@ -69,13 +72,13 @@ class Checkpoints:
                 f"There is no checkpoint in {self._directory}.", "Start the run without --resume."
             ) from None
         try:
-            message = decode(data)
+            arrays = decode(data, max_bytes=len(data)).arrays
         except CongraspError as error:
             raise CongraspError(
                 f"The checkpoint {path} is damaged: {error}",
                 f"Point {self._directory / _LATEST} at an older one to go on from there.",
             ) from None
-        return restore(message.arrays, template, str(path)), message.meta
+        return restore(arrays, template, str(path)), json.loads(arrays[_META].tobytes())
 
 
 def flatten(tree: Any) -> dict[str, np.ndarray]:

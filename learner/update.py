@@ -74,14 +74,13 @@ class NonFiniteUpdate(PhysicsError):
 
 def init_state(seed: int, layout: Layout, action_size: int, sizes: NetworkConfig, ppo: PPOConfig) -> TrainState:
     """The state before the first update."""
-    network_key, key = jax.random.split(jax.random.PRNGKey(seed))
-    params = network.init(network_key, layout, action_size, sizes)
+    params = network.init(seed, layout, action_size, sizes)
     size = sum(width for _, width in layout)
     return TrainState(
         params,
         _ADAM.init(params),
         jnp.float32(ppo.learning_rate),
-        key,
+        jax.random.PRNGKey(seed),
         normalizer.empty((size,)),
         normalizer.empty(),
         version=0,
@@ -240,7 +239,7 @@ def _epochs(
         minibatch = jax.tree.map(lambda x: x[rows], samples)
         (_, terms), gradients = gradient(params, layout, log_std_proximal, minibatch, coefficients)
         # The networks share no weight, so one's large gradient must not shrink the other's.
-        norms = {name: optax.global_norm(tree) for name, tree in gradients.items()}
+        norms = {name: optax.tree.norm(tree) for name, tree in gradients.items()}
         shrink = {
             name: hyper["max_grad_norm"] / jnp.maximum(norm, hyper["max_grad_norm"]) for name, norm in norms.items()
         }

@@ -63,9 +63,7 @@ def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: tuple[float
     vertices = np.concatenate([ring, [[0, 0, 6 * radius], [0, 0, 0]]])
     here = np.arange(32)
     after = (here + 1) % 32
-    faces = np.concatenate(
-        [np.stack([here, after, np.full(32, 32)], -1), np.stack([after, here, np.full(32, 33)], -1)]
-    )
+    faces = np.concatenate([np.stack([here, after, np.full(32, 32)], -1), np.stack([after, here, np.full(32, 33)], -1)])
     cone = Shape("mesh", (0, 0, 0), colour, neck, turn, vertices=vertices, faces=faces)
     return [between(start, neck, radius, colour), cone]
 
@@ -217,7 +215,9 @@ def episode_title(episode: Message) -> str:
     names = [name.replace("_", " ") for name, bit in zip(MASKS, mask, strict=True) if bit > 0]
     result = "success" if meta["success"] else "no success"
     metrics = meta.get("metrics", {})
-    shown = [f"{name.replace('_', ' ')} {metrics[name]:.3g}" for name in ("return", "links_at_removal") if name in metrics]
+    shown = [
+        f"{name.replace('_', ' ')} {metrics[name]:.3g}" for name in ("return", "links_at_removal") if name in metrics
+    ]
     parts = [f"{meta['hand']} hand, {meta['object']}", " + ".join(["heading", *names]), result, *shown]
     return "   |   ".join([*parts, f"policy version {meta['version']}"])
 

@@ -31,9 +31,7 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
     height, width = images[0].shape[:2]
     rows = -(-len(images) // columns)
     top = _TITLE if title else _MARGIN
-    sheet = Image.new(
-        "RGB", (columns * (width + _MARGIN) + _MARGIN, top + rows * (height + _LABEL) + _MARGIN), _PAPER
-    )
+    sheet = Image.new("RGB", (columns * (width + _MARGIN) + _MARGIN, top + rows * (height + _LABEL) + _MARGIN), _PAPER)
     draw = ImageDraw.Draw(sheet)
     if title:
         font = _font(title, 19, sheet.width - 2 * _MARGIN)

@@ -20,7 +20,7 @@ _BEYOND = 0.01  # the slab ends this far beyond the heading position, where the 
 _TUBE = 0.01  # radius around the approach in which nothing may stand before the surface point
 _MARGIN = 0.01  # an approach stays this far from O-
 _ROLLS = 4
-_BATCH = 384
+_BATCH = 320
 _PREFERENCE = 0.015  # m of width for which a roll becomes e times less likely
 _WIDTH_POINTS = 256
 
@@ -82,29 +82,28 @@ def sample_headings(
         sources = np.arange(len(minus))
     points = obj.points.astype(np.float32)
     found: list[Headings] = []
-    scores: list[np.ndarray] = []
     total = 0
     for _ in range(attempts):
         surface = rng.choice(sources, _BATCH)
         direction = _in_cone(-obj.normals[surface], cone, rng)
-        position = points[surface] + inward * direction
-        offset = points - position[:, None]
-        depth = np.einsum("npi,ni->np", offset, direction)
-        cross, width = _roll(offset[:, :_WIDTH_POINTS], depth[:, :_WIDTH_POINTS], direction, rng)
-        faults = _occluded(offset, depth, inward, back_off).astype(int)
-        if minus.any():
-            faults = faults + _approaches(offset, depth, minus, back_off)
-        found.append(Headings(position, direction, cross))
-        scores.append(faults + np.where(width > max_width, width, 0.0))
-        total += int((scores[-1] == 0).sum())
+        position = points[surface] + np.float32(inward) * direction
+        faults = _faults(points, minus, position, direction, inward, back_off)
+        position, direction, faults = (part[faults.argsort(kind="stable")] for part in (position, direction, faults))
+        clean = int((faults == 0).sum())
+        cross, width = _roll(points, position[:clean], direction[:clean], rng)
+        good = np.flatnonzero(width <= max_width)
+        found.append(Headings(position[good], direction[good], cross[good]))
+        total += len(good)
         if total >= count:
             break
-    candidates = Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
-    score = np.concatenate(scores)
-    # Faults count whole numbers and a width in metres less than one, so that sorting puts the rules in order.
-    good = np.flatnonzero(score == 0) if total else np.argsort(score, kind="stable")[: max(1, _BATCH // 16)]
-    chosen = np.resize(good, count)
-    return Headings(*(part[chosen].astype(np.float32) for part in candidates))
+    if total == 0:
+        cross, width = _roll(points, position, direction, rng)
+        # Faults count whole numbers and a width in metres less than one: together they sort in the right order.
+        best = (faults + width).argsort(kind="stable")[: _BATCH // 16]
+        found.append(Headings(position[best], direction[best], cross[best]))
+    pool = Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    chosen = np.resize(np.arange(len(pool.position)), count)
+    return Headings(*(part[chosen].astype(np.float32) for part in pool))
 
 
 def clear_table(
@@ -189,24 +188,30 @@ def _spin(side: np.ndarray, other: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _roll(
-    offset: np.ndarray, depth: np.ndarray, direction: np.ndarray, rng: np.random.Generator
+    points: np.ndarray, position: np.ndarray, direction: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cross-finger axes (N, 3), one of a few evenly spaced rolls each, and the object's local widths (N,) along them.
 
     Args:
-      offset: (N, P, 3) surface points from the heading position.
-      depth: (N, P) along the direction.
+      points: (P, 3) surface points, the first of which cover the surface.
+      position: (N, 3) heading positions.
       direction: (N, 3).
       rng: draws the rolls.
     """
     side, other = _frame(direction)
     turn = rng.uniform(0, np.pi, len(direction))[:, None] + np.pi / _ROLLS * np.arange(_ROLLS)
     axes = _spin(side[:, None], other[:, None], turn).astype(np.float32)
-    along = offset @ np.swapaxes(axes, 1, 2)
+    points = points[:_WIDTH_POINTS]
+    along = (axes.reshape(-1, 3) @ points.T).reshape(*turn.shape, -1)
+    along -= (axes * position[:, None]).sum(-1, keepdims=True)
+    shallow = direction @ points.T - (direction * position).sum(-1, keepdims=True) < _BEYOND
     # The slab's other axis is the roll a right angle further on: with the rolls spread over a half turn, the one
     # half of them later (the sign does not matter).
-    within = (depth < _BEYOND)[..., None] & (np.abs(np.roll(along, -_ROLLS // 2, -1)) < _BREADTH)
-    width = np.where(within, along, -np.inf).max(1) - np.where(within, along, np.inf).min(1)
+    outside = ~(shallow[:, None] & (np.abs(np.roll(along, -_ROLLS // 2, 1)) < _BREADTH))
+    along[outside] = -np.inf
+    highest = along.max(-1)
+    along[outside] = np.inf
+    width = highest - along.min(-1)
     # Gumbel's trick draws a roll with probability exp(-width / preference).
     pick = (rng.gumbel(size=width.shape) - width / _PREFERENCE).argmax(-1)
     rows = np.arange(len(width))
@@ -214,16 +219,18 @@ def _roll(
     return sign[:, None] * axes[rows, pick], width[rows, pick]
 
 
-def _occluded(offset: np.ndarray, depth: np.ndarray, inward: float, back_off: float) -> np.ndarray:
-    """(N,) whether a part of the object stands on the approach, clearly before the surface point."""
-    aside = (offset**2).sum(-1) - depth**2
-    return ((aside < _TUBE**2) & (depth < -inward - 1.5 * _TUBE) & (depth > -back_off - inward)).any(-1)
-
-
-def _approaches(offset: np.ndarray, depth: np.ndarray, minus: np.ndarray, back_off: float) -> np.ndarray:
-    """(N,) whether the approach comes too near to O-, or ends nearer to O- than to O+."""
-    squared = (offset**2).sum(-1)
-    past = depth - depth.clip(-back_off, 0.0)
-    to_approach = squared - depth**2 + past**2
-    near = (to_approach[:, minus] < _MARGIN**2).any(-1)
-    return near | (squared[:, minus].min(-1) < squared[:, ~minus].min(-1))
+def _faults(
+    points: np.ndarray, minus: np.ndarray, position: np.ndarray, direction: np.ndarray, inward: float, back_off: float
+) -> np.ndarray:
+    """(N,) how many of the rules on occlusion and on O- each approach breaks."""
+    depth = direction @ points.T - (direction * position).sum(-1, keepdims=True)
+    squared = (points**2).sum(-1) + (position**2).sum(-1, keepdims=True) - 2 * (position @ points.T)
+    aside = squared - depth**2
+    before = (depth < -inward - 1.5 * _TUBE) & (depth > -back_off - inward)
+    faults = ((aside < _TUBE**2) & before).any(-1).astype(int)
+    if minus.any():
+        past = depth - depth.clip(-back_off, 0.0)
+        near = (aside + past**2)[:, minus].min(-1) < _MARGIN**2
+        ends_near = squared[:, minus].min(-1) < squared[:, ~minus].min(-1, initial=np.inf)
+        faults += near | ends_near
+    return faults

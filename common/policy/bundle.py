@@ -199,9 +199,7 @@ def _dataclass(cls: type, fields: Any) -> Any:
 @functools.lru_cache(maxsize=8)
 def _shapes(spec: PolicySpec) -> dict[str, tuple[int, ...]]:
     """The shape of every array in a bundle."""
-    params = jax.eval_shape(
-        lambda key: network.init(key, spec.layout, spec.action_size, spec.network), jax.random.PRNGKey(0)
-    )
+    params = network.shapes(spec.layout, spec.action_size, spec.network)
     size = sum(width for _, width in spec.layout)
     statistics = {"observation": normalizer.empty((size,))._asdict(), "value": normalizer.empty()._asdict()}
     flat = flax.traverse_util.flatten_dict({**params, **statistics}, sep="/")

@@ -18,6 +18,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from common.config import NetworkConfig
 from common.errors import CongraspError
@@ -55,7 +56,6 @@ class GatedNetwork(nn.Module):
       hidden: units of the trunk's layers.
       encoder: units of each optional block's encoder.
       outputs: units of the linear output layer.
-      output_gain: gain of the output layer's orthogonal initialisation.
       precision: of the matrix products.
     """
 
@@ -63,7 +63,6 @@ class GatedNetwork(nn.Module):
     hidden: tuple[int, ...]
     encoder: int
     outputs: int
-    output_gain: float
     precision: jax.lax.Precision | None
 
     @nn.compact
@@ -72,24 +71,23 @@ class GatedNetwork(nn.Module):
         blocks = split(self.layout, observation)
         inputs = [blocks[name] for name in _TRUNK]
         for bit, name in enumerate(MASKS):
-            code = nn.elu(self._dense(self.encoder, _HIDDEN_GAIN, name)(blocks[name]))
+            code = nn.elu(self._dense(self.encoder, name)(blocks[name]))
             inputs.append(code * blocks["mask"][..., bit : bit + 1])
         x = jnp.concatenate(inputs, -1)
         for depth, units in enumerate(self.hidden):
-            x = nn.elu(self._dense(units, _HIDDEN_GAIN, f"trunk_{depth}")(x))
-        return self._dense(self.outputs, self.output_gain, "output")(x)
+            x = nn.elu(self._dense(units, f"trunk_{depth}")(x))
+        return self._dense(self.outputs, "output")(x)
 
-    def _dense(self, units: int, gain: float, name: str) -> nn.Dense:
-        initial = nn.initializers.orthogonal(gain)
-        return nn.Dense(units, kernel_init=initial, precision=self.precision, name=name)
+    def _dense(self, units: int, name: str) -> nn.Dense:
+        return nn.Dense(units, precision=self.precision, name=name)
 
 
 def _actor(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
-    return GatedNetwork(layout, hidden, encoder, outputs, _ACTION_GAIN, jax.lax.Precision.HIGHEST)
+    return GatedNetwork(layout, hidden, encoder, outputs, jax.lax.Precision.HIGHEST)
 
 
 def _critic(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
-    return GatedNetwork(layout, hidden, encoder, outputs, 1.0, None)
+    return GatedNetwork(layout, hidden, encoder, outputs, None)
 
 
 def _sizes(tree: Params) -> tuple[tuple[int, ...], int, int]:
@@ -99,20 +97,51 @@ def _sizes(tree: Params) -> tuple[tuple[int, ...], int, int]:
     return hidden, tree[MASKS[0]]["kernel"].shape[-1], tree["output"]["kernel"].shape[-1]
 
 
-def init(key: Array, layout: Layout, action_size: int, config: NetworkConfig) -> Params:
-    """Orthogonal weights and zero biases: `{"actor": {"network", "log_std"}, "critic": {...}}`."""
+def shapes(layout: Layout, action_size: int, config: NetworkConfig) -> Params:
+    """What `init` returns, with `jax.ShapeDtypeStruct` leaves; nothing is computed."""
     check_layout(layout)
-    actor_key, critic_key = jax.random.split(key)
-    observation = jnp.zeros((1, sum(size for _, size in layout)), jnp.float32)
+    observation = jax.ShapeDtypeStruct((1, sum(size for _, size in layout)), jnp.float32)
     actor = _actor(layout, config.hidden, config.encoder, action_size)
     critic = _critic(layout, config.hidden, config.encoder, 1)
+    key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     return {
         "actor": {
-            "network": actor.init(actor_key, observation)["params"],
-            "log_std": jnp.full((action_size,), math.log(config.initial_std), jnp.float32),
+            "network": jax.eval_shape(actor.init, key, observation)["params"],
+            "log_std": jax.ShapeDtypeStruct((action_size,), jnp.float32),
         },
-        "critic": critic.init(critic_key, observation)["params"],
+        "critic": jax.eval_shape(critic.init, key, observation)["params"],
     }
+
+
+def init(seed: int, layout: Layout, action_size: int, config: NetworkConfig) -> Params:
+    """Orthogonal weights and zero biases: `{"actor": {"network", "log_std"}, "critic": {...}}`.
+
+    Drawn with NumPy: compiling a QR decomposition for each kernel's shape would take seconds.
+    """
+    rng = np.random.default_rng(seed)
+    tree = shapes(layout, action_size, config)
+
+    def fill(layers: Params, output_gain: float) -> Params:
+        gains = {name: output_gain if name == "output" else _HIDDEN_GAIN for name in layers}
+        return {
+            name: {
+                "kernel": jnp.asarray(gains[name] * _orthogonal(rng, layer["kernel"].shape), jnp.float32),
+                "bias": jnp.zeros(layer["bias"].shape, jnp.float32),
+            }
+            for name, layer in layers.items()
+        }
+
+    log_std = jnp.full((action_size,), math.log(config.initial_std), jnp.float32)
+    actor = {"network": fill(tree["actor"]["network"], _ACTION_GAIN), "log_std": log_std}
+    return {"actor": actor, "critic": fill(tree["critic"], 1.0)}
+
+
+def _orthogonal(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    """A random matrix with orthonormal rows or columns, whichever are fewer (Saxe et al. 2014, arXiv 1312.6120)."""
+    tall = rng.normal(size=(max(shape), min(shape)))
+    q, r = np.linalg.qr(tall)
+    q *= np.sign(np.diag(r))
+    return q if q.shape == shape else q.T
 
 
 def policy(params: Params, layout: Layout, observation: Array) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ CONFIG = NetworkConfig(hidden=(16, 8), encoder=4, initial_std=0.6)
 
 @pytest.fixture(scope="module")
 def params():
-    return network.init(jax.random.PRNGKey(0), LAYOUT, ACTIONS, CONFIG)
+    return network.init(0, LAYOUT, ACTIONS, CONFIG)
 
 
 def observations(mask: tuple[int, ...], seed: int = 0) -> np.ndarray:
@@ -80,7 +80,9 @@ def test_gaussian_against_scipy():
     mean, log_std, action = rng.normal(size=(5, 4)), rng.normal(size=4) * 0.3, rng.normal(size=(5, 4))
     expected = scipy.stats.norm.logpdf(action, mean, np.exp(log_std)).sum(-1)
     np.testing.assert_allclose(network.log_probability(mean, log_std, action), expected, rtol=1e-5)
-    np.testing.assert_allclose(network.entropy(log_std), scipy.stats.norm.entropy(scale=np.exp(log_std)).sum(), rtol=1e-5)
+    np.testing.assert_allclose(
+        network.entropy(log_std), scipy.stats.norm.entropy(scale=np.exp(log_std)).sum(), rtol=1e-5
+    )
 
 
 def test_kl_divergence_by_hand():
@@ -99,4 +101,4 @@ def test_samples_have_the_gaussians_moments():
 @pytest.mark.parametrize("layout", [LAYOUT[:-1], (*LAYOUT[:-1], ("mask", 5)), (("extra", 1), *LAYOUT), LAYOUT[1:]])
 def test_foreign_layouts_are_refused(layout):
     with pytest.raises(CongraspError, match="layout"):
-        network.init(jax.random.PRNGKey(0), layout, ACTIONS, CONFIG)
+        network.init(0, layout, ACTIONS, CONFIG)

@@ -1,3 +1,5 @@
+import itertools
+
 import hypothesis
 import hypothesis.extra.numpy
 import hypothesis.strategies as st
@@ -49,7 +51,7 @@ def test_moments_of_half_precision_far_from_zero():
 )
 def test_merging_any_partition_gives_the_whole(samples, cuts):
     edges = [0, *sorted(min(cut, len(samples)) for cut in cuts), len(samples)]
-    parts = [samples[a:b] for a, b in zip(edges, edges[1:], strict=False) if b > a]
+    parts = [samples[a:b] for a, b in itertools.pairwise(edges) if b > a]
     merged = normalizer.merge(*(exact(part) for part in parts))
     one_by_one = normalizer.empty((3,))
     for part in parts:

@@ -49,7 +49,7 @@ def test_importance_weight_has_no_gradient():
 
 @pytest.fixture(scope="module")
 def case():
-    params = network.init(jax.random.PRNGKey(0), LAYOUT, 2, NetworkConfig(hidden=(8,), encoder=2))
+    params = network.init(0, LAYOUT, 2, NetworkConfig(hidden=(8,), encoder=2))
     rng = np.random.default_rng(1)
     observation = rng.normal(size=(64, 12)).astype(np.float32)
     mean, log_std = network.policy(params, LAYOUT, observation)

@@ -17,13 +17,13 @@ def fresh(seed: int = 0) -> updates.TrainState:
     return updates.init_state(seed, toy.LAYOUT, 1, toy.SPEC.network, toy.PPO)
 
 
-def rollout(bundle: bundles.PolicyBundle, seed: int, worlds: int = 64) -> dict[str, np.ndarray]:
+def rollout(bundle: bundles.PolicyBundle, seed: int, worlds: int = 64, reach: float = 1.0) -> dict[str, np.ndarray]:
     keys = iter(jax.random.split(jax.random.PRNGKey(seed), toy.STEPS))
 
     def act(observation):
         return bundles.sample_action(toy.LAYOUT, bundle.acting, observation, next(keys))
 
-    return toy.episode(act, worlds, np.random.default_rng(seed))
+    return toy.episode(act, worlds, np.random.default_rng(seed), reach)
 
 
 step = functools.partial(updates.update, layout=toy.LAYOUT, ppo=toy.PPO)
@@ -60,14 +60,17 @@ def test_counters_and_normalisers_follow_the_batch():
 
 
 def test_the_normaliser_moves_after_the_epochs():
-    """The second update must see the statistics of the first batch alone: its proximal policy is the behaviour's."""
-    state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 0))
-    batch = rollout(toy.bundle_of(state), 1)
-    batch["observation"][:, :, 1] += 0.0
-    _, metrics = step(state, batch)
-    assert metrics["importance_mean"] == pytest.approx(1.0, abs=1e-4)
+    """The log probability that the learner recomputes is the behaviour's, though the batch is unlike all before."""
+    state = fresh()
+    for seed in range(5):
+        state, _ = step(state, rollout(toy.bundle_of(state), seed))
+    old = normalizer.observation_affine(state.observation, toy.LAYOUT)
+    batch = rollout(toy.bundle_of(state), 9, reach=5.0)
+    state, metrics = step(state, batch)
     assert metrics["importance_max"] == pytest.approx(1.0, abs=1e-3)
     assert metrics["behaviour_kl"] == pytest.approx(0.0, abs=1e-4)
+    new = normalizer.observation_affine(state.observation, toy.LAYOUT)
+    assert np.max(np.abs(new.scale / old.scale - 1.0)) > 0.2
 
 
 def test_moving_the_value_statistics_does_not_move_the_values():

@@ -34,9 +34,9 @@ def observe(position: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return observation
 
 
-def episode(act, worlds: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """A batch of whole episodes; `act` maps observations to actions and log probabilities."""
-    goal, position = rng.uniform(-1, 1, worlds), np.zeros(worlds)
+def episode(act, worlds: int, rng: np.random.Generator, reach: float = 1.0) -> dict[str, np.ndarray]:
+    """A batch of whole episodes; `act` maps observations to actions and log probabilities, goals lie within `reach`."""
+    goal, position = rng.uniform(-reach, reach, worlds), np.zeros(worlds)
     rows = []
     for step in range(STEPS):
         observation = observe(position, goal)

@@ -1,0 +1,143 @@
+"""What a recorder writes: entries on channels, whether into an MCAP file or to a live viewer.
+
+Metrics and signals are JSON with a JSON schema, so that their numbers can be plotted; events and scenes are Foxglove's
+Protobuf messages, which Rerun reads too; rollouts and raw episodes are the bytes of `common.wire.codec`.
+"""
+
+import dataclasses
+import functools
+import json
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from google.protobuf.message import Message as Protobuf
+from mcap_protobuf.schema import build_file_descriptor_set
+
+OPAQUE = "x-safetensors"
+"""Encoding of messages that are the bytes of `common.wire.codec`."""
+
+CONVENTIONS = {
+    "units": "metres, radians, seconds, newtons, kilograms",
+    "quaternions": "(w, x, y, z) in JSON and x-safetensors; by field name in Foxglove's messages",
+    "frames": "world: z up, table's top at z = 0; <actor>/<link> and <actor>/object as in the simulation",
+    "joints": "finger joints by name, in the order of the hand's 'q'; wrist x, y, z, then intrinsic x-y-z angles",
+}
+"""Written into every file: what the numbers mean."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Channel:
+    """A stream of messages of one schema."""
+
+    topic: str
+    encoding: str
+    """Of the messages: json, protobuf or x-safetensors."""
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+    latched: bool = False
+    """Sent seldom and needed by whoever joins later: a live viewer that subscribes is given the last message."""
+
+
+class Entry(NamedTuple):
+    """One message on a channel."""
+
+    channel: Channel
+    time: int
+    """Nanoseconds since 1970: when the message happened, by the recorder's clock."""
+    data: bytes
+
+
+@functools.cache
+def protobuf_channel(topic: str, kind: type[Protobuf], *, latched: bool = False) -> Channel:
+    """A channel of one of Foxglove's messages, with the descriptors a reader needs."""
+    schema = build_file_descriptor_set(kind).SerializeToString()
+    return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", schema, latched)
+
+
+@functools.cache
+def opaque_channel(topic: str, name: str) -> Channel:
+    """A channel of encoded `common.wire.codec.Message`s; `name` says of which kind."""
+    return Channel(topic, OPAQUE, name, "", b"")
+
+
+class JsonChannels:
+    """Channels of JSON objects whose schemas grow when new fields appear: a schema must name a field to plot it."""
+
+    def __init__(self) -> None:
+        """No topic is known."""
+        self._fields: dict[str, dict[str, Any]] = {}
+        self._channels: dict[str, Channel] = {}
+
+    def entry(self, topic: str, time: int, value: Mapping[str, Any]) -> Entry:
+        """The object as an entry; fields that are NaN or infinite are left out, because JSON has no such numbers."""
+        finite = _finite(value)
+        fields = self._fields.setdefault(topic, {})
+        if _merge(fields, finite) or topic not in self._channels:
+            # Schemas are known by their name, so every topic has its own.
+            schema = json.dumps(_schema(fields)).encode()
+            self._channels[topic] = Channel(topic, "json", f"congrasp{topic.replace('/', '.')}", "jsonschema", schema)
+        return Entry(self._channels[topic], time, json.dumps(finite, separators=(",", ":")).encode())
+
+
+def nest(values: Mapping[str, float]) -> dict[str, Any]:
+    """`{"term/contact": 1}` as `{"term": {"contact": 1}}`; the inverse of `flatten`.
+
+    A name that is also the beginning of another (`loss` beside `loss/policy`) becomes that group's empty name.
+    """
+    tree: dict[str, Any] = {}
+    groups = {name.rsplit("/", i)[0] for name in values for i in range(1, name.count("/") + 1)}
+    for name, value in values.items():
+        *path, leaf = name.split("/") if name not in groups else [*name.split("/"), ""]
+        node = tree
+        for part in path:
+            node = node.setdefault(part, {})
+        node[leaf] = value
+    return tree
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """`{"term": {"contact": 1}}` as `{"term/contact": 1}`."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        path = f"{prefix}/{name}".strip("/")
+        if isinstance(value, Mapping):
+            flat |= flatten(value, path)
+        else:
+            flat[path] = value
+    return flat
+
+
+def _finite(value: Mapping[str, Any]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for name, item in value.items():
+        if isinstance(item, Mapping):
+            result[name] = _finite(item)
+        elif not isinstance(item, float) or math.isfinite(item):
+            result[name] = item
+    return result
+
+
+def _merge(fields: dict[str, Any], value: Mapping[str, Any]) -> bool:
+    """Adds the fields of an object to those known; true if any was new."""
+    grown = False
+    for name, item in value.items():
+        if isinstance(item, Mapping):
+            known = fields.setdefault(name, {})
+            grown |= _merge(known, item) if isinstance(known, dict) else False
+        elif name not in fields:
+            fields[name] = _kind(item)
+            grown = True
+    return grown
+
+
+def _kind(item: Any) -> str:
+    if isinstance(item, bool):
+        return "boolean"
+    return "number" if isinstance(item, int | float) else "string"
+
+
+def _schema(fields: Mapping[str, Any]) -> dict[str, Any]:
+    properties = {name: _schema(kind) if isinstance(kind, dict) else {"type": kind} for name, kind in fields.items()}
+    return {"type": "object", "properties": properties}

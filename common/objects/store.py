@@ -1,0 +1,178 @@
+"""Objects on disk: one safetensors file each, and folders of them."""
+
+import hashlib
+import json
+import os
+import pathlib
+import re
+import tempfile
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from common.errors import CongraspError
+from common.objects.spec import GraspObject, Piece
+
+SUFFIX = ".safetensors"
+_FORMAT = 1
+_KINDS = ("box", "cylinder", "capsule", "ellipsoid", "mesh")
+_ARRAYS = ("graspable", "inertia", "points", "normals", "labels", "rest_poses", "visual_vertices", "visual_faces")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+def digest(obj: GraspObject) -> str:
+    """Sixteen hex digits that identify the object's content."""
+    return _digest(*_pack(obj))
+
+
+def save(obj: GraspObject, path: str | os.PathLike[str]) -> None:
+    """Writes an object; the file appears complete or not at all.
+
+    Raises:
+      CongraspError: the file cannot be written.
+    """
+    path = pathlib.Path(path)
+    arrays, meta = _pack(obj)
+    meta["digest"] = _digest(arrays, meta)
+    data = safetensors.numpy.save(arrays, metadata={"congrasp_object": json.dumps(meta, sort_keys=True)})
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+            temporary = pathlib.Path(file.name)
+            try:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            except OSError:
+                temporary.unlink()
+                raise
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    except OSError as error:
+        raise CongraspError(f"The object cannot be written to {path}: {error.strerror}.") from None
+
+
+def load(path: str | os.PathLike[str]) -> GraspObject:
+    """Reads an object.
+
+    Raises:
+      CongraspError: no such file, another kind of file, or damaged content.
+    """
+    path = pathlib.Path(path)
+    remedy = "Make it anew with 'congrasp objects import' or 'congrasp objects generate'."
+    if not path.is_file():
+        raise CongraspError(f"There is no object file {path}.", "'congrasp objects list' shows what a folder holds.")
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            text = (file.metadata() or {}).get("congrasp_object")
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        meta = json.loads(text) if text else {}
+    except (safetensors.SafetensorError, OSError, ValueError) as error:
+        raise CongraspError(f"{path} cannot be read as an object: {error}.", remedy) from None
+    if meta.get("format") != _FORMAT:
+        found = "is not an object of congrasp" if not meta else f"has format {meta.get('format')}, not {_FORMAT}"
+        raise CongraspError(f"{path} {found}.", remedy)
+    stored = meta.pop("digest", "")
+    if stored != _digest(arrays, meta):
+        raise CongraspError(f"{path} is damaged: its content does not match its digest.", remedy)
+    return _unpack(arrays, meta)
+
+
+class Catalogue:
+    """A folder of object files, `<name>.safetensors`."""
+
+    def __init__(self, folder: str | os.PathLike[str]):
+        self.folder = pathlib.Path(folder)
+
+    def list(self) -> list[str]:
+        """Names of the objects, sorted.
+
+        Raises:
+          CongraspError: the folder does not exist.
+        """
+        if not self.folder.is_dir():
+            raise CongraspError(
+                f"There is no folder {self.folder}.", "Make one with 'congrasp objects generate' or 'objects import'."
+            )
+        return sorted(path.stem for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith("."))
+
+    def get(self, name: str) -> GraspObject:
+        """The object of a name.
+
+        Raises:
+          CongraspError: there is none, or its file is damaged.
+        """
+        return load(self.path(name))
+
+    def add(self, obj: GraspObject) -> pathlib.Path:
+        """Stores an object under its name, in place of one with the same name; returns the file."""
+        path = self.path(obj.name)
+        save(obj, path)
+        return path
+
+    def path(self, name: str) -> pathlib.Path:
+        """The file of a name.
+
+        Raises:
+          CongraspError: the name cannot be a file name.
+        """
+        if not _NAME.fullmatch(name):
+            raise CongraspError(
+                f"'{name}' cannot name an object.", "Use letters, digits, dots, hyphens and underscores."
+            )
+        return self.folder / f"{name}{SUFFIX}"
+
+
+def _pack(obj: GraspObject) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    arrays = {name: np.ascontiguousarray(getattr(obj, name)) for name in _ARRAYS}
+    pieces = obj.pieces
+    meshes = [np.zeros((0, 3)) if piece.vertices is None else piece.vertices for piece in pieces]
+    arrays["piece_kind"] = np.array([_KINDS.index(piece.kind) for piece in pieces], np.int32)
+    arrays["piece_part"] = np.array([piece.part for piece in pieces], np.int32)
+    for name in ("size", "pos", "quat"):
+        arrays[f"piece_{name}"] = np.array([getattr(piece, name) for piece in pieces], np.float64)
+    arrays["piece_vertex_count"] = np.array([len(vertices) for vertices in meshes], np.int32)
+    arrays["piece_vertices"] = np.concatenate(meshes).astype(np.float64)
+    meta = {
+        "format": _FORMAT,
+        "name": obj.name,
+        "family": obj.family,
+        "part_names": list(obj.part_names),
+        "mass": float(obj.mass),
+        "units": "m, kg, kg.m^2; quaternions (w, x, y, z); object frame with its origin at the centre of mass",
+    }
+    return arrays, meta
+
+
+def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> GraspObject:
+    ends = np.cumsum(arrays["piece_vertex_count"])
+    vertices = np.split(arrays["piece_vertices"], ends[:-1])
+    pieces = tuple(
+        Piece(
+            kind=_KINDS[arrays["piece_kind"][i]],  # type: ignore[arg-type]
+            size=tuple(arrays["piece_size"][i].tolist()),
+            pos=tuple(arrays["piece_pos"][i].tolist()),
+            quat=tuple(arrays["piece_quat"][i].tolist()),
+            vertices=vertices[i] if len(vertices[i]) else None,
+            part=int(arrays["piece_part"][i]),
+        )
+        for i in range(len(ends))
+    )
+    return GraspObject(
+        name=meta["name"],
+        family=meta["family"],
+        pieces=pieces,
+        part_names=tuple(meta["part_names"]),
+        mass=meta["mass"],
+        **{name: arrays[name] for name in _ARRAYS},
+    )
+
+
+def _digest(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> str:
+    content = hashlib.sha256(json.dumps(meta, sort_keys=True).encode())
+    for name in sorted(arrays):
+        content.update(f"{name} {arrays[name].dtype} {arrays[name].shape} ".encode())
+        content.update(arrays[name].tobytes())
+    return content.hexdigest()[:16]

@@ -1,0 +1,158 @@
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from common.config import NetworkConfig, RunConfig, TaskConfig
+from common.errors import CongraspError
+from common.policy import bundle as bundles
+from common.policy import network, normalizer
+from common.policy.bundle import PolicyBundle, PolicySpec
+from common.policy.normalizer import Statistics
+from common.wire.codec import Message, decode, encode
+
+LAYOUT = (
+    ("state", 3),
+    ("heading", 2),
+    ("affordance", 2),
+    ("pose_finger", 2),
+    ("pose_wrist", 2),
+    ("trajectory", 2),
+    ("mask", 4),
+)
+SPEC = PolicySpec("claw", LAYOUT, 2, NetworkConfig(hidden=(8, 4), encoder=3))
+
+
+@pytest.fixture
+def bundle() -> PolicyBundle:
+    rng = np.random.default_rng(0)
+    return PolicyBundle(
+        spec=SPEC,
+        task=TaskConfig(hand="claw", mass_range=(0.8, 1.2)),
+        params=network.init(5, LAYOUT, 2, SPEC.network),
+        observation=Statistics(np.float64(2**40 + 1), rng.normal(size=17), rng.random(17) * 2**40),
+        value=Statistics(np.float64(7), np.float64(-3.0), np.float64(28.0)),
+        version=12,
+        epoch="ab12",
+        transitions=3_000_000_000,
+    )
+
+
+def test_file_keeps_everything_exactly(bundle, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    bundles.save(bundle, path)
+    loaded = bundles.load(path)
+    assert (loaded.spec, loaded.task) == (bundle.spec, bundle.task)
+    assert (loaded.version, loaded.epoch, loaded.transitions) == (12, "ab12", 3_000_000_000)
+    for name in ("params", "observation", "value"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(loaded, name), jax.device_get(getattr(bundle, name)))
+    assert loaded.observation.count == 2**40 + 1
+    assert [p.name for p in tmp_path.iterdir()] == ["policy.safetensors"]
+
+
+def test_file_is_read_by_other_programs(bundle, tmp_path):
+    bundles.save(bundle, tmp_path / "policy.safetensors")
+    arrays = safetensors.numpy.load_file(tmp_path / "policy.safetensors")
+    np.testing.assert_array_equal(arrays["actor/log_std"], bundle.params["actor"]["log_std"])
+
+
+def test_content_hash_changes_with_the_content(bundle):
+    first = bundles.content_hash(encode(bundle.to_message()))
+    again = bundles.content_hash(encode(PolicyBundle.from_message(decode(encode(bundle.to_message()))).to_message()))
+    other = bundles.content_hash(encode(dataclasses.replace(bundle, version=13).to_message()))
+    assert first == again != other
+
+
+def test_message_shares_the_arrays_of_this_process(bundle):
+    assert bundle.to_message().arrays["actor/log_std"] is bundle.params["actor"]["log_std"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"hand": "paw"},
+        {"action_size": 3},
+        {"layout": (("state", 4), ("heading", 1), *LAYOUT[2:])},
+        {"network": NetworkConfig(hidden=(8, 5), encoder=3)},
+        {"network": NetworkConfig(hidden=(8, 4), encoder=4)},
+    ],
+)
+def test_schema_changes_with_what_it_covers(change):
+    other = dataclasses.replace(SPEC, **change)
+    assert other.schema != SPEC.schema
+    with pytest.raises(CongraspError) as caught:
+        other.require(SPEC, "mine.safetensors")
+    text = str(caught.value)
+    assert "\n" not in text
+    assert all(word in text for word in ("mine.safetensors", "'claw'", SPEC.schema, other.hand, other.schema))
+
+
+def test_initial_std_is_no_part_of_the_schema():
+    assert dataclasses.replace(SPEC, network=NetworkConfig((8, 4), 3, 0.9)).schema == SPEC.schema
+
+
+def _without(message: Message, name: str) -> Message:
+    return Message({k: v for k, v in message.arrays.items() if k != name}, message.meta)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda m: Message(m.arrays, {**m.meta, "format": 2}), "format 2"),
+        (lambda m: Message(m.arrays, {k: v for k, v in m.meta.items() if k != "hand"}), "hand"),
+        (lambda m: Message(m.arrays, {**m.meta, "task": {"wheels": 4}}), "wheels"),
+        (lambda m: Message(m.arrays, {**m.meta, "layout": [["state", -3]]}), "layout|meta"),
+        (lambda m: Message(m.arrays, {**m.meta, "network": {"hidden": [-8], "encoder": 3}}), "meta|schema"),
+        (lambda m: Message(m.arrays, {**m.meta, "schema": "0" * 16}), "schema"),
+        (lambda m: _without(m, "critic/output/bias"), "critic/output/bias"),
+        (lambda m: Message({**m.arrays, "extra": np.zeros(1)}, m.meta), "extra"),
+        (lambda m: Message({**m.arrays, "actor/log_std": np.zeros(3, np.float32)}, m.meta), "actor/log_std"),
+        (lambda m: Message({**m.arrays, "actor/log_std": np.full(2, np.nan)}, m.meta), "actor/log_std"),
+        (lambda m: Message({**m.arrays, "actor/log_std": np.zeros(2, np.int32)}, m.meta), "actor/log_std"),
+    ],
+)
+def test_a_spoilt_bundle_is_refused_in_one_line(bundle, spoil, words):
+    with pytest.raises(CongraspError, match=words) as caught:
+        PolicyBundle.from_message(spoil(bundle.to_message()), "p.safetensors")
+    assert "p.safetensors" in str(caught.value)
+
+
+def test_files_that_are_none_are_refused(bundle, tmp_path):
+    with pytest.raises(CongraspError, match=r"nowhere\.safetensors cannot be read"):
+        bundles.load(tmp_path / "nowhere.safetensors")
+    path = tmp_path / "torn.safetensors"
+    bundles.save(bundle, path)
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(CongraspError, match=r"torn\.safetensors is damaged"):
+        bundles.load(path)
+
+
+def test_acting_normalises_and_knows_its_log_probability(bundle):
+    raw = np.random.default_rng(1).normal(size=(5, 17)).astype(np.float16)
+    raw[:, -4:] = 1.0
+    affine = normalizer.observation_affine(bundle.observation, LAYOUT)
+    mean, log_std = network.policy(bundle.params, LAYOUT, normalizer.apply(affine, raw))
+    np.testing.assert_allclose(bundles.mean_action(LAYOUT, bundle.acting, raw), mean, rtol=1e-5, atol=1e-6)
+    action, log_probability = bundles.sample_action(LAYOUT, bundle.acting, raw, jax.random.PRNGKey(0))
+    np.testing.assert_allclose(log_probability, network.log_probability(mean, log_std, action), rtol=1e-4)
+    other, _ = bundles.sample_action(LAYOUT, bundle.acting, raw, jax.random.PRNGKey(1))
+    assert not np.allclose(action, other)
+
+
+def test_new_weights_do_not_compile_again(bundle):
+    raw = np.zeros((3, 17), np.float32)
+    bundles.mean_action(LAYOUT, bundle.acting, raw)
+    compiled = bundles.mean_action._cache_size()
+    moved = dataclasses.replace(bundle, params=jax.tree.map(lambda x: x + 1, bundle.params))
+    wire = PolicyBundle.from_message(decode(encode(moved.to_message())))
+    bundles.mean_action(LAYOUT, wire.acting, raw)
+    assert bundles.mean_action._cache_size() == compiled
+
+
+def test_spec_of_the_real_task():
+    config = RunConfig()
+    spec = bundles.policy_spec(config.task, config.network)
+    assert (spec.hand, spec.action_size) == ("human", 26)
+    network.check_layout(spec.layout)

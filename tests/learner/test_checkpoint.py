@@ -1,0 +1,120 @@
+import os
+import pathlib
+import resource
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from common.errors import CongraspError
+from learner.checkpoint import Checkpoints
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+
+# Runs updates FIRST..LAST-1 of a fixed stream and leaves a checkpoint; a process of its own each time.
+STREAM = """
+import pathlib, sys
+from learner import update as updates
+from learner.checkpoint import Checkpoints
+from tests.learner import toy
+from tests.learner.test_update import rollout
+
+directory, first, last = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+state = updates.init_state(3, toy.LAYOUT, 1, toy.SPEC.network, toy.PPO)
+checkpoints = Checkpoints(directory)
+if first:
+    state, meta = checkpoints.load(state)
+    assert meta == {"next": first}
+for seed in range(first, last):
+    state, _ = updates.update(state, rollout(toy.bundle_of(state), seed), toy.LAYOUT, toy.PPO)
+checkpoints.save(state, {"next": last}, state.version)
+"""
+
+
+def run_stream(directory: pathlib.Path, first: int, last: int) -> None:
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", STREAM, str(directory), str(first), str(last)]
+    subprocess.run(command, check=True, env=environment, timeout=120)
+
+
+def test_half_save_load_half_equals_the_whole_bit_for_bit(tmp_path):
+    run_stream(tmp_path / "whole", 0, 6)
+    run_stream(tmp_path / "halves", 0, 3)
+    run_stream(tmp_path / "halves", 3, 6)
+    whole, halves = ((tmp_path / name / "latest").read_bytes() for name in ("whole", "halves"))
+    assert whole == halves
+
+
+def tree(value: float) -> dict:
+    return {
+        "device": {"half": jnp.full((2, 3), value, jnp.float16), "key": jax.random.PRNGKey(int(value))},
+        "host": np.array([value, 2.0**60 + 512]),
+        "steps": 2**40 + int(value),
+    }
+
+
+def test_leaves_come_back_where_and_what_they_were(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(tree(1.0), {"hub": {"seen": [1, 2]}, "epoch": "e"}, 1)
+    loaded, meta = checkpoints.load(tree(0.0))
+    assert meta == {"hub": {"seen": [1, 2]}, "epoch": "e"}
+    jax.tree.map(np.testing.assert_array_equal, loaded, tree(1.0))
+    assert isinstance(loaded["device"]["half"], jax.Array)
+    assert isinstance(loaded["host"], np.ndarray) and loaded["host"].dtype == np.float64
+    assert isinstance(loaded["steps"], int)
+
+
+def test_three_are_kept_and_the_latest_is_the_newest(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    for version in range(1, 6):
+        checkpoints.save(tree(version), {}, version)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == [*(f"checkpoint_00000000{v}.safetensors" for v in (3, 4, 5)), "latest"]
+    assert checkpoints.load(tree(0.0))[0]["host"][0] == 5.0
+
+
+def test_a_full_disk_is_one_clear_error_and_the_previous_checkpoint_is_intact(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(tree(1.0), {}, 1)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))  # the kernel refuses to write more than 100 bytes
+    try:
+        with pytest.raises(CongraspError, match="checkpoint_000000002.safetensors could not be written") as caught:
+            checkpoints.save(tree(2.0), {}, 2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "\n" not in str(caught.value)
+    assert checkpoints.load(tree(0.0))[0]["host"][0] == 1.0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint_000000001.safetensors", "latest"]
+
+
+def test_a_process_that_dies_while_writing_leaves_the_previous_checkpoint(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(tree(1.0), {}, 1)
+    script = """
+import os, pathlib, sys
+import learner.checkpoint as checkpoint
+from tests.learner.test_checkpoint import tree
+checkpoint.sync_directory = lambda path: None
+os.fsync = lambda descriptor: os._exit(9)  # gone after the data were written, before the rename
+checkpoint.Checkpoints(pathlib.Path(sys.argv[1])).save(tree(2.0), {}, 2)
+"""
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], env=environment, timeout=60)
+    assert done.returncode == 9
+    assert checkpoints.load(tree(0.0))[0]["host"][0] == 1.0
+
+
+def test_no_checkpoint_a_torn_one_and_one_of_another_shape(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    with pytest.raises(CongraspError, match="no checkpoint"):
+        checkpoints.load(tree(0.0))
+    path = checkpoints.save(tree(1.0), {}, 1)
+    with pytest.raises(CongraspError, match="'host'"):
+        checkpoints.load({**tree(0.0), "host": np.zeros(3)})
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(CongraspError, match="damaged"):
+        checkpoints.load(tree(0.0))

@@ -1,0 +1,41 @@
+import numpy as np
+import pytest
+
+from common.wire.codec import Message
+from learner.statistics import Pace, episode_means, staleness
+
+
+def rollout(version: int = 0, steps: int = 1, **episodes: list[float]) -> Message:
+    arrays = {name.replace("_", "/", 1): np.array(values, np.float32) for name, values in episodes.items()}
+    return Message({**arrays, "reward": np.zeros((1, steps))}, {"version": version, "steps": steps})
+
+
+def test_means_are_over_episodes_and_not_over_rollouts():
+    means = episode_means(
+        [rollout(episode_success=[1, 0, 0], term_drop=[-1, -2, -3]), rollout(episode_success=[1], term_drop=[0])]
+    )
+    assert means == {"episode/success": 0.5, "term/drop": -1.5, "episodes": 4.0}
+
+
+def test_rollouts_without_a_finished_episode_add_nothing():
+    assert episode_means([rollout(episode_success=[])]) == {"episodes": 0.0}
+    assert episode_means([rollout()]) == {"episodes": 0.0}
+
+
+def test_metrics_of_inactive_constraints_are_left_out():
+    means = episode_means([rollout(episode_pose_rad=[np.nan, 0.2, np.nan], episode_trajectory_m=[np.nan] * 3)])
+    assert means["episode/pose_rad"] == pytest.approx(0.2)
+    assert "episode/trajectory_m" not in means
+
+
+def test_staleness_weighs_transitions():
+    lags = staleness([rollout(version=9, steps=300), rollout(version=7, steps=100)], version=9)
+    assert lags == {"staleness_mean": 0.5, "staleness_max": 2.0}
+
+
+def test_pace_forgets_what_is_outside_its_window():
+    now = iter([0.0, 10.0, 11.0, 12.0])
+    pace = Pace(window=2, clock=lambda: next(now))
+    assert pace.steps_per_second(100) == pytest.approx(10.0)
+    assert pace.steps_per_second(100) == pytest.approx(200 / 11)
+    assert pace.steps_per_second(100) == pytest.approx(100.0)
