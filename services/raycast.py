@@ -154,7 +154,11 @@ class _Scene:
         self.data = [mujoco.MjData(self.model) for _ in range(4)]
         for data in self.data:
             mujoco.mj_kinematics(self.model, data)
-        self.smooth = {i: SmoothNormals(s.vertices, s.faces) for i, s in enumerate(shapes) if s.kind == "mesh"}
+        self.smooth = {
+            i: SmoothNormals(np.asarray(s.vertices), np.asarray(s.faces))
+            for i, s in enumerate(shapes)
+            if s.kind == "mesh"
+        }
         self.paint = {i: cKDTree(s.paint_points) for i, s in enumerate(shapes) if s.paint_points is not None}
 
     def cast(

@@ -1,5 +1,6 @@
 """Pictures of hands and of recorded episodes."""
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -23,6 +24,7 @@ TABLE = (0.80, 0.79, 0.77)
 _TABLE_RADIUS, _TABLE_HALF_HEIGHT = 0.28, 0.008
 _FULL_CONTACT = 2.0  # force at which a link takes the full contact colour, N
 _FIELD_OF_VIEW, _ELEVATION = 26.0, 24.0  # degrees
+_ARROW_SEARCH, _ARROW_GAP = 0.012, 0.004  # radius in which the approach looks for the object, space before it, m
 _SPACE = 1.06  # free space at the picture's edges
 _LINK_SPACE = 0.03  # how far a link reaches around its origin, m
 
@@ -108,13 +110,18 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
     origin = np.asarray(arrays["object_position"][step], float)
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
     mask = dict(zip(MASKS, arrays["goal/mask"] > 0, strict=True))
-    tip = turn.apply(arrays["goal/heading_position"]) + origin
     direction = turn.apply(arrays["goal/heading_direction"])
-    shapes = arrow(tip - 0.11 * direction, tip, 0.0028, APPROACH)
+    # The target lies inside the object: the arrow ends where its line enters.
+    off = arrays["surface_points"] - arrays["goal/heading_position"]
+    along = off @ arrays["goal/heading_direction"]
+    across = np.linalg.norm(off - along[:, None] * arrays["goal/heading_direction"], axis=-1)
+    depth = max(0.0, -float(along[across < _ARROW_SEARCH].min(initial=0.0))) + _ARROW_GAP
+    tip = turn.apply(arrays["goal/heading_position"]) + origin - depth * direction
+    shapes = arrow(tip - 0.08 * direction, tip, 0.0028, APPROACH)
     if mask["trajectory"]:
         points = turn.apply(arrays["goal/trajectory_position"]) + origin
         shapes += [Shape("sphere", (0.0035, 0, 0), WAYPOINT, point) for point in points]
-        shapes += [between(a, b, 0.0013, WAYPOINT) for a, b in zip(points, points[1:], strict=False)]
+        shapes += [between(a, b, 0.0013, WAYPOINT) for a, b in itertools.pairwise(points)]
     if mask["pose_finger"]:
         wrist = turn * Rotation.from_quat(arrays["goal/pose_quaternion"], scalar_first=True)
         position, quaternion = link_poses(hand, arrays["goal/pose_q"])

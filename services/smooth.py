@@ -42,8 +42,8 @@ class SmoothNormals:
             around = owner[groups]  # (groups, size) faces that share a vertex
             near = np.einsum("gik,gjk->gij", self.normals[around], self.normals[around]) > CREASE
             result[order[groups]] = np.einsum("gij,gjk->gik", near, cross[around])
-        result = result.reshape(-1, 3, 3)
-        return result / np.linalg.norm(result, axis=-1, keepdims=True)
+        result /= np.linalg.norm(result, axis=-1, keepdims=True)
+        return result.reshape(-1, 3, 3)
 
     def __call__(self, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """(n, 3) smooth normals at points (n, 3) of the surface with flat normals (n, 3), in the mesh's frame."""

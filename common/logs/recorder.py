@@ -131,7 +131,7 @@ class Recorder:
         for entry in entries:
             for sink in self._sinks:
                 sink.write(entry)
-        self._on_disk(lambda writer: [writer.write(entry) for entry in entries])
+        self._on_disk(lambda writer: writer.write(*entries))
 
     def _count_gap(self, key: str, message: Message) -> None:
         sequence = message.meta.get("log_sequence")

@@ -73,7 +73,8 @@ def duration(episode: Message) -> int:
 
 
 def _protobuf(topic: str, time: int, message: Any, *, latched: bool = False) -> Entry:
-    return Entry(protobuf_channel(topic, type(message), latched=latched), time, message.SerializeToString())
+    kind: Any = type(message)
+    return Entry(protobuf_channel(topic, kind, latched=latched), time, message.SerializeToString())
 
 
 def _transforms(

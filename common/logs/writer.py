@@ -58,21 +58,27 @@ class LogWriter:
         self._path = directory
         self.files: list[pathlib.Path] = []
 
-    def write(self, entry: Entry) -> None:
-        """Adds an entry.
+    def write(self, *entries: Entry) -> None:
+        """Adds entries that belong together: they come into one file.
 
         Raises:
           OSError: the disk is full or broken; what was flushed before stays readable.
         """
-        if self._file is not None and (self._file.tell() > self._max_bytes or entry.time - self._first > self._max_ns):
+        if not entries:
+            return
+        if self._file is not None and self._is_over(self._file, entries[0].time):
             self.close()
         if self._file is None:
-            self._begin(entry.time)
-        channel = self._channels.get(entry.channel)
-        if channel is None:
-            channel = self._channels[entry.channel] = self._register(entry.channel)
-        self._sequences[channel] = sequence = self._sequences.get(channel, 0) + 1
-        self._writer.add_message(channel, entry.time, entry.data, entry.time, sequence)
+            self._begin(entries[0].time)
+        for entry in entries:
+            channel = self._channels.get(entry.channel)
+            if channel is None:
+                channel = self._channels[entry.channel] = self._register(entry.channel)
+            self._sequences[channel] = sequence = self._sequences.get(channel, 0) + 1
+            self._writer.add_message(channel, entry.time, entry.data, entry.time, sequence)
+
+    def _is_over(self, file: IO[bytes], time: int) -> bool:
+        return file.tell() > self._max_bytes or time - self._first > self._max_ns
 
     def flush(self) -> None:
         """Hands everything so far to the operating system; a killed writer loses only what comes after.

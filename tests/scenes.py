@@ -1,0 +1,95 @@
+"""Random but valid scenes, goals and surfaces for tests of the task."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.hands import get_hand
+from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
+
+HAND = get_hand("human")
+F, L, N, K = len(HAND.joints), len(HAND.links), 64, 15
+
+
+def quaternions(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Uniform unit quaternions (..., 4), w first."""
+    q = rng.normal(size=(*shape, 4))
+    return (q / np.linalg.norm(q, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def units(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Uniform unit vectors (..., 3)."""
+    v = rng.normal(size=(*shape, 3))
+    return (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
+    """A scene near a box-like cloud of points, with every constraint active."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape: int, scale: float = 1.0) -> np.ndarray:
+        return (scale * rng.normal(size=(batch, *shape))).astype(np.float32)
+
+    object_position = normal(3, scale=0.1) + np.array([0, 0, 0.3], np.float32)
+    state = SceneState(
+        q=rng.uniform(HAND.lower, HAND.upper, (batch, F)).astype(np.float32),
+        u=normal(6, scale=0.1),
+        q_velocity=normal(F),
+        u_velocity=normal(6),
+        q_target=rng.uniform(HAND.lower, HAND.upper, (batch, F)).astype(np.float32),
+        u_target=normal(6, scale=0.1),
+        object_position=object_position,
+        object_quaternion=quaternions(rng, batch),
+        object_velocity=normal(3),
+        object_angular_velocity=normal(3),
+        contact_force=normal(L, CONTACTS_PER_LINK, 3, scale=5.0),
+        contact_position=object_position[:, None, None] + normal(L, CONTACTS_PER_LINK, 3, scale=0.03),
+        contact_found=rng.random((batch, L, CONTACTS_PER_LINK)) < 0.4,
+        base_position=object_position + normal(3, scale=0.15),
+        base_quaternion=quaternions(rng, batch),
+        q_initial=np.tile(HAND.q_open, (batch, 1)),
+        object_position_initial=object_position + normal(3, scale=0.02),
+        object_quaternion_initial=quaternions(rng, batch),
+        time=np.full(batch, 20.0, np.float32),
+        table=np.ones(batch, bool),
+    )
+    direction = units(rng, batch)
+    cross = np.cross(direction, units(rng, batch))
+    goal = Goal(
+        heading_position=normal(3, scale=0.03),
+        heading_direction=direction,
+        heading_cross=(cross / np.linalg.norm(cross, axis=-1, keepdims=True)).astype(np.float32),
+        pose_q=rng.uniform(HAND.lower, HAND.upper, (batch, F)).astype(np.float32),
+        pose_position=normal(3, scale=0.1),
+        pose_quaternion=quaternions(rng, batch),
+        trajectory_position=normal(K, 3, scale=0.15),
+        trajectory_quaternion=quaternions(rng, batch, K),
+        mask=np.ones((batch, 4), np.float32),
+    )
+    surface = Surface(normal(N, 3, scale=0.03), rng.random((batch, N)) < 0.5)
+    return state, surface, goal
+
+
+def moved(state: SceneState, position: np.ndarray, turn: Rotation) -> SceneState:
+    """The whole scene carried by a rigid motion of the world: first turned about the origin, then shifted."""
+
+    def point(x: np.ndarray) -> np.ndarray:
+        return (turn.apply(x.reshape(-1, 3)).reshape(x.shape) + position).astype(np.float32)
+
+    def vector(x: np.ndarray) -> np.ndarray:
+        return turn.apply(x.reshape(-1, 3)).reshape(x.shape).astype(np.float32)
+
+    def attitude(q: np.ndarray) -> np.ndarray:
+        return (turn * Rotation.from_quat(q, scalar_first=True)).as_quat(scalar_first=True).astype(np.float32)
+
+    return state._replace(
+        object_position=point(state.object_position),
+        object_quaternion=attitude(state.object_quaternion),
+        object_velocity=vector(state.object_velocity),
+        object_angular_velocity=vector(state.object_angular_velocity),
+        contact_force=vector(state.contact_force),
+        contact_position=point(state.contact_position),
+        base_position=point(state.base_position),
+        base_quaternion=attitude(state.base_quaternion),
+        object_position_initial=point(state.object_position_initial),
+        object_quaternion_initial=attitude(state.object_quaternion_initial),
+    )
