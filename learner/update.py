@@ -9,11 +9,12 @@ bundle that was published with them may still be in use in this process. The hos
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from common.config import NetworkConfig, PPOConfig
@@ -86,6 +87,17 @@ def init_state(seed: int, layout: Layout, action_size: int, sizes: NetworkConfig
         version=0,
         transitions=0,
     )
+
+
+def collate(rollouts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    """The worlds of several rollouts of equal length side by side, where the rollouts are: host or device."""
+    if len(rollouts) == 1:
+        return {name: rollouts[0][name] for name in FIELDS}
+    parts = {name: [rollout[name] for rollout in rollouts] for name in FIELDS}
+    return {
+        name: (jnp if isinstance(arrays[0], jax.Array) else np).concatenate(arrays, axis=name != "last_observation")
+        for name, arrays in parts.items()
+    }
 
 
 def update(

@@ -1,18 +1,22 @@
 """Pictures of hands and of recorded episodes."""
 
+import collections
 import itertools
+import pathlib
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.spec import Hand, link_origin
 from common.logs.poses import link_poses
+from common.logs.reader import read_episodes
 from common.task.types import MASKS
 from common.wire.codec import Message
 from services.raycast import Camera, Shape, between, render_scene, visible
-from services.sheets import contact_sheet
+from services.sheets import contact_sheet, save_video
 
 SKIN = (0.70, 0.73, 0.79)
 TOUCHING = (0.13, 0.74, 0.63)
@@ -266,3 +270,26 @@ def _ends(capsule: Shape) -> np.ndarray:
     turn = Rotation.from_quat(capsule.quaternion, scalar_first=True)
     ends = capsule.position + turn.apply([[0, 0, capsule.size[1]], [0, 0, -capsule.size[1]]])
     return (ends[:, None] + capsule.size[0] * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
+
+
+def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Message:
+    """One of the recorded episodes at `path`; -1 is the last. A CongraspError says how many there are."""
+    last: collections.deque[Message] = collections.deque(maxlen=max(1, -index))
+    count = 0
+    for episode in read_episodes(path):
+        if episode.meta["success"] or not success:
+            last.append(episode)
+            count += 1
+            if count == index + 1:
+                break
+    if not -count <= index < count:
+        kind = "successful episodes" if success else "episodes"
+        raise CongraspError(f"{path} holds {count} {kind}, not one with index {index}.")
+    return last[0 if index < 0 else -1]
+
+
+def save_episode_video(path: pathlib.Path, episode: Message, size: tuple[int, int] = (640, 480)) -> None:
+    """Every second control step of an episode as MP4, at half its speed."""
+    steps = range(0, len(episode.arrays["table"]), 2)
+    frame_rate = 0.25 / float(episode.meta["control_dt"])
+    save_video(path, render_episode_frames(episode, steps, size), size, frame_rate)

@@ -166,9 +166,24 @@ def propose(piece: Piece, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
         keep = u[:, 3] * (1 / radii.min()) < stretch
         x, n = unit * radii, gradient / stretch[:, None]
     else:
-        x, n = _propose_mesh(_vertices(piece), u)
+        x, n, _ = on_triangles(np.asarray(triangulate(_vertices(piece)).triangles), u)
     r = rotation(piece)
     return x @ r.T + np.asarray(piece.pos), n @ r.T, keep
+
+
+def on_triangles(triangles: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points that are uniform on triangles (F, 3, 3) where `u` (N, >= 3) is uniform in the unit cube.
+
+    Returns:
+      Points (N, 3), unit normals (N, 3) by the right-hand rule, and (N,) index of each point's triangle.
+    """
+    crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    doubled = np.linalg.norm(crosses, axis=-1)
+    edges = np.cumsum(doubled)
+    face = np.searchsorted(edges, u[:, 0] * edges[-1], side="right").clip(max=len(edges) - 1)
+    root = np.sqrt(u[:, 1])
+    weights = np.stack([1 - root, root * (1 - u[:, 2]), root * u[:, 2]], -1)
+    return np.einsum("ni,nij->nj", weights, triangles[face]), crosses[face] / doubled[face, None], face
 
 
 def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
@@ -246,15 +261,3 @@ def _propose_capsule(radius: float, half: float, u: np.ndarray) -> tuple[np.ndar
     ring, turn = np.sqrt(1 - z**2), 2 * np.pi * u[:, 1]
     normals = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], -1)
     return radius * normals + center[:, None] * [0.0, 0.0, 1.0], normals
-
-
-def _propose_mesh(vertices: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    mesh = triangulate(vertices)
-    edges = np.cumsum(mesh.area_faces)
-    face = np.searchsorted(edges, u[:, 0] * edges[-1], side="right").clip(max=len(edges) - 1)
-    corners = np.asarray(mesh.triangles)[face]
-    root = np.sqrt(u[:, 1])
-    weights = np.stack([1 - root, root * (1 - u[:, 2]), root * u[:, 2]], -1)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.einsum("ni,nij->nj", weights, corners), normals

@@ -6,6 +6,7 @@ from common.objects import shapes
 from common.objects.spec import SURFACE_POINTS, Piece
 
 _SEAM = 2e-4  # m; a point is outside if it still is after this step along its normal
+_REACHABLE = 4e-3  # m; a mesh's surface counts as open if the collision pieces end within this distance
 # The generalised golden ratio of four dimensions: the positive root of x^5 = x + 1 (Roberts' R4 sequence).
 _STRIDE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
@@ -32,9 +33,8 @@ def sample_union(
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     total, drawn = 0, 0
     while total < count:
-        index = np.arange(drawn, drawn + 2 * count)
+        u = _sequence(offset, drawn, 2 * count)
         drawn += 2 * count
-        u = (offset + index[:, None] * _STRIDE) % 1.0
         area = u[:, 0] * edges[-1]
         owner = np.searchsorted(edges, area, side="right").clip(max=len(pieces) - 1)
         u[:, 0] = (area - starts[owner]) / (edges - starts)[owner]
@@ -51,6 +51,38 @@ def sample_union(
     return points, normals, owner
 
 
+def sample_mesh(
+    triangles: np.ndarray, pieces: tuple[Piece, ...], rng: np.random.Generator, count: int = SURFACE_POINTS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points on the part of a mesh that a finger can reach.
+
+    Points that lie more than a few millimetres below the surface of the collision pieces (inner walls, hollows that
+    the pieces fill) are left out, unless that would leave less than a quarter. Normals that point into the pieces
+    where the other side is free are turned, so that a mesh with flipped faces does no harm.
+
+    Args:
+      triangles: (F, 3, 3) corners.
+      pieces: collision pieces in the same frame.
+      rng: draws the start of the low-discrepancy sequence.
+      count: number of points N.
+
+    Returns:
+      Points (N, 3), outward unit normals (N, 3), and (N,) index of each point's triangle.
+    """
+    points, normals, face = shapes.on_triangles(triangles, _sequence(rng.random(4), 0, 8 * count))
+    outer, inner = (
+        np.any([shapes.contains(piece, points + side * _REACHABLE * normals) for piece in pieces], axis=0)
+        for side in (1, -1)
+    )
+    flipped = outer & ~inner
+    normals = np.where(flipped[:, None], -normals, normals)
+    reachable = ~(outer & inner)
+    if reachable.mean() < 0.25:
+        reachable[:] = True
+    chosen = np.flatnonzero(reachable)[:count]
+    return points[chosen], normals[chosen], face[chosen]
+
+
 def halves(points: np.ndarray, cut: float) -> np.ndarray:
     """Labels (N,) 0 and 1 of points (N, 3) on the two sides of a plane across their longest principal axis.
 
@@ -63,6 +95,11 @@ def halves(points: np.ndarray, cut: float) -> np.ndarray:
     axis = axis * np.sign(axis[np.abs(axis).argmax()])
     along = centered @ axis
     return (along > np.quantile(along, cut)).astype(np.int32)
+
+
+def _sequence(offset: np.ndarray, start: int, count: int) -> np.ndarray:
+    """(count, 4) points of the low-discrepancy sequence in the unit cube, from index `start` on."""
+    return (offset + np.arange(start, start + count)[:, None] * _STRIDE) % 1.0
 
 
 def mass_properties(pieces: tuple[Piece, ...], densities: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

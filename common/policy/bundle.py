@@ -90,7 +90,7 @@ class PolicyBundle:
     value: Statistics
     """Of returns."""
     version: int
-    """Updates since the run began."""
+    """Rises with every update of a run, also over restarts of its learner."""
     epoch: str
     """Identity of the run's beginning: another one when training restarts from scratch, the same after a resume."""
     transitions: int
@@ -109,7 +109,6 @@ class PolicyBundle:
             "format": FORMAT,
             "version": self.version,
             "epoch": self.epoch,
-            "updates": self.version,
             "transitions": self.transitions,
             "schema": self.spec.schema,
             "hand": self.spec.hand,
@@ -144,7 +143,7 @@ class PolicyBundle:
             task = _dataclass(TaskConfig, meta["task"])
             version, epoch, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
             shapes = _shapes(spec)
-        except (KeyError, TypeError, ValueError, dacite.DaciteError) as error:
+        except (KeyError, TypeError, ValueError, CongraspError, dacite.DaciteError) as error:
             raise CongraspError(f"The policy {source} has bad meta data: {error}.", _REMEDY) from None
         if meta.get("schema") != spec.schema:
             raise CongraspError(f"The policy {source} names a schema that is not its own.", _REMEDY)

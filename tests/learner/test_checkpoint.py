@@ -10,40 +10,40 @@ import numpy as np
 import pytest
 
 from common.errors import CongraspError
-from learner.checkpoint import Checkpoints
-
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-
-# Runs updates FIRST..LAST-1 of a fixed stream and leaves a checkpoint; a process of its own each time.
-STREAM = """
-import pathlib, sys
 from learner import update as updates
 from learner.checkpoint import Checkpoints
 from tests.learner import toy
 from tests.learner.test_update import rollout
 
-directory, first, last = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-state = updates.init_state(3, toy.LAYOUT, 1, toy.SPEC.network, toy.PPO)
-checkpoints = Checkpoints(directory)
-if first:
-    state, meta = checkpoints.load(state)
-    assert meta == {"next": first}
-for seed in range(first, last):
-    state, _ = updates.update(state, rollout(toy.bundle_of(state), seed), toy.LAYOUT, toy.PPO)
-checkpoints.save(state, {"next": last}, state.version)
-"""
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 
 def run_stream(directory: pathlib.Path, first: int, last: int) -> None:
+    """Runs updates `first` to `last` - 1 of a fixed stream, from the checkpoint that is there, and leaves one."""
+    state = updates.init_state(3, toy.LAYOUT, 1, toy.SPEC.network, toy.PPO)
+    checkpoints = Checkpoints(directory)
+    if first:
+        state, meta = checkpoints.load(state)
+        assert meta == {"next": first}
+    for seed in range(first, last):
+        state, _ = updates.update(state, rollout(toy.bundle_of(state), seed), toy.LAYOUT, toy.PPO)
+    checkpoints.save(state, {"next": last}, state.version)
+
+
+def in_a_fresh_process(script: str, directory: pathlib.Path) -> int:
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", STREAM, str(directory), str(first), str(last)]
-    subprocess.run(command, check=True, env=environment, timeout=120)
+    return subprocess.run([sys.executable, "-c", script, str(directory)], env=environment, timeout=120).returncode
 
 
 def test_half_save_load_half_equals_the_whole_bit_for_bit(tmp_path):
     run_stream(tmp_path / "whole", 0, 6)
     run_stream(tmp_path / "halves", 0, 3)
-    run_stream(tmp_path / "halves", 3, 6)
+    script = """
+import pathlib, sys
+from tests.learner.test_checkpoint import run_stream
+run_stream(pathlib.Path(sys.argv[1]), 3, 6)
+"""
+    assert in_a_fresh_process(script, tmp_path / "halves") == 0
     whole, halves = ((tmp_path / name / "latest").read_bytes() for name in ("whole", "halves"))
     assert whole == halves
 
@@ -82,7 +82,7 @@ def test_a_full_disk_is_one_clear_error_and_the_previous_checkpoint_is_intact(tm
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))  # the kernel refuses to write more than 100 bytes
     try:
-        with pytest.raises(CongraspError, match="checkpoint_000000002.safetensors could not be written") as caught:
+        with pytest.raises(CongraspError, match=r"checkpoint_000000002\.safetensors could not be written") as caught:
             checkpoints.save(tree(2.0), {}, 2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -102,9 +102,7 @@ checkpoint.sync_directory = lambda path: None
 os.fsync = lambda descriptor: os._exit(9)  # gone after the data were written, before the rename
 checkpoint.Checkpoints(pathlib.Path(sys.argv[1])).save(tree(2.0), {}, 2)
 """
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], env=environment, timeout=60)
-    assert done.returncode == 9
+    assert in_a_fresh_process(script, tmp_path) == 9
     assert checkpoints.load(tree(0.0))[0]["host"][0] == 1.0
 
 

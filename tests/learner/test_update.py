@@ -35,10 +35,10 @@ def leaves(state: updates.TrainState) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("lag", [0, 2])
 def test_it_learns_to_reach(lag):
-    """From worse than standing still to better than halving the distance at every step, also from stale rollouts."""
+    """From hardly moving to better than halving the distance at every step, also from stale rollouts."""
     state = fresh()
     published = [toy.bundle_of(state)]
-    assert toy.mean_return(published[0]) < toy.STANDING_STILL + 0.5
+    assert toy.mean_return(published[0]) < toy.STANDING_STILL / 2
     for seed in range(60):
         batch = rollout(published[max(0, len(published) - 1 - lag)], seed)
         state, metrics = step(state, batch)

@@ -1,0 +1,313 @@
+"""Import of meshes: from files to a `GraspObject`, with every complaint in one line."""
+
+import dataclasses
+import hashlib
+import logging
+import os
+import pathlib
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+import numpy as np
+import trimesh
+from scipy.spatial import QhullError, cKDTree
+
+from common.errors import CongraspError
+from common.objects import decompose, shapes, store
+from common.objects.procedural import MASS_RANGE
+from common.objects.resting import rest_poses
+from common.objects.sources import MeshFile, Source, find_sources, read_mesh
+from common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
+from common.objects.surface import halves, mass_properties, sample_mesh
+
+Unit = Literal["auto", "m", "cm", "mm", "in"]
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
+_PLAUSIBLE = (0.01, 0.6)
+_POSSIBLE = (0.005, 1.0)
+_CACHE_VERSION = 1
+_MAX_FACES = 20_000
+_THINNEST = 2e-4
+_log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportOptions:
+    """How meshes become objects; the string under a field is its help on the command line."""
+
+    unit: Unit = "auto"
+    """Unit of the files' numbers; auto takes metres if that makes an object of 1 to 60 cm, and asks otherwise."""
+    scale: float = 1.0
+    """Factor on the size, after the unit."""
+    density: float = 500.0
+    """kg/m^3, for the mass where none is given; that mass is kept between 0.05 and 0.5 kg."""
+    mass: float | None = None
+    """Mass in kg."""
+    time_limit: float = 60.0
+    """Seconds for the convex decomposition (CoACD) of one mesh; V-HACD takes over after it."""
+    max_pieces: int = MAX_MESH_PIECES
+    """Most convex pieces of an object; more are merged."""
+    cache_dir: str = ""
+    """Folder that remembers finished imports; empty means the user's cache folder."""
+
+
+def import_paths(paths: Sequence[str | os.PathLike[str]], options: ImportOptions | None = None) -> list[GraspObject]:
+    """Imports everything that the paths hold; see `find_sources` for what they may be.
+
+    Raises:
+      CongraspError: a mesh cannot be used; the line names it, its fault and the remedy.
+    """
+    options = options or ImportOptions()
+    return [import_source(source, options)[0] for path in paths for source in find_sources(path)]
+
+
+def import_source(source: Source, options: ImportOptions) -> tuple[GraspObject, list[str]]:
+    """Imports one object.
+
+    Its origin moves to the centre of mass; its orientation stays the file's. Parts come from part files; an object
+    without them is labelled by its two halves, the slimmer one graspable.
+
+    Returns:
+      The object, and what the user should know about it (none if it came from the cache).
+
+    Raises:
+      CongraspError: see `import_paths`.
+    """
+    _check_options(options)
+    key = _cache_key(source, options)
+    cached = _cache_folder(options) / f"{key}{store.SUFFIX}"
+    if cached.is_file():
+        try:
+            return store.load(cached), []
+        except CongraspError:
+            cached.unlink()
+    notes: list[str] = []
+    obj = _build(source, options, int(key, 16), notes)
+    for note in notes:
+        _log.warning("%s: %s", source.name, note)
+    store.save(obj, cached)
+    return obj, notes
+
+
+def _check_options(options: ImportOptions) -> None:
+    for name in ("scale", "density", "time_limit", "max_pieces"):
+        if not getattr(options, name) > 0:
+            raise CongraspError(f"--{name.replace('_', '-')} is {getattr(options, name)}.", "It must be positive.")
+    if options.mass is not None and not options.mass > 0:
+        raise CongraspError(f"--mass is {options.mass}.", "It must be positive, in kilograms.")
+
+
+def _cache_folder(options: ImportOptions) -> pathlib.Path:
+    if options.cache_dir:
+        return pathlib.Path(options.cache_dir)
+    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "objects"
+
+
+def _cache_key(source: Source, options: ImportOptions) -> str:
+    settings = dataclasses.replace(options, cache_dir="")
+    content = hashlib.sha256(f"{_CACHE_VERSION} {source.name} {settings}".encode())
+    for file in source.files():
+        content.update(f" {file.path.name} {file.role} {file.part} ".encode())
+        content.update(hashlib.sha256(file.path.read_bytes()).digest())
+    return content.hexdigest()[:24]
+
+
+def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) -> GraspObject:
+    visuals = [read_mesh(file.path) for file in source.visuals] or [
+        shapes.triangulate(_corners(file)) for file in source.pieces
+    ]
+    factor = _unit_factor(source, trimesh.util.concatenate(visuals), options)
+    meshes = [_scaled(mesh, factor) for mesh in visuals]
+    whole = trimesh.util.concatenate(meshes)
+    closed = all(mesh.is_volume for mesh in meshes)
+    if not closed:
+        notes.append("its mesh is not a closed surface: mass and inertia are those of its convex pieces")
+    hulls, owners = _pieces(source, meshes, factor, closed, options, notes)
+    mass, center, inertia = _weigh(whole, hulls, closed, options)
+    pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
+    whole.apply_translation(-center)
+    points, normals, face = sample_mesh(np.asarray(whole.triangles), pieces, np.random.default_rng(seed))
+    part_names, graspable, labels = _labels(source, meshes, factor, center, points, face)
+    share = graspable[labels].mean()
+    if not 0.1 <= share <= 0.9:
+        notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
+    if not source.parts_are_pieces:
+        near = cKDTree(points)
+        votes = (labels[near.query(piece.vertices + piece.pos)[1]] for piece in pieces)
+        pieces = tuple(
+            dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
+            for piece, vote in zip(pieces, votes, strict=True)
+        )
+    picture = whole if len(whole.faces) <= _MAX_FACES else whole.simplify_quadric_decimation(face_count=_MAX_FACES)
+    obj = GraspObject(
+        name=source.name,
+        family="imported",
+        pieces=pieces,
+        part_names=part_names,
+        graspable=graspable,
+        mass=mass,
+        inertia=inertia,
+        points=points.astype(np.float32),
+        normals=normals.astype(np.float32),
+        labels=labels.astype(np.int32),
+        rest_poses=np.zeros((0, 7)),
+        visual_vertices=np.asarray(picture.vertices, np.float32),
+        visual_faces=np.asarray(picture.faces, np.int32),
+    )
+    return dataclasses.replace(obj, rest_poses=rest_poses(obj))
+
+
+def _corners(file: MeshFile) -> np.ndarray:
+    return np.asarray(read_mesh(file.path).vertices, np.float64)
+
+
+def _unit_factor(source: Source, mesh: trimesh.Trimesh, options: ImportOptions) -> float:
+    """Metres per unit of the files, with the scale; complains about sizes that no hand can grasp."""
+    unit = "m" if options.unit == "auto" else options.unit
+    factor = METRES[unit] * options.scale
+    extent = float(mesh.extents.max())
+    size = extent * factor
+    low, high = _PLAUSIBLE if options.unit == "auto" else _POSSIBLE
+    if not low <= size <= high:
+        fitting = [u for u in ("mm", "cm", "in", "m") if 0.02 <= extent * METRES[u] * options.scale <= 0.4 and u != unit]
+        remedy = f"Set '--scale {_round(0.1 / (extent * METRES[unit]))}' for an object of 10 cm."
+        if fitting:
+            then = extent * METRES[fitting[0]] * options.scale
+            remedy = f"If they are {_UNIT_NAMES[fitting[0]]}, add '--unit {fitting[0]}' ({_length(then)}); or set --scale."
+        raise CongraspError(
+            f"{source.path} is {_length(size)} long if its numbers are {_UNIT_NAMES[unit]}: too "
+            f"{'large' if size > high else 'small'} for a hand.",
+            remedy,
+        )
+    if float(mesh.extents.min()) * factor < _THINNEST:
+        raise CongraspError(
+            f"{source.path} is flat: it is {_length(float(mesh.extents.min()) * factor)} thick.",
+            "Give it a thickness in a modelling program.",
+        )
+    return factor
+
+
+def _round(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _length(metres: float) -> str:
+    for limit, unit, factor in ((0.01, "mm", 1000.0), (1.0, "cm", 100.0), (1000.0, "m", 1.0)):
+        if metres < limit:
+            return f"{metres * factor:.3g} {unit}"
+    return f"{metres / 1000:.3g} km"
+
+
+def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
+    mesh = mesh.copy()
+    mesh.apply_scale(factor)
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh
+
+
+def _pieces(
+    source: Source,
+    meshes: list[trimesh.Trimesh],
+    factor: float,
+    closed: bool,
+    options: ImportOptions,
+    notes: list[str],
+) -> tuple[list[np.ndarray], list[int]]:
+    """Vertices of at most `max_pieces` simple convex pieces, and the part of each (0 where the parts are labels)."""
+    try:
+        if source.pieces:
+            groups = [[_corners(file) * factor for file in source.pieces]]
+        else:
+            volumes = [float(mesh.convex_hull.volume) for mesh in meshes]
+            shares = [volume / sum(volumes) for volume in volumes]
+            budgets = [max(1, int(options.max_pieces * share)) for share in shares]
+            groups = []
+            for mesh, budget in zip(meshes, budgets, strict=True):
+                reduced = mesh
+                if len(mesh.faces) > _MAX_FACES:
+                    reduced = mesh.simplify_quadric_decimation(face_count=_MAX_FACES)
+                result = decompose.decompose(
+                    np.asarray(reduced.vertices),
+                    np.asarray(reduced.faces),
+                    fill=float(mesh.volume) if closed else None,
+                    time_limit=options.time_limit,
+                    max_pieces=budget,
+                )
+                groups.append(result.pieces)
+                notes.extend(result.notes)
+        hulls, owners, missing = [], [], 0.0
+        limits = [options.max_pieces] if len(groups) == 1 else budgets
+        for owner, (group, limit) in enumerate(zip(groups, limits, strict=True)):
+            before = sum(shapes.hull_of(piece).volume for piece in group)
+            merged = decompose.merge(group, limit)
+            after = sum(shapes.hull_of(piece).volume for piece in merged)
+            if after > 1.1 * before:
+                notes.append(
+                    f"{len(group)} convex pieces were merged into {len(merged)}, whose volume is "
+                    f"{after / before - 1:.0%} larger: some hollows are filled (--max-pieces)"
+                )
+            for piece in merged:
+                vertices, lost = decompose.simplify(piece)
+                hulls.append(vertices)
+                owners.append(owner if source.parts_are_pieces else 0)
+                missing = max(missing, lost)
+    except QhullError:
+        raise CongraspError(
+            f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
+        ) from None
+    if missing > 0.1:
+        notes.append(f"round pieces were cut to 32 vertices ({missing:.0%} of a piece's volume, made up by its scale)")
+    return hulls, owners
+
+
+def _weigh(
+    whole: trimesh.Trimesh, hulls: Iterable[np.ndarray], closed: bool, options: ImportOptions
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre of mass and inertia: of the mesh if it is closed, of its convex pieces otherwise."""
+    if closed:
+        properties = whole.mass_properties
+        volume, center = float(properties["volume"]), np.asarray(properties["center_mass"])
+        per_volume = np.asarray(properties["inertia"]) / volume
+    else:
+        solids = tuple(Piece("mesh", (0, 0, 0), vertices=hull) for hull in hulls)
+        volume, center, inertia = mass_properties(solids, np.ones(len(solids)))
+        per_volume = inertia / volume
+    mass = float(np.clip(volume * options.density, *MASS_RANGE)) if options.mass is None else options.mass
+    return mass, center, per_volume * mass
+
+
+def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
+    middle = hull.mean(0)
+    return Piece("mesh", (0.0, 0.0, 0.0), tuple((middle - center).tolist()), vertices=hull - middle, part=part)
+
+
+def _labels(
+    source: Source,
+    meshes: list[trimesh.Trimesh],
+    factor: float,
+    center: np.ndarray,
+    points: np.ndarray,
+    face: np.ndarray,
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Names of the parts, which of them form O+, and the part (N,) of each surface point."""
+    if source.parts_are_pieces:
+        ends = np.cumsum([len(mesh.faces) for mesh in meshes])
+        labels = np.searchsorted(ends, face, side="right")
+    elif source.parts:
+        distances = []
+        for file in source.parts:
+            part = read_mesh(file.path)
+            dense, _ = trimesh.sample.sample_surface(part, 4000, seed=0)
+            distances.append(cKDTree(dense * factor - center).query(points)[0])
+        labels = np.argmin(distances, axis=0)
+    else:
+        labels = halves(points, 0.5)
+        middle = [points[labels == k] - points[labels == k].mean(0) for k in (0, 1)]
+        slim = int(np.argmin([np.linalg.svd(half, compute_uv=False)[2] / np.sqrt(len(half)) for half in middle]))
+        return ("near half", "far half"), np.arange(2) == slim, labels
+    files = source.parts
+    graspable = np.array([bool(file.graspable) for file in files])
+    if graspable.all() or not graspable.any():
+        graspable = np.arange(len(files)) == np.bincount(labels, minlength=len(files)).argmax()
+    return tuple(file.part for file in files), graspable, labels

@@ -1,0 +1,301 @@
+"""The learner process: rollouts in, policy bundles out, and a run directory from which it can be resumed.
+
+A run directory holds `config.json`, `checkpoints/`, `policy.safetensors` (the policy of the newest checkpoint), `logs/`
+and `version` (the newest version that was ever published, so that versions rise over a crash, too).
+"""
+
+import contextlib
+import pathlib
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from common.config import RunConfig, run_config_from_json, to_json
+from common.errors import CongraspError, PhysicsError
+from common.files import write_atomically
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle, PolicySpec
+from common.transport import keys
+from common.transport.base import Transport
+from common.wire.codec import Message, encode
+from learner import update as updates
+from learner.checkpoint import Checkpoints, flatten
+from learner.hub import LearnerHub, RolloutSizes
+from learner.staleness import StalenessManager
+from learner.statistics import Pace, episode_means, staleness
+from learner.update import NonFiniteUpdate, TrainState
+
+POLICY_FILE = "policy.safetensors"
+CONFIG_FILE = "config.json"
+LOGS = "logs"
+_VERSION_FILE = "version"
+_POLL_SECONDS = 0.2
+_STALL_SECONDS = 60.0
+_FAREWELL_SECONDS = 3.0
+
+Notify = Callable[[str, str], None]
+"""(level, text) of an event."""
+
+
+def create_run(run_dir: pathlib.Path, config: RunConfig) -> None:
+    """Makes a run directory; a CongraspError if there is a run in it already."""
+    if (run_dir / CONFIG_FILE).exists():
+        raise CongraspError(
+            f"{run_dir} holds a run already.", "Choose another --run-dir, or continue it with --resume."
+        )
+    write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
+    (run_dir / LOGS).mkdir(exist_ok=True)
+
+
+def open_run(run_dir: pathlib.Path) -> RunConfig:
+    """The configuration of a run directory; a CongraspError if it is not one."""
+    try:
+        text = (run_dir / CONFIG_FILE).read_bytes()
+    except OSError:
+        raise CongraspError(
+            f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Name one made by 'congrasp train'."
+        ) from None
+    return run_config_from_json(text)
+
+
+def run_learner(
+    run_dir: pathlib.Path,
+    config: RunConfig,
+    transport: Transport,
+    *,
+    stop_event: threading.Event,
+    resume: bool = False,
+    initial: PolicyBundle | None = None,
+    name: str = "0",
+    recorder: contextlib.AbstractContextManager[object] | None = None,
+    on_update: Callable[[dict[str, float]], None] = lambda values: None,
+    on_event: Notify = lambda level, text: None,
+) -> PolicyBundle:
+    """Trains until `config.updates` updates are done or `stop_event` is set; returns the last policy.
+
+    The run can be resumed in both cases, and after a crash from its last checkpoint.
+
+    Args:
+      run_dir: made by `create_run`.
+      config: the run; when resuming, it may differ from the one that began it in what changes no array.
+      transport: the learner's endpoint; it stays the caller's.
+      stop_event: ends training after the update that is under way.
+      resume: go on from the latest checkpoint.
+      initial: a policy to begin with instead of random weights (not when resuming).
+      name: the learner's name on the wire.
+      recorder: entered while the learner runs, for example one that writes the run's logs.
+      on_update: given the figures of every update.
+      on_event: given what is worth a line.
+
+    Raises:
+      CongraspError: the directory is not a run's; the checkpoint or the initial policy does not fit; the disk is full;
+        a thread of this process died.
+      PhysicsError: a value was not finite; state and batch are in `failure/`.
+    """
+    open_run(run_dir)
+    with _watch_threads() as deaths, recorder or contextlib.nullcontext():
+        learner = _Learner(run_dir, config, transport, name, resume, initial, on_event)
+        learner.train(stop_event, deaths, on_update)
+        return learner.bundle()
+
+
+@contextlib.contextmanager
+def _watch_threads() -> Iterator[list[str]]:
+    """Collects what killed threads of this process, so that the rest does not live on as if nothing had happened."""
+    deaths: list[str] = []
+    previous = threading.excepthook
+
+    def note(arguments: threading.ExceptHookArgs) -> None:
+        previous(arguments)
+        thread = arguments.thread.name if arguments.thread else "?"
+        deaths.append(f"thread '{thread}' died of {arguments.exc_type.__name__}: {arguments.exc_value}")
+
+    threading.excepthook = note
+    try:
+        yield deaths
+    finally:
+        threading.excepthook = previous
+
+
+class _Learner:
+    """State of one run between two updates."""
+
+    def __init__(
+        self,
+        run_dir: pathlib.Path,
+        config: RunConfig,
+        transport: Transport,
+        name: str,
+        resume: bool,
+        initial: PolicyBundle | None,
+        on_event: Notify,
+    ):
+        self._run_dir, self._config, self._transport, self._name = run_dir, config, transport, name
+        self._on_event = on_event
+        self._spec: PolicySpec = bundles.policy_spec(config.task, config.network)
+        self._checkpoints = Checkpoints(run_dir / "checkpoints")
+        self._state = updates.init_state(
+            config.seed, self._spec.layout, self._spec.action_size, config.network, config.ppo
+        )
+        self._epoch, self._skipped, hub_state = secrets.token_hex(8), 0, None
+        if resume:
+            self._state, meta = self._checkpoints.load(self._state)
+            self._epoch, self._skipped, hub_state = meta["epoch"], meta["skipped"], meta["hub"]
+            self._skip_lost_versions()
+            write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
+        elif initial is not None:
+            self._spec.require(initial.spec, f"to begin with (version {initial.version})")
+            params = jax.tree.map(jnp.asarray, initial.params)
+            self._state = self._state._replace(params=params, observation=initial.observation, value=initial.value)
+        self._hub = LearnerHub(
+            transport,
+            run=config.name,
+            config_json=to_json(config),
+            epoch=self._epoch,
+            sizes=RolloutSizes(sum(size for _, size in self._spec.layout), self._spec.action_size, self._spec.schema),
+            staleness=StalenessManager(max_staleness=config.ppo.max_staleness, batch=config.ppo.rollouts_per_update),
+            on_event=self._event,
+        )
+        if hub_state is not None:
+            self._hub.restore(hub_state)
+        transport.declare_alive(keys.alive_key(config.name, "learner", name, secrets.token_hex(8)))
+
+    @property
+    def version(self) -> int:
+        """Of the newest policy."""
+        return self._state.version + self._skipped
+
+    def bundle(self) -> PolicyBundle:
+        """The newest policy."""
+        state = self._state
+        return PolicyBundle(
+            self._spec,
+            self._config.task,
+            state.params,
+            state.observation,
+            state.value,
+            self.version,
+            self._epoch,
+            state.transitions,
+        )
+
+    def train(self, stop: threading.Event, deaths: list[str], on_update: Callable[[dict[str, float]], None]) -> None:
+        """Updates until the end, a stop, or a thread's death; leaves a checkpoint behind in each case."""
+        self._publish()
+        self._warm_up()
+        pace = Pace()
+        saved = -1
+        while self._state.version < self._config.updates and not stop.is_set() and not deaths:
+            began = time.monotonic()
+            messages = self._next_batch(stop, deaths)
+            if messages is None:
+                break
+            arrived = time.monotonic()
+            values = self._update(messages)
+            values["wait_seconds"], values["update_seconds"] = arrived - began, time.monotonic() - arrived
+            values["steps_per_second"] = pace.steps_per_second(sum(message.meta["steps"] for message in messages))
+            values["transitions"] = float(self._state.transitions)
+            self._log("metrics", {"update": self._state.version, "version": self.version, "values": values})
+            self._hub.set_progress({"updates": float(self._config.updates), **values})
+            on_update({"update": float(self._state.version), "version": float(self.version), **values})
+            if self._state.version % self._config.checkpoint_every == 0:
+                saved = self._save()
+        if saved != self._state.version:
+            self._save()
+        if deaths:
+            raise CongraspError(f"The learner stopped: {deaths[0]}.", "A checkpoint was written; use --resume.")
+        if not stop.is_set():
+            self._event("info", f"The run is complete after {self._state.version} updates.")
+            self._say_goodbye()
+
+    def _next_batch(self, stop: threading.Event, deaths: list[str]) -> list[Message] | None:
+        """The next batch; None when training is to end. A long silence is an event, not an end: actors may return."""
+        silent_since = time.monotonic()
+        while not stop.is_set() and not deaths:
+            messages = self._hub.next_batch(self._config.ppo.rollouts_per_update, _POLL_SECONDS)
+            if messages is not None:
+                return messages
+            if time.monotonic() - silent_since > _STALL_SECONDS:
+                self._event("warning", f"No batch of rollouts for {_STALL_SECONDS:.0f} s.")
+                silent_since = time.monotonic()
+        return None
+
+    def _update(self, messages: list[Message]) -> dict[str, float]:
+        figures = {**staleness(messages, self.version), **episode_means(messages)}
+        batch = updates.collate([message.arrays for message in messages])
+        try:
+            self._state, metrics = updates.update(self._state, batch, self._spec.layout, self._config.ppo)
+        except NonFiniteUpdate as error:
+            folder = self._run_dir / "failure"
+            with contextlib.suppress(CongraspError):
+                write_atomically(folder / "state.safetensors", encode(Message(flatten(error.state), {})))
+                write_atomically(folder / "batch.safetensors", encode(Message(batch, {})))
+            self._event("fatal", str(error))
+            raise PhysicsError(str(error), f"State and batch are in {folder}.") from None
+        self._publish()
+        return {**metrics, **figures}
+
+    def _publish(self) -> None:
+        # Renamed without flushing: this must survive the process, and a power cut costs no more than a version.
+        temporary = self._run_dir / f".{_VERSION_FILE}.tmp"
+        temporary.write_text(str(self.version))
+        temporary.replace(self._run_dir / _VERSION_FILE)
+        self._hub.publish_weights(self.bundle().to_message(), self.version)
+        meta = {"version": self.version, "epoch": self._epoch, "schema": self._spec.schema}
+        self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
+
+    def _skip_lost_versions(self) -> None:
+        """Versions that were published after the checkpoint and died with the process are not given out again."""
+        try:
+            published = int((self._run_dir / _VERSION_FILE).read_text())
+        except (OSError, ValueError):
+            return
+        if published > self.version:
+            self._event("warning", f"{published - self.version} update(s) after the checkpoint were lost.")
+            self._skipped += published + 1 - self.version
+
+    def _warm_up(self) -> None:
+        """Compiles the update while the actors make the first rollouts."""
+        config, spec = self._config, self._spec
+        steps, worlds = config.rollout_steps, config.environments * config.ppo.rollouts_per_update
+        size = sum(width for _, width in spec.layout)
+        dtype = np.float16 if config.half_observations else np.float32
+        batch = {
+            "observation": np.zeros((steps, worlds, size), dtype),
+            "last_observation": np.zeros((worlds, size), dtype),
+            "action": np.zeros((steps, worlds, spec.action_size), np.float32),
+            "log_probability": np.zeros((steps, worlds), np.float32),
+            "reward": np.zeros((steps, worlds), np.float32),
+            "terminal": np.zeros((steps, worlds), bool),
+        }
+        copy = self._state._replace(optimizer=jax.tree.map(jnp.copy, self._state.optimizer))
+        updates.update(copy, batch, spec.layout, config.ppo)
+
+    def _save(self) -> int:
+        meta = {"epoch": self._epoch, "skipped": self._skipped, "hub": self._hub.state()}
+        self._checkpoints.save(self._state, meta, self._state.version)
+        bundles.save(self.bundle(), self._run_dir / POLICY_FILE)
+        return self._state.version
+
+    def _say_goodbye(self) -> None:
+        """Sends the actors home, and gives them a moment to hear it."""
+        self._hub.finish()
+        deadline = time.monotonic() + _FAREWELL_SECONDS
+        while time.monotonic() < deadline and any(who.startswith("actor/") for who in self._hub.status()["alive"]):
+            time.sleep(_POLL_SECONDS / 4)
+
+    def _event(self, level: str, text: str) -> None:
+        self._on_event(level, text)
+        self._log("event", {"level": level, "text": text})
+
+    def _log(self, kind: str, meta: dict[str, object]) -> None:
+        key = keys.log_key(self._config.name, kind, "learner", self._name)
+        self._transport.publish(key, Message({}, {"time": time.time(), **meta}))
+
+
+__all__ = ["CONFIG_FILE", "LOGS", "POLICY_FILE", "TrainState", "create_run", "open_run", "run_learner"]

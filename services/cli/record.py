@@ -1,0 +1,30 @@
+"""`congrasp record`."""
+
+import pathlib
+
+
+def record(
+    connect: str = "tcp/127.0.0.1:7447",
+    run: str = "run",
+    out: pathlib.Path = pathlib.Path("recordings"),
+    live: int | None = None,
+    duration: float | None = None,
+) -> int:
+    """Record a run to MCAP, from this machine or another: metrics, events, versions, rollouts and episodes.
+
+    Ctrl-C ends it and finishes the file. A recorder that is slow or dies never holds the run up, and its file reads up
+    to the last half second.
+
+    Args:
+      connect: The learner's endpoint, such as tcp/10.0.0.5:7447.
+      run: Name of the run.
+      out: Folder for the MCAP files.
+      live: Also offer everything to the Foxglove app on this port of the loopback interface: ws://127.0.0.1:PORT.
+      duration: Seconds after which to stop; without it until Ctrl-C.
+    """
+    from services.record import record_run
+
+    return record_run(connect, run, out, live=live, duration=duration)
+
+
+COMMAND = record

@@ -1,0 +1,175 @@
+"""Figures of a run from its recordings: learning curves, reward terms, episodes and every other number."""
+
+import dataclasses
+import io
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.logs.reader import read_metrics
+
+Series = Mapping[str, tuple[np.ndarray, np.ndarray]]
+_COLUMNS = 4
+_INK, _QUIET, _GRID = "#262b35", "#6b7280", "#e3e6ea"
+_COLOURS = ("#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a", "#c2478f", "#6b7280")
+_LEGEND = 8
+"""Lines of one panel that a legend still names."""
+_UNITS = {
+    "_per_second": "1/s",
+    "_seconds": "s",
+    "_rad": "rad",
+    "_m": "m",
+    "_bytes": "bytes",
+    "_ratio": "share",
+    "kl": "nats",
+    "entropy": "nats",
+    "fraction": "share",
+    "length": "control steps",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """One plot: its title, the unit of its vertical axis, and the metrics (after the process's name) it shows."""
+
+    title: str
+    unit: str
+    metrics: tuple[str, ...]
+
+
+LEARNING = (
+    Panel("Return of an episode", "reward", ("episode/return",)),
+    Panel("Success", "share of episodes", ("episode/success",)),
+    Panel("Links in contact at the table's removal", "links", ("episode/links_at_removal",)),
+    Panel("Throughput", "control steps/s", ("steps_per_second",)),
+    Panel("Policy lag", "versions", ("staleness_mean", "staleness_max")),
+    Panel("KL of an update", "nats", ("kl",)),
+    Panel("Policy loss", "", ("policy_loss",)),
+    Panel("Value loss", "", ("value_loss",)),
+    Panel("Explained variance of the critic", "share", ("explained_variance",)),
+    Panel("Standard deviation of actions", "action units", ("action_std",)),
+    Panel("Learning rate", "", ("learning_rate",)),
+    Panel("Clipped samples", "share", ("clip_fraction",)),
+)
+"""Panels of the first figure; those without data are left out."""
+
+
+def plot_run(path: pathlib.Path, out: pathlib.Path) -> list[pathlib.Path]:
+    """Draws a run.
+
+    Args:
+      path: a run's folder, or one MCAP file.
+      out: folder for the figures.
+
+    Returns:
+      The PNG files written.
+
+    Raises:
+      CongraspError: there are no metrics, matplotlib is absent, or a file cannot be written.
+    """
+    series = read_metrics(path)
+    if not series:
+        raise CongraspError(f"The recordings in {path} hold no metrics.", "Was the learner recorded?")
+    written = []
+    for name, (title, panels) in figures(series).items():
+        file = out / f"{name}.png"
+        write_atomically(file, draw(title, panels, series))
+        written.append(file)
+    return written
+
+
+def figures(series: Series) -> dict[str, tuple[str, list[Panel]]]:
+    """Title and panels of each figure by file name; every metric of `series` is in exactly one of them."""
+    present = {_metric(name) for name in series}
+    learning = [
+        dataclasses.replace(panel, metrics=shown)
+        for panel in LEARNING
+        if (shown := tuple(metric for metric in panel.metrics if metric in present))
+    ]
+    rest = sorted(present - {metric for panel in learning for metric in panel.metrics})
+    groups = {
+        "learning": ("Learning", learning),
+        "reward_terms": ("Reward terms, sum over an episode", _panels(rest, "term/", "reward")),
+        "episodes": ("Episodes", _panels(rest, "episode/", "")),
+        "details": ("Details", [_panel(m) for m in rest if not m.startswith(("term/", "episode/"))]),
+    }
+    return {name: group for name, group in groups.items() if group[1]}
+
+
+def draw(title: str, panels: Sequence[Panel], series: Series) -> bytes:
+    """One figure of small multiples as PNG; a line is named after its process, and its metric where there are two."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise CongraspError("Figures need the package 'matplotlib'.", "Run: pip install 'congrasp[viz]'") from None
+    columns = min(_COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(3.6 * columns, 0.6 + 2.5 * rows), layout="constrained", facecolor="white")
+    figure.suptitle(title, x=0.01, ha="left", color=_INK, fontsize=15, fontweight="bold")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_axis_off()
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        lines = [name for name in series if _metric(name) in panel.metrics]
+        for i, name in enumerate(lines):
+            _curve(axes, *series[name], _COLOURS[i % len(_COLOURS)], _label(name, panel))
+        axes.set_title(panel.title, loc="left", color=_INK, fontsize=10)
+        axes.set_ylabel(panel.unit, color=_QUIET, fontsize=8)
+        axes.set_xlabel("update", color=_QUIET, fontsize=8)
+        axes.tick_params(colors=_QUIET, labelsize=8, length=0)
+        axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4), useOffset=False)
+        axes.yaxis.get_offset_text().set(fontsize=7, color=_QUIET)
+        axes.grid(color=_GRID, linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.margins(x=0.02)
+        for side in axes.spines.values():
+            side.set_visible(False)
+        if 1 < len(lines) <= _LEGEND:
+            axes.legend(fontsize=7, frameon=False, labelcolor=_QUIET)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130)
+    return buffer.getvalue()
+
+
+def smooth(values: np.ndarray, window: int) -> np.ndarray:
+    """Mean of the last `window` values (n,), of fewer at the beginning; NaN does not count."""
+    finite = np.isfinite(values)
+    total = np.cumsum(np.where(finite, values, 0.0))
+    count = np.cumsum(finite)
+    total[window:] = total[window:] - total[:-window]
+    count[window:] = count[window:] - count[:-window]
+    return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
+
+
+def _curve(axes: Any, steps: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
+    window = len(values) // 40
+    if window < 3:
+        marker = "o" if len(values) < 20 else ""
+        axes.plot(steps, values, color=colour, linewidth=1.5, label=label, marker=marker, markersize=3)
+    else:
+        axes.plot(steps, values, color=colour, linewidth=0.6, alpha=0.3)
+        axes.plot(steps, smooth(values, window), color=colour, linewidth=1.6, label=label)
+
+
+def _metric(name: str) -> str:
+    """`learner/0/term/contact` is the metric `term/contact` of the process `learner/0`."""
+    return name.split("/", 2)[2]
+
+
+def _label(name: str, panel: Panel) -> str:
+    role, process, metric = name.split("/", 2)
+    return f"{role} {process}" if len(panel.metrics) == 1 else metric.replace("_", " ")
+
+
+def _panels(metrics: Sequence[str], prefix: str, unit: str) -> list[Panel]:
+    return [_panel(metric, prefix, unit) for metric in metrics if metric.startswith(prefix)]
+
+
+def _panel(metric: str, prefix: str = "", unit: str = "") -> Panel:
+    words = metric.removeprefix(prefix)
+    found = next((unit for end, unit in _UNITS.items() if words.endswith(end)), unit)
+    return Panel(words.replace("/", ": ").replace("_", " ").capitalize(), found, (metric,))
