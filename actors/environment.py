@@ -182,7 +182,7 @@ def sample_episodes(
     uniform = lambda: jax.random.uniform(next(keys), (batch,))  # noqa: E731
     objects = jax.random.randint(next(keys), (batch,), 0, taskset.points.shape[0])
     rests = jax.random.randint(next(keys), (batch,), 0, taskset.rest.shape[1])
-    affordance = (uniform() < task.p_affordance) & taskset.has_minus[objects]
+    affordance = (uniform() < task.p_affordance) & taskset.has_affordance[objects, rests]
     variant = affordance.astype(jnp.int32)
     available = taskset.has_pose[objects, variant, rests]
     pose = (uniform() < task.p_pose) & available

@@ -22,6 +22,8 @@ from common.task.types import Array
 HEADINGS = 256
 POSES = 20
 _WAYPOINT_CLEARANCE = 0.02
+_HEADING_CLEARANCE = -0.012
+"""Heading positions may lie this far under the table's top: 2 cm inside a thin object that lies flat."""
 
 
 class TaskSet(NamedTuple):
@@ -55,8 +57,8 @@ class TaskSet(NamedTuple):
     """(N, V, R, M) poses whose trajectory stays above the table in each resting pose, repeated to fill the row."""
     has_pose: Array
     """(N, V, R) bool: the row of `pose_index` is not empty."""
-    has_minus: Array
-    """(N,) bool: the object has an O-."""
+    has_affordance: Array
+    """(N, R) bool: the object has an O-, and its O+ can be approached in the resting pose."""
 
 
 def _repeat(indices: np.ndarray, length: int) -> np.ndarray:
@@ -85,6 +87,7 @@ def build_taskset(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], 
         row["rest"] = row["rest"][fill]
         for name in ("heading_index", "pose_index", "has_pose"):
             row[name] = row[name][:, fill]
+        row["has_affordance"] = row["has_affordance"][fill]
     stacked = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     return TaskSet(**{name: jnp.asarray(_compact(value)) for name, value in stacked.items()})
 
@@ -98,7 +101,7 @@ def _compact(value: np.ndarray) -> np.ndarray:
 def _object_row(hand: Hand, task: TaskConfig, obj: GraspObject, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Everything of one object; resting poses without a reachable heading are left out."""
     variants = [_variant(hand, task, obj, use_affordance, rng) for use_affordance in (False, True)]
-    usable = [r for r in range(len(obj.rest_poses)) if all(v["feasible"][r].any() for v in variants)]
+    usable = [r for r in range(len(obj.rest_poses)) if variants[0]["feasible"][r].any()]
     if not usable:
         raise CongraspError(
             f"The object '{obj.name}' cannot be approached in any of its resting poses.",
@@ -110,7 +113,7 @@ def _object_row(hand: Hand, task: TaskConfig, obj: GraspObject, rng: np.random.G
         "points": obj.points[keep],
         "minus": minus[keep],
         "rest": obj.rest_poses[usable],
-        "has_minus": np.array(minus[keep].any()),
+        "has_affordance": np.array([minus[keep].any() and variants[1]["feasible"][r].any() for r in usable]),
         "heading_index": np.array(
             [[_repeat(np.flatnonzero(v["feasible"][r]), HEADINGS) for r in usable] for v in variants]
         ),
@@ -158,5 +161,5 @@ def _variant(
 
 
 def _reachable(task: TaskConfig, headings: Headings, rest: np.ndarray) -> np.ndarray:
-    mask = feasible(headings, rest, back_off=task.back_off)
+    mask = feasible(headings, rest, clearance=_HEADING_CLEARANCE, back_off=task.back_off)
     return mask & above(headings, rest) if task.headings == "above" else mask

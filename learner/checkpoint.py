@@ -11,6 +11,7 @@ import pathlib
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from common.errors import CongraspError
@@ -90,7 +91,7 @@ def flatten(tree: Any) -> dict[str, np.ndarray]:
 def restore(arrays: dict[str, Any], template: Any, source: str) -> Any:
     """The inverse of `flatten`: a tree like `template`, whose leaves say what becomes of each array.
 
-    A JAX array goes to the template's device, a NumPy array stays on the host, an integer becomes one.
+    A JAX array goes to the default device, a NumPy array stays on the host, an integer becomes one.
 
     Raises:
       CongraspError: naming `source` and the first leaf that is missing or has another shape or type.
@@ -106,7 +107,7 @@ def restore(arrays: dict[str, Any], template: Any, source: str) -> Any:
                 "Resume with the configuration that the run was started with.",
             )
         if isinstance(leaf, jax.Array):
-            restored.append(jax.device_put(array, leaf.sharding))
+            restored.append(jnp.array(array))  # not bound to a device, as after `init`: nothing compiles again
         else:
             restored.append(int(array) if isinstance(leaf, int) else np.array(array))
     return jax.tree_util.tree_unflatten(structure, restored)

@@ -1,7 +1,8 @@
 """The learner process: rollouts in, policy bundles out, and a run directory from which it can be resumed.
 
-A run directory holds `config.json`, `checkpoints/`, `policy.safetensors` (the policy of the newest checkpoint), `logs/`
-and `version` (the newest version that was ever published, so that versions rise over a crash, too).
+A run directory holds `config.json`, `checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`,
+`version` (the newest version that was ever published, so that versions rise over a crash, too) and, after an update
+that was not finite, `failure/`.
 """
 
 import contextlib
@@ -28,7 +29,7 @@ from learner.checkpoint import Checkpoints, flatten
 from learner.hub import LearnerHub, RolloutSizes
 from learner.staleness import StalenessManager
 from learner.statistics import Pace, episode_means, staleness
-from learner.update import NonFiniteUpdate, TrainState
+from learner.update import NonFiniteUpdate
 
 POLICY_FILE = "policy.safetensors"
 CONFIG_FILE = "config.json"
@@ -296,6 +297,3 @@ class _Learner:
     def _log(self, kind: str, meta: dict[str, object]) -> None:
         key = keys.log_key(self._config.name, kind, "learner", self._name)
         self._transport.publish(key, Message({}, {"time": time.time(), **meta}))
-
-
-__all__ = ["CONFIG_FILE", "LOGS", "POLICY_FILE", "TrainState", "create_run", "open_run", "run_learner"]

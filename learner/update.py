@@ -93,11 +93,12 @@ def collate(rollouts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     """The worlds of several rollouts of equal length side by side, where the rollouts are: host or device."""
     if len(rollouts) == 1:
         return {name: rollouts[0][name] for name in FIELDS}
-    parts = {name: [rollout[name] for rollout in rollouts] for name in FIELDS}
-    return {
-        name: (jnp if isinstance(arrays[0], jax.Array) else np).concatenate(arrays, axis=name != "last_observation")
-        for name, arrays in parts.items()
-    }
+    joined = {}
+    for name in FIELDS:
+        parts = [rollout[name] for rollout in rollouts]
+        concatenate = jnp.concatenate if isinstance(parts[0], jax.Array) else np.concatenate
+        joined[name] = concatenate(parts, axis=0 if name == "last_observation" else 1)
+    return joined
 
 
 def update(

@@ -138,11 +138,12 @@ def draw(title: str, panels: Sequence[Panel], series: Series) -> bytes:
 def smooth(values: np.ndarray, window: int) -> np.ndarray:
     """Mean of the last `window` values (n,), of fewer at the beginning; NaN does not count."""
     finite = np.isfinite(values)
-    total = np.cumsum(np.where(finite, values, 0.0))
+    base = values[finite][0] if finite.any() else 0.0  # sums of differences stay exact where nothing changes
+    total = np.cumsum(np.where(finite, values - base, 0.0))
     count = np.cumsum(finite)
     total[window:] = total[window:] - total[:-window]
     count[window:] = count[window:] - count[:-window]
-    return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
+    return base + np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
 
 
 def _curve(axes: Any, steps: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:

@@ -1,7 +1,7 @@
 """Pictures of capsules, boxes and meshes by casting rays with MuJoCo: no OpenGL, EGL or display is needed.
 
-Every pixel takes `SAMPLES` x `SAMPLES` rays to find what it shows, but is shaded once unless it holds an edge. Light
-comes from one soft key light and a dome; shadows are found by casting rays from each lamp to the shaded points.
+Every pixel takes one ray, and `SAMPLES` x `SAMPLES` where it lies on an edge. Light comes from one soft key light and
+a dome; shadows are found by casting rays from each lamp to the shaded points.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from services.smooth import SmoothNormals
 Kind = Literal["box", "sphere", "capsule", "cylinder", "ellipsoid", "mesh"]
 
 SAMPLES = 2
-"""Rays along each side of a pixel."""
+"""Rays along each side of a pixel that lies on an edge."""
 _TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -78,13 +78,12 @@ class Camera:
         right = right / np.linalg.norm(right)
         return np.stack([right, np.cross(right, forward), forward])
 
-    def rays(self, width: int, height: int) -> np.ndarray:
-        """(height, width, 3) unit directions through the centres of the pixels."""
+    def rays(self, x: np.ndarray, y: np.ndarray, width: int, height: int) -> np.ndarray:
+        """(n, 3) unit directions through places (n,) of a picture, in pixels from its upper left corner."""
         tangent = np.tan(np.radians(self.field_of_view) / 2)
-        x = (2 * (np.arange(width) + 0.5) / width - 1) * tangent * width / height
-        y = (1 - 2 * (np.arange(height) + 0.5) / height) * tangent
         right, up, forward = self.axes()
-        rays = forward + x[None, :, None] * right + y[:, None, None] * up
+        across = ((2 * x - width) / height * tangent)[:, None] * right
+        rays = forward + across + ((1 - 2 * y / height) * tangent)[:, None] * up
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
@@ -119,8 +118,7 @@ def render_scene(shapes: list[Shape], camera: Camera, size: tuple[int, int] = (6
 
 def visible(shapes: list[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:
     """(height, width) index of the solid shape that each pixel shows, -1 for the background; quick, without shading."""
-    rays = camera.rays(*size)
-    return _Scene(shapes).cast(camera.position, rays, _SOLID)[0]
+    return _Scene(shapes).cast(camera.position, _grid(camera, *size), _SOLID)[0].reshape(size[::-1])
 
 
 class _Scene:
@@ -179,51 +177,59 @@ class _Scene:
 
     def render(self, camera: Camera, width: int, height: int) -> np.ndarray:
         """(height, width, 3) uint8."""
-        rays = camera.rays(SAMPLES * width, SAMPLES * height)
-        rays = rays.reshape(height, SAMPLES, width, SAMPLES, 3).swapaxes(1, 2).reshape(-1, SAMPLES**2, 3)
-        index, distance, normal = self.cast(camera.position, rays, _SOLID)
-        image = self._layer(camera, rays, index, distance, normal, _background(rays[:, :1]), width)
-        if any(shape.alpha < 1 for shape in self.shapes):
-            glass, nearer, normal = self.cast(camera.position, rays, _GLASS)
-            hidden = (index >= 0) & (distance < nearer)
-            image = self._layer(camera, rays, np.where(hidden, -1, glass), nearer, normal, image[:, None], width)
+        pixel = np.arange(width * height)
+        row, column = np.divmod(pixel, width)
+        image, seen, normal = self._see(camera, _grid(camera, width, height), column % 2 + 2 * (row % 2), width)
+        edge = np.flatnonzero(_edges(seen.reshape(height, width), normal.reshape(height, width, 3)))
+        step = (np.arange(SAMPLES) + 0.5) / SAMPLES
+        x = np.add.outer(column[edge], np.tile(step, SAMPLES)).ravel()
+        y = np.add.outer(row[edge], np.repeat(step, SAMPLES)).ravel()
+        fine, _, _ = self._see(camera, camera.rays(x, y, width, height), np.arange(len(x)) % 4, None)
+        image[edge] = fine.reshape(len(edge), SAMPLES**2, 3).mean(1)
         return (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8).reshape(height, width, 3)
 
-    def _layer(
-        self,
-        camera: Camera,
-        rays: np.ndarray,
-        index: np.ndarray,
-        distance: np.ndarray,
-        normal: np.ndarray,
-        below: np.ndarray,
-        width: int,
-    ) -> np.ndarray:
-        """(pixels, 3) sRGB of what rays (pixels, samples, 3) hit, over the picture `below` (pixels, 1, 3)."""
-        pixels, samples = index.shape
-        # A pixel is shaded once where its samples agree, and for every sample where it holds an edge.
-        flat = (index == index[:, :1]).all(1) & ((normal * normal[:, :1]).sum(-1) > 0.9).all(1)
-        shaded = (index >= 0) & (~flat[:, None] | (np.arange(samples) == 0))
-        pixel, sample = np.nonzero(shaded)
-        point = camera.position + distance[shaded][:, None] * rays[shaded]
-        lit = self._shade(camera, index[shaded], point, normal[shaded], rays[shaded], pixel, sample, (pixels, width))
-        colour = np.repeat(below, samples, 1)
-        alpha = np.array([shape.alpha for shape in self.shapes])[index[shaded]][:, None]
-        colour[shaded] = alpha * lit + (1 - alpha) * colour[shaded]
-        return np.where(flat[:, None], colour[:, 0], colour.mean(1))
+    def _see(
+        self, camera: Camera, rays: np.ndarray, lamp_set: np.ndarray, width: int | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What rays (n, 3) show.
+
+        Args:
+          camera: where they begin.
+          rays: unit directions.
+          lamp_set: (n,) which of the four sets of lamps lights each point.
+          width: pixels in a row where the rays are those of a whole picture, whose light is then smoothed.
+
+        Returns:
+          Colours (n, 3) sRGB, numbers (n,) that differ where other shapes are seen, and normals (n, 3).
+        """
+        index, distance, normal = self.cast(camera.position, rays, _SOLID)
+        colour = _background(rays)
+        seen = index >= 0
+        colour[seen] = self._shade(camera, index, distance, normal, rays, lamp_set, seen, width)
+        if all(shape.alpha >= 1 for shape in self.shapes):
+            return colour, index, normal
+        glass, nearer, glass_normal = self.cast(camera.position, rays, _GLASS)
+        seen = (glass >= 0) & ((index < 0) | (nearer < distance))
+        alpha = np.array([shape.alpha for shape in self.shapes])[glass[seen]][:, None]
+        lit = self._shade(camera, glass, nearer, glass_normal, rays, lamp_set, seen, width)
+        colour[seen] = alpha * lit + (1 - alpha) * colour[seen]
+        return colour, (len(self.shapes) + 1) * index + np.where(seen, glass, -1), normal
 
     def _shade(
         self,
         camera: Camera,
         index: np.ndarray,
-        point: np.ndarray,
+        distance: np.ndarray,
         normal: np.ndarray,
         ray: np.ndarray,
-        pixel: np.ndarray,
-        sample: np.ndarray,
-        grid: tuple[int, int],
+        lamp_set: np.ndarray,
+        seen: np.ndarray,
+        width: int | None,
     ) -> np.ndarray:
-        """(n, 3) sRGB of points (n, 3) with flat normals (n, 3), seen along unit rays (n, 3) by a pixel's sample."""
+        """sRGB of the points that rays `seen` (n,) hit, as many as there are; other arguments as in `_see`."""
+        pixel, pixels = np.flatnonzero(seen), len(seen)
+        index, distance, normal, ray, lamp_set = (a[seen] for a in (index, distance, normal, ray, lamp_set))
+        point = camera.position + distance[:, None] * ray
         albedo = np.array([shape.colour for shape in self.shapes], float)[index]
         shine = np.array([shape.shine for shape in self.shapes])[index]
         bent = normal.copy()
@@ -241,18 +247,17 @@ class _Scene:
         right = camera.axes()[0]
         key = _KEY @ np.stack([right, np.cross([0.0, 0.0, 1.0], right), [0.0, 0.0, 1.0]])
         key = key / np.linalg.norm(key)
-        lamp_set = ((pixel % grid[1]) % 2 + 2 * ((pixel // grid[1]) % 2) + sample) % 4
-        seen, sky = self._light(point + 2 * _SKIN * normal, bent, key, lamp_set)
-        place = np.where(sample == 0, pixel, -1)
-        softened = np.stack([seen, sky], -1)
-        for _ in range(2):
-            softened = _blur(softened, index, normal, place, grid)
-        seen, sky = softened.T
+        light = np.stack(self._light(point + 2 * _SKIN * normal, bent, key, lamp_set), -1)
+        if width is not None:
+            for _ in range(2):
+                light = _blur(light, index, normal, pixel, (pixels, width))
+        seen_key, sky = light.T
         half = key - ray
         half = half / np.linalg.norm(half, axis=1, keepdims=True)
-        gloss = shine * seen * np.clip((bent * half).sum(1), 0, None) ** 60
-        light = _KEY_STRENGTH * seen * np.clip(bent @ key, 0, None) + _DOME_STRENGTH * sky + _BOUNCE * (1 - bent[:, 2])
-        return np.clip(albedo**2.2 * light[:, None] + 0.35 * gloss[:, None], 0, 1) ** (1 / 2.2)
+        gloss = shine * seen_key * np.clip((bent * half).sum(1), 0, None) ** 60
+        total = _KEY_STRENGTH * seen_key * np.clip(bent @ key, 0, None)
+        total += _DOME_STRENGTH * sky + _BOUNCE * (1 - bent[:, 2])
+        return np.clip(albedo**2.2 * total[:, None] + 0.35 * gloss[:, None], 0, 1) ** (1 / 2.2)
 
     def _light(
         self, start: np.ndarray, normal: np.ndarray, key: np.ndarray, lamp_set: np.ndarray
@@ -295,29 +300,43 @@ def _painted(tree: cKDTree, colours: np.ndarray, point: np.ndarray) -> np.ndarra
     return (weight[..., None] * colours[near]).sum(1) / weight.sum(1, keepdims=True)
 
 
+def _grid(camera: Camera, width: int, height: int) -> np.ndarray:
+    """(height * width, 3) rays through the centres of a picture's pixels, row by row."""
+    y, x = np.indices((height, width)).reshape(2, -1) + 0.5
+    return camera.rays(x, y, width, height)
+
+
+def _edges(seen: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """(height, width) whether a pixel and one of its eight neighbours show other shapes or sides of a shape."""
+    edge = np.zeros(seen.shape, bool)
+    for axis in (0, 1):
+        here, there = (slice(None),) * axis + (slice(1, None),), (slice(None),) * axis + (slice(None, -1),)
+        differ = (seen[here] != seen[there]) | ((normal[here] * normal[there]).sum(-1) < 0.9) & (seen[here] >= 0)
+        edge[here] |= differ
+        edge[there] |= differ
+    return edge
+
+
 def _blur(
     value: np.ndarray, index: np.ndarray, normal: np.ndarray, pixel: np.ndarray, grid: tuple[int, int]
 ) -> np.ndarray:
     """Averages value (n, c) over the 3 x 3 pixels around, among points of one shape that face the same way.
 
-    The binomial filter weighs the four interleaved lamp sets equally. Points with a negative `pixel` stay as they are.
+    The binomial filter weighs the four interleaved lamp sets equally. `grid` is the number of pixels and a row's width.
     """
     pixels, width = grid
     place = np.full(pixels, -1)
-    mine = np.flatnonzero(pixel >= 0)
-    place[pixel[mine]] = mine
+    place[pixel] = np.arange(len(pixel))
     place = np.pad(place.reshape(-1, width), 1, constant_values=-1)
-    row, column = pixel[mine] // width + 1, pixel[mine] % width + 1
-    total, weights = np.zeros((len(mine), value.shape[1])), np.zeros(len(mine))
+    row, column = np.divmod(pixel, width)
+    total, weights = np.zeros(value.shape), np.zeros(len(value))
     for y, x in np.ndindex(3, 3):
-        other = place[row + y - 1, column + x - 1]
-        alike = (other >= 0) & (index[other] == index[mine]) & ((normal[other] * normal[mine]).sum(-1) > 0.8)
+        other = place[row + y, column + x]
+        alike = (other >= 0) & (index[other] == index) & ((normal[other] * normal).sum(-1) > 0.8)
         weight = alike * float((2 - abs(y - 1)) * (2 - abs(x - 1)))
         total += weight[:, None] * value[other]
         weights += weight
-    result = value.copy()
-    result[mine] = total / weights[:, None]
-    return result
+    return total / weights[:, None]
 
 
 def _disc(direction: np.ndarray, count: int, radius: float) -> np.ndarray:

@@ -4,8 +4,10 @@ import collections
 import itertools
 import pathlib
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
@@ -74,6 +76,15 @@ def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: tuple[float
     return [between(start, neck, radius, colour), cone]
 
 
+def beads(points: np.ndarray, radius: float, colour: tuple[float, float, float]) -> Shape:
+    """Balls at points (N, 3) on a string, as one mesh: every further shape would slow down all rays."""
+    balls = [trimesh.creation.icosphere(1, radius).apply_translation(point) for point in points]
+    pairs = [pair for pair in itertools.pairwise(points) if np.linalg.norm(np.subtract(*pair)) > 1e-6]
+    string = [trimesh.creation.cylinder(0.4 * radius, segment=pair, sections=8) for pair in pairs]
+    mesh: Any = trimesh.util.concatenate([*balls, *string])
+    return Shape("mesh", (0, 0, 0), colour, vertices=mesh.vertices, faces=mesh.faces)
+
+
 def episode_shapes(episode: Message, step: int) -> list[Shape]:
     """Hand, object, table and active constraints of one control step of an episode."""
     arrays = episode.arrays
@@ -124,8 +135,7 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
     shapes = arrow(tip - 0.08 * direction, tip, 0.0028, APPROACH)
     if mask["trajectory"]:
         points = turn.apply(arrays["goal/trajectory_position"]) + origin
-        shapes += [Shape("sphere", (0.0035, 0, 0), WAYPOINT, point) for point in points]
-        shapes += [between(a, b, 0.0013, WAYPOINT) for a, b in itertools.pairwise(points)]
+        shapes.append(beads(points, 0.0035, WAYPOINT))
     if mask["pose_finger"]:
         wrist = turn * Rotation.from_quat(arrays["goal/pose_quaternion"], scalar_first=True)
         position, quaternion = link_poses(hand, arrays["goal/pose_q"])

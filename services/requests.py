@@ -141,7 +141,9 @@ class Layout:
             if "quaternion" in name or name == "heading_direction":
                 norm = np.linalg.norm(value, axis=-1, keepdims=True)
                 if np.abs(norm - 1).max() > _UNIT_TOLERANCE:
-                    raise CongraspError(f"The field '{name}' has length {norm.flat[np.abs(norm - 1).argmax()]:.3f}, not 1.")
+                    raise CongraspError(
+                        f"The field '{name}' has length {norm.flat[np.abs(norm - 1).argmax()]:.3f}, not 1."
+                    )
                 value /= norm
         for name in ("pose_quaternion", "trajectory_quaternion"):
             if name not in goal:

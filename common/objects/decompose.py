@@ -17,7 +17,7 @@ import numpy as np
 from common.objects.shapes import hull_of
 from common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES
 
-_CONVEX = 0.97  # share of its hull that a mesh fills to count as convex
+_CONVEX = 0.95  # share of its hull that a mesh fills to count as convex
 _FALLBACK_LIMIT = 30.0  # s
 _ROOT = pathlib.Path(__file__).resolve().parents[2]
 
@@ -53,7 +53,7 @@ def decompose(
     hull = hull_of(vertices)
     if fill is not None and fill > _CONVEX * hull.volume:
         return Decomposition([hull.points[hull.vertices]], "convex", [])
-    notes = []
+    notes: list[str] = []
     for method, limit in (("coacd", time_limit), ("vhacd", _FALLBACK_LIMIT)):
         pieces, failure = _in_child(method, vertices, faces, max_pieces, limit)
         if pieces:
@@ -64,7 +64,7 @@ def decompose(
 
 
 def merge(pieces: list[np.ndarray], max_pieces: int) -> list[np.ndarray]:
-    """Joins convex pieces (V, 3) until at most `max_pieces` are left, each time the two whose hull adds least volume."""
+    """Joins convex pieces (V, 3) until `max_pieces` are left, each time the two whose hull adds least volume."""
     parts = dict(enumerate(pieces))
     volumes = {i: hull_of(part).volume for i, part in parts.items()}
     joint: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
@@ -145,7 +145,7 @@ def _in_child(
             last = child.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {child.returncode}"]
             return [], f"failed ({last[0]})"
         with np.load(result) as arrays:
-            pieces = [arrays[name] for name in sorted(arrays, key=int)]
+            pieces = list(arrays.values())
     solid = [piece for piece in pieces if len(piece) >= 4 and np.linalg.matrix_rank(piece - piece[0], tol=1e-6) == 3]
     return solid, "" if solid else "found no piece"
 
@@ -170,7 +170,7 @@ def _child(method: str, mesh: str, result: str, max_pieces: str, limit: str) -> 
         import vhacdx
 
         found = vhacdx.compute_vhacd(vertices, faces.astype(np.uint32), maxConvexHulls=int(max_pieces))
-    np.savez(result, **{str(i): np.asarray(piece[0], np.float64) for i, piece in enumerate(found)})
+    np.savez(result, *(np.asarray(piece[0], np.float64) for piece in found))
 
 
 if __name__ == "__main__":

@@ -116,9 +116,9 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
     visuals = [read_mesh(file.path) for file in source.visuals] or [
         shapes.triangulate(_corners(file)) for file in source.pieces
     ]
-    factor = _unit_factor(source, trimesh.util.concatenate(visuals), options)
+    factor = _unit_factor(source, _joined(visuals), options)
     meshes = [_scaled(mesh, factor) for mesh in visuals]
-    whole = trimesh.util.concatenate(meshes)
+    whole = _joined(meshes)
     closed = all(mesh.is_volume for mesh in meshes)
     if not closed:
         notes.append("its mesh is not a closed surface: mass and inertia are those of its convex pieces")
@@ -126,19 +126,21 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
     mass, center, inertia = _weigh(whole, hulls, closed, options)
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
     whole.apply_translation(-center)
-    points, normals, face = sample_mesh(np.asarray(whole.triangles), pieces, np.random.default_rng(seed))
+    points, normals, face = sample_mesh(
+        np.asarray(whole.triangles), pieces, np.random.default_rng(seed), oriented=closed
+    )
     part_names, graspable, labels = _labels(source, meshes, factor, center, points, face)
     share = graspable[labels].mean()
     if not 0.1 <= share <= 0.9:
         notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
     if not source.parts_are_pieces:
         near = cKDTree(points)
-        votes = (labels[near.query(piece.vertices + piece.pos)[1]] for piece in pieces)
+        votes = (labels[near.query(np.asarray(piece.vertices) + piece.pos)[1]] for piece in pieces)
         pieces = tuple(
             dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
             for piece, vote in zip(pieces, votes, strict=True)
         )
-    picture = whole if len(whole.faces) <= _MAX_FACES else whole.simplify_quadric_decimation(face_count=_MAX_FACES)
+    picture = _reduced(whole)
     obj = GraspObject(
         name=source.name,
         family="imported",
@@ -157,6 +159,17 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
     return dataclasses.replace(obj, rest_poses=rest_poses(obj))
 
 
+def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
+    return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)
+
+
+def _reduced(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with at most `_MAX_FACES` faces."""
+    return mesh if len(mesh.faces) <= _MAX_FACES else mesh.simplify_quadric_decimation(face_count=_MAX_FACES)
+
+
 def _corners(file: MeshFile) -> np.ndarray:
     return np.asarray(read_mesh(file.path).vertices, np.float64)
 
@@ -169,11 +182,15 @@ def _unit_factor(source: Source, mesh: trimesh.Trimesh, options: ImportOptions) 
     size = extent * factor
     low, high = _PLAUSIBLE if options.unit == "auto" else _POSSIBLE
     if not low <= size <= high:
-        fitting = [u for u in ("mm", "cm", "in", "m") if 0.02 <= extent * METRES[u] * options.scale <= 0.4 and u != unit]
+        fitting = [
+            u for u in ("mm", "cm", "in", "m") if 0.02 <= extent * METRES[u] * options.scale <= 0.4 and u != unit
+        ]
         remedy = f"Set '--scale {_round(0.1 / (extent * METRES[unit]))}' for an object of 10 cm."
         if fitting:
             then = extent * METRES[fitting[0]] * options.scale
-            remedy = f"If they are {_UNIT_NAMES[fitting[0]]}, add '--unit {fitting[0]}' ({_length(then)}); or set --scale."
+            remedy = (
+                f"If they are {_UNIT_NAMES[fitting[0]]}, add '--unit {fitting[0]}' ({_length(then)}); or set --scale."
+            )
         raise CongraspError(
             f"{source.path} is {_length(size)} long if its numbers are {_UNIT_NAMES[unit]}: too "
             f"{'large' if size > high else 'small'} for a hand.",
@@ -215,33 +232,30 @@ def _pieces(
     notes: list[str],
 ) -> tuple[list[np.ndarray], list[int]]:
     """Vertices of at most `max_pieces` simple convex pieces, and the part of each (0 where the parts are labels)."""
+    hulls: list[np.ndarray] = []
+    owners: list[int] = []
+    missing = 0.0
     try:
         if source.pieces:
-            groups = [[_corners(file) * factor for file in source.pieces]]
+            groups, limits = [[_corners(file) * factor for file in source.pieces]], [options.max_pieces]
         else:
-            volumes = [float(mesh.convex_hull.volume) for mesh in meshes]
-            shares = [volume / sum(volumes) for volume in volumes]
-            budgets = [max(1, int(options.max_pieces * share)) for share in shares]
+            volumes = np.array([mesh.convex_hull.volume for mesh in meshes])
+            limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
             groups = []
-            for mesh, budget in zip(meshes, budgets, strict=True):
-                reduced = mesh
-                if len(mesh.faces) > _MAX_FACES:
-                    reduced = mesh.simplify_quadric_decimation(face_count=_MAX_FACES)
-                result = decompose.decompose(
-                    np.asarray(reduced.vertices),
-                    np.asarray(reduced.faces),
+            for mesh, limit in zip(meshes, limits, strict=True):
+                small = _reduced(mesh)
+                found = decompose.decompose(
+                    np.asarray(small.vertices),
+                    np.asarray(small.faces),
                     fill=float(mesh.volume) if closed else None,
                     time_limit=options.time_limit,
-                    max_pieces=budget,
+                    max_pieces=limit,
                 )
-                groups.append(result.pieces)
-                notes.extend(result.notes)
-        hulls, owners, missing = [], [], 0.0
-        limits = [options.max_pieces] if len(groups) == 1 else budgets
+                groups.append(found.pieces)
+                notes.extend(found.notes)
         for owner, (group, limit) in enumerate(zip(groups, limits, strict=True)):
-            before = sum(shapes.hull_of(piece).volume for piece in group)
             merged = decompose.merge(group, limit)
-            after = sum(shapes.hull_of(piece).volume for piece in merged)
+            before, after = (sum(shapes.hull_of(piece).volume for piece in pieces) for pieces in (group, merged))
             if after > 1.1 * before:
                 notes.append(
                     f"{len(group)} convex pieces were merged into {len(merged)}, whose volume is "

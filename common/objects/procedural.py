@@ -13,8 +13,6 @@ from common.objects.spec import GraspObject
 from common.objects.surface import halves, mass_properties, sample_union
 
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)
-EVALUATION_SEED = 1_000_000
-"""Objects of this seed and above are never trained on."""
 MASS_RANGE = (0.05, 0.5)
 """Kilograms."""
 _SIZE_RANGE = (0.03, 0.25)
@@ -31,7 +29,7 @@ def generate(seed: int, family: str | None = None) -> GraspObject:
     (overlaps count twice), scaled together where the mass had to be brought into range.
 
     Args:
-      seed: not negative; seeds from `EVALUATION_SEED` upward are kept for evaluation.
+      seed: not negative; seeds from one million upward are kept for evaluation.
       family: one of `FAMILIES`; chosen by the seed if not given.
 
     Raises:

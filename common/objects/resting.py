@@ -11,7 +11,7 @@ from common.objects.spec import GraspObject, Piece
 
 MAX_POSES = 8
 _SAME_NORMAL = np.cos(np.radians(15))  # directions nearer than this count as one
-_SAME_KIND = 5e-4  # m; poses whose heights differ by less are turns of one another (a cylinder on its side)
+_SAME_KIND = 0.03  # poses whose heights differ by less than this share are turns of one another
 _PER_KIND = 4
 _LEAST_LIKELY = 0.02
 _STILL = 1e-3  # m/s
@@ -216,7 +216,7 @@ def _choose(heights: np.ndarray, weights: np.ndarray) -> list[int]:
     """Indices of at most eight poses, likely ones, not too many of which are turns of one another."""
     chosen: list[int] = []
     for i, (height, weight) in enumerate(zip(heights, weights, strict=True)):
-        alike = sum(abs(heights[k] - height) < _SAME_KIND for k in chosen)
+        alike = sum(abs(heights[k] - height) < _SAME_KIND * height for k in chosen)
         if not chosen or (len(chosen) < MAX_POSES and alike < _PER_KIND and weight > _LEAST_LIKELY):
             chosen.append(i)
     return chosen

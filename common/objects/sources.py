@@ -91,7 +91,9 @@ def read_mesh(path: pathlib.Path) -> trimesh.Trimesh:
         with path.open("rb") as file:
             start = file.read(4)
     except OSError as error:
-        raise CongraspError(f"{path} cannot be read: {error.strerror}.", "Check the path and its permissions.") from None
+        raise CongraspError(
+            f"{path} cannot be read: {error.strerror}.", "Check the path and its permissions."
+        ) from None
     if not start:
         raise CongraspError(f"{path} is empty (0 bytes).", "Export or download it again.")
     if start == b"PK\x03\x04":
@@ -100,7 +102,7 @@ def read_mesh(path: pathlib.Path) -> trimesh.Trimesh:
     try:
         mesh = trimesh.load_scene(path, process=False).to_mesh()
     except Exception as error:  # the readers raise whatever they stumble over
-        reason = (str(error) or type(error).__name__).splitlines()[0]
+        reason = (str(error) or type(error).__name__).splitlines()[0].rstrip(" .!")
         raise CongraspError(f"{path} cannot be read as {kind}: {reason}.", "Export it again, or convert it.") from None
     if len(mesh.faces) == 0:
         points = f"only {len(mesh.vertices)} points" if len(mesh.vertices) else "nothing that can be read as a mesh"

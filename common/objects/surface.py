@@ -52,18 +52,24 @@ def sample_union(
 
 
 def sample_mesh(
-    triangles: np.ndarray, pieces: tuple[Piece, ...], rng: np.random.Generator, count: int = SURFACE_POINTS
+    triangles: np.ndarray,
+    pieces: tuple[Piece, ...],
+    rng: np.random.Generator,
+    *,
+    oriented: bool,
+    count: int = SURFACE_POINTS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points on the part of a mesh that a finger can reach.
 
     Points that lie more than a few millimetres below the surface of the collision pieces (inner walls, hollows that
-    the pieces fill) are left out, unless that would leave less than a quarter. Normals that point into the pieces
-    where the other side is free are turned, so that a mesh with flipped faces does no harm.
+    the pieces fill) are left out, unless that would leave less than a quarter.
 
     Args:
       triangles: (F, 3, 3) corners.
       pieces: collision pieces in the same frame.
       rng: draws the start of the low-discrepancy sequence.
+      oriented: whether the triangles wind outwards everywhere; if not, normals that point into the pieces where the
+        other side is free are turned.
       count: number of points N.
 
     Returns:
@@ -74,9 +80,11 @@ def sample_mesh(
         np.any([shapes.contains(piece, points + side * _REACHABLE * normals) for piece in pieces], axis=0)
         for side in (1, -1)
     )
-    flipped = outer & ~inner
-    normals = np.where(flipped[:, None], -normals, normals)
-    reachable = ~(outer & inner)
+    if oriented:
+        reachable = ~outer
+    else:
+        reachable = ~(outer & inner)
+        normals = np.where((outer & ~inner)[:, None], -normals, normals)
     if reachable.mean() < 0.25:
         reachable[:] = True
     chosen = np.flatnonzero(reachable)[:count]

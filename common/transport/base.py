@@ -1,64 +1,127 @@
-"""What messages travel over: queries with answers, publications that may be lost, and signs of life."""
+"""What a transport does, whatever carries the messages."""
 
 import collections
 import threading
+import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, Self
 
+from common.errors import CongraspError, TransportError
 from common.wire.codec import Message
 
 Handler = Callable[[str, Message], Message]
-"""(key, request) -> reply. A CongraspError that it raises reaches the asker in words."""
+"""(key, request) -> reply."""
+Damage = Callable[[str, CongraspError], None]
+"""(key, what is wrong): a request arrived that could not be decoded."""
+
+
+class RefusedError(TransportError):
+    """The peer answered, and its answer is an error in words."""
 
 
 class Subscription:
-    """The newest messages of a key expression; what does not fit into the ring is dropped and counted."""
+    """What was published under a key expression: a ring that keeps the newest and counts what it lost.
 
-    def __init__(self, depth: int):
-        """A ring of `depth` messages."""
-        self._ring: collections.deque[tuple[str, Message]] = collections.deque(maxlen=depth)
-        self._ready = threading.Condition()
+    Attributes:
+      dropped: messages lost so far, on the way or because `receive` was called too rarely.
+    """
+
+    def __init__(self, depth: int, on_close: Callable[[], None] = lambda: None):
         self.dropped = 0
+        self._ring: collections.deque[tuple[str, Callable[[], Message]]] = collections.deque()
+        self._depth = depth
+        self._on_close = on_close
+        self._changed = threading.Condition()
+        self._closed = False
 
-    def deliver(self, key: str, message: Message) -> None:
-        """Called by the transport."""
-        with self._ready:
-            self.dropped += len(self._ring) == self._ring.maxlen
+    def push(self, key: str, message: Callable[[], Message], lost: int = 0) -> None:
+        """Adds a message, which is decoded when it is received; `lost` ones before it never arrived."""
+        with self._changed:
+            self.dropped += lost
+            if len(self._ring) == self._depth:
+                self._ring.popleft()
+                self.dropped += 1
             self._ring.append((key, message))
-            self._ready.notify()
+            self._changed.notify()
 
     def receive(self, timeout: float) -> tuple[str, Message] | None:
-        """The oldest message kept, or None when none arrives within `timeout` seconds."""
-        with self._ready:
-            if not self._ready.wait_for(lambda: self._ring, timeout):
-                return None
-            return self._ring.popleft()
+        """The oldest message that is kept, with its key; None if none comes within `timeout` seconds.
+
+        A message that cannot be decoded counts as dropped.
+        """
+        deadline = time.monotonic() + timeout
+        while True:
+            with self._changed:
+                while not self._ring:
+                    rest = deadline - time.monotonic()
+                    if self._closed or rest <= 0:
+                        return None
+                    self._changed.wait(rest)
+                key, message = self._ring.popleft()
+            try:
+                return key, message()
+            except CongraspError:
+                self.dropped += 1
+
+    def close(self) -> None:
+        """Ends the subscription; a waiting `receive` returns."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._on_close()
 
 
 class Transport(Protocol):
-    """One endpoint. Every call returns within its deadline; `close` may be called twice."""
+    """One process's end of the wire."""
 
-    def serve(self, key: str, handler: Handler, *, workers: int = 1, depth: int = 4) -> None:
-        """Answers queries on `key` in threads of its own."""
+    def serve(
+        self, key: str, handler: Handler, *, workers: int = 1, depth: int = 4, on_damage: Damage | None = None
+    ) -> None:
+        """Answers queries.
+
+        Args:
+          key: key or key expression.
+          handler: makes the reply, in a daemon thread of its own; a CongraspError that it raises is answered in words.
+          workers: threads that run the handler.
+          depth: queries that wait; further ones wait at their senders.
+          on_damage: told about requests that cannot be decoded, which are refused without asking the handler.
+        """
+        ...
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
-        """The answer of whoever serves `key`; a TransportError says why there is none."""
+        """Asks whoever serves a key.
+
+        Args:
+          key: the key.
+          request: the question.
+          timeout: seconds to wait for the answer.
+
+        Raises:
+          RefusedError: the peer answered with an error.
+          TransportError: nobody serves the key, or no answer came in time.
+        """
+        ...
 
     def publish(self, key: str, message: Message) -> None:
-        """Sends to whoever listens; may be lost, never blocks for long."""
+        """Sends to whoever listens; never waits long, and may lose the message."""
+        ...
 
-    def subscribe(self, key_expression: str, *, depth: int = 64) -> Subscription:
-        """Collects what is published on matching keys."""
+    def subscribe(self, key_expression: str, *, depth: int) -> Subscription:
+        """Listens; `depth` messages are kept."""
+        ...
 
     def declare_alive(self, key: str) -> None:
-        """Shows `key` as alive until this endpoint closes or dies."""
+        """Shows a token to everyone until this transport closes or its process dies."""
+        ...
 
     def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
-        """Calls `on_change(key, alive)` for those alive now and for every change."""
+        """Calls back, in a daemon thread, for each token that is there, comes or goes."""
+        ...
 
     def close(self) -> None:
-        """Leaves."""
+        """Ends everything that was declared; may be called again."""
+        ...
 
-    def __enter__(self) -> "Transport": ...
+    def __enter__(self) -> Self: ...
 
-    def __exit__(self, *exc: object) -> None: ...
+    def __exit__(self, *exception: object) -> None: ...

@@ -1,39 +1,131 @@
-"""Keys on the wire; all lie under `congrasp/<run>/`."""
+"""Keys on the wire: `congrasp/<run>/...`, and which flow each belongs to."""
 
+import dataclasses
 import re
+from typing import Literal, NamedTuple
 
 from common.errors import CongraspError
 
-CONFIG = "config"
-TICKET = "ticket"
-ROLLOUT = "rollout"
-WEIGHTS = "weights/latest"
-ANNOUNCE = "weights/announce"
-STATUS = "status"
-ACT = "policy/act"
-HEALTH = "policy/health"
-BULK = (ROLLOUT, WEIGHTS)
-"""Keys whose messages are large; they travel on a session of their own."""
+ROOT = "congrasp"
+Flow = Literal["control", "bulk", "log", "policy"]
+FLOWS: tuple[Flow, ...] = ("control", "bulk", "log", "policy")
+"""Kinds of traffic that must not wait for one another, in the order of their ports."""
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 
 
-def key(run: str, *parts: str) -> str:
-    """The full key of a run; a CongraspError names a part that cannot be in a key."""
-    for part in (run, *parts):
-        if not re.fullmatch(r"[\w.\-*]+(/[\w.\-*]+)*", part):
-            raise CongraspError(f"The name '{part}' cannot be used on the wire.", "Use letters, digits, '-', '_', '.'.")
-    return "/".join(("congrasp", run, *parts))
+def check_name(what: str, name: str) -> str:
+    """Returns a name that may stand in a key.
+
+    Raises:
+      CongraspError: it is empty, too long, or has other characters than letters, digits, `_`, `.` and `-`.
+    """
+    if not _NAME.fullmatch(name):
+        raise CongraspError(
+            f"{ascii(name)[:70]} cannot be the name of {'an' if what[0] in 'aeiou' else 'a'} {what}.",
+            "Use 1 to 64 letters, digits, '_', '.' and '-'.",
+        )
+    return name
 
 
-def log_key(run: str, kind: str, role: str, name: str) -> str:
-    """Key of a log stream: kind is metrics, event, version, episode or rollout."""
-    return key(run, "log", kind, role, name)
+def flow(key: str) -> Flow:
+    """The flow of a key or key expression: the part below the run decides."""
+    part = key.split("/")[2:3]
+    if part in (["rollout"], ["weights"]):
+        # The notice is tiny and urgent, the weights themselves are neither.
+        return "control" if key.endswith("/announce") else "bulk"
+    return "log" if part == ["log"] else "policy" if part == ["policy"] else "control"
 
 
-def alive_key(run: str, role: str, name: str, incarnation: str) -> str:
-    """Key of a liveliness token."""
-    return key(run, "alive", role, name, incarnation)
+class Alive(NamedTuple):
+    """Whose liveliness token it is."""
+
+    role: str
+    id: str
+    incarnation: str
 
 
-def relative(full: str) -> str:
-    """The part of a key after the run's name."""
-    return full.split("/", 2)[2]
+def parse_alive(key: str) -> Alive | None:
+    """The owner of a liveliness token; None if the key is none."""
+    parts = key.split("/")
+    return Alive(*parts[3:]) if len(parts) == 6 and parts[2] == "alive" else None
+
+
+def matches(expression: str, key: str) -> bool:
+    """Whether a key is one of those that an expression names: `*` stands for one part, `**` for any number of them."""
+    pattern = "".join(
+        "(?:/[^/]+)*" if part == "**" else "/[^/]+" if part == "*" else "/" + re.escape(part)
+        for part in expression.split("/")
+    )
+    return re.fullmatch(pattern, "/" + key) is not None
+
+
+@dataclasses.dataclass(frozen=True)
+class Keys:
+    """The keys of one run."""
+
+    run: str
+    """Name of the run."""
+
+    def __post_init__(self) -> None:
+        check_name("run", self.run)
+
+    def _key(self, *parts: str) -> str:
+        return "/".join((ROOT, self.run, *parts))
+
+    @property
+    def config(self) -> str:
+        """Query: the run's configuration."""
+        return self._key("config")
+
+    @property
+    def ticket(self) -> str:
+        """Query: permission to make a rollout."""
+        return self._key("ticket")
+
+    @property
+    def rollout(self) -> str:
+        """Query: takes a rollout and acknowledges it."""
+        return self._key("rollout")
+
+    @property
+    def weights(self) -> str:
+        """Query: the latest policy bundle."""
+        return self._key("weights", "latest")
+
+    @property
+    def announcement(self) -> str:
+        """Publication: a new policy version is there."""
+        return self._key("weights", "announce")
+
+    @property
+    def status(self) -> str:
+        """Query: roles, versions, rates and the ledger."""
+        return self._key("status")
+
+    @property
+    def act(self) -> str:
+        """Query: an action of the live policy."""
+        return self._key("policy", "act")
+
+    @property
+    def health(self) -> str:
+        """Query: whether the policy server is ready."""
+        return self._key("policy", "health")
+
+    @property
+    def logs(self) -> str:
+        """Expression of everything that is published for logs."""
+        return self._key("log", "**")
+
+    @property
+    def everyone(self) -> str:
+        """Expression of all liveliness tokens."""
+        return self._key("alive", "*", "*", "*")
+
+    def alive(self, role: str, name: str, incarnation: str) -> str:
+        """Liveliness token of one start of one process."""
+        return self._key("alive", *(check_name("role", part) for part in (role, name, incarnation)))
+
+    def log(self, channel: str, role: str, name: str) -> str:
+        """Publication for logs; channels: metrics, event, version, episode, rollout."""
+        return self._key("log", channel, check_name("role", role), check_name("role", name))

@@ -1,118 +1,212 @@
-"""Messages as bytes: the safetensors format, with the message's JSON and a checksum in its metadata.
+"""Messages as bytes: named arrays and meta data in the safetensors format, checked strictly on arrival.
 
-Written and read here because one join and `numpy.frombuffer` are several times faster than the library, and because
-everything that arrives is checked: sizes, offsets, types, full coverage and the CRC-32 of the data.
+The layout is that of https://github.com/huggingface/safetensors: eight bytes with the header's length, a JSON header
+that gives each array's dtype, shape and byte range, then the arrays. Encoding joins the arrays' memory once; decoding
+copies nothing, its arrays are read-only views of the message. The header's `__metadata__` holds the message's meta data
+as JSON text (`meta`) and the CRC-32 of the data section (`crc32`).
 """
 
 import dataclasses
+import functools
 import json
 import math
-import struct
 import zlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from common.errors import CongraspError
 
-MAX_HEADER = 1 << 20
 MAX_MESSAGE = 256 << 20
+"""Bytes that a message may have unless the caller says otherwise."""
+MAX_HEADER = 1 << 20
+"""Bytes that a header may have."""
+_MAX_DIMENSIONS = 8
+_MAX_ITEMS = 1 << 40
 _DTYPES = {
-    "BOOL": "?",
-    "U8": "u1",
-    "I8": "i1",
-    "U16": "<u2",
-    "I16": "<i2",
-    "F16": "<f2",
-    "U32": "<u4",
-    "I32": "<i4",
-    "F32": "<f4",
-    "U64": "<u8",
-    "I64": "<i8",
-    "F64": "<f8",
+    name: np.dtype(code)
+    for name, code in {
+        "F64": "<f8",
+        "F32": "<f4",
+        "F16": "<f2",
+        "I64": "<i8",
+        "I32": "<i4",
+        "I16": "<i2",
+        "I8": "|i1",
+        "U64": "<u8",
+        "U32": "<u4",
+        "U16": "<u2",
+        "U8": "|u1",
+        "BOOL": "|b1",
+    }.items()
 }
-_NAMES = {np.dtype(code): name for name, code in _DTYPES.items()}
+_NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Message:
-    """Named arrays and a JSON object. In one process the arrays may stay on the device."""
+    """What travels between processes; never changed once made."""
 
-    arrays: dict[str, Any]
-    meta: dict[str, Any]
+    arrays: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """NumPy arrays by name, or device arrays inside one process."""
+    meta: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """What JSON can hold."""
+
+
+class SharedMessage(Message):
+    """A message that is sent more than once; its bytes are made on first use and kept."""
+
+    @functools.cached_property
+    def encoded(self) -> bytes:
+        """The message's bytes."""
+        return _encode(self)
 
 
 def encode(message: Message) -> bytes:
-    """The message as bytes; a file with them is a valid `.safetensors` file."""
-    header: dict[str, Any] = {}
-    parts: list[Any] = []
-    offset = 0
-    for name, value in message.arrays.items():
-        array = np.asarray(value)
-        array = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False)).reshape(array.shape)
-        if array.dtype not in _NAMES:
-            raise CongraspError(f"The array '{name}' has type {array.dtype}, which messages cannot carry.")
-        header[name] = {
-            "dtype": _NAMES[array.dtype],
-            "shape": list(array.shape),
-            "data_offsets": [offset, offset + array.nbytes],
-        }
-        offset += array.nbytes
-        parts.append(array.reshape(-1).view(np.uint8).data if array.nbytes else b"")
-    checksum = 0
-    for part in parts:
-        checksum = zlib.crc32(part, checksum)
-    header["__metadata__"] = {"meta": json.dumps(message.meta), "crc32": str(checksum)}
+    """A message as safetensors bytes.
+
+    Raises:
+      CongraspError: an array's dtype or name, or the meta data, cannot be represented.
+    """
+    return message.encoded if isinstance(message, SharedMessage) else _encode(message)
+
+
+def _encode(message: Message) -> bytes:
+    try:
+        meta = json.dumps(dict(message.meta), allow_nan=False)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise CongraspError(f"A message's meta data cannot be written as JSON: {error}.") from None
+    arrays = {name: _portable(name, array) for name, array in message.arrays.items()}
+    # Wide dtypes first, so that every array starts at a multiple of its item's size.
+    order = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
+    header: dict[str, Any] = {"__metadata__": {"meta": meta, "crc32": ""}}
+    parts, offset, crc = [], 0, 0
+    for name in order:
+        array = arrays[name]
+        end = offset + array.nbytes
+        header[name] = {"dtype": _NAMES[array.dtype], "shape": array.shape, "data_offsets": [offset, end]}
+        parts.append(array.reshape(-1).view(np.uint8).data)
+        crc = zlib.crc32(parts[-1], crc)
+        offset = end
+    header["__metadata__"]["crc32"] = f"{crc:08x}"
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > MAX_HEADER:
-        raise CongraspError(f"The message's header takes {len(text)} bytes, more than {MAX_HEADER}.")
-    return b"".join([struct.pack("<Q", len(text)), text, *parts])
+        raise CongraspError(f"A message's header has {len(text)} bytes.", f"At most {MAX_HEADER} fit: send less meta data.")
+    return b"".join([len(text).to_bytes(8, "little"), text, *parts])
 
 
 def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
-    """The inverse of `encode`; arrays are read-only views of `data`. Anything damaged is a `CongraspError`."""
+    """The inverse of `encode`, for bytes that anyone may have sent.
+
+    Args:
+      data: the bytes; the arrays of the result are views of them.
+      max_bytes: longer messages are refused.
+
+    Raises:
+      CongraspError: the bytes are not an intact message; the text says what is wrong with them.
+    """
     if len(data) > max_bytes:
-        raise CongraspError(f"The message has {len(data)} bytes, more than the {max_bytes} allowed.")
+        raise CongraspError(f"The message has {len(data)} bytes, more than the {max_bytes} that are allowed.")
     if len(data) < 8:
-        raise CongraspError("The message is cut off: it has no header.")
-    (size,) = struct.unpack_from("<Q", data)
-    if size > MAX_HEADER or 8 + size > len(data):
-        raise CongraspError(f"The message's header claims {size} bytes: it is damaged or not a message.")
+        raise CongraspError(f"The message is cut: it has only {len(data)} bytes.")
+    length = int.from_bytes(data[:8], "little")
+    if length > MAX_HEADER:
+        raise CongraspError(f"The message's header claims {length} bytes, more than the {MAX_HEADER} that are allowed.")
+    if 8 + length > len(data):
+        raise CongraspError(f"The message is cut inside its header: {len(data)} bytes of {8 + length} or more.")
+    header = _header(data[8 : 8 + length])
+    section = memoryview(data)[8 + length :]
+    meta, crc = _metadata(header.pop("__metadata__", None))
+    if zlib.crc32(section) != crc:
+        raise CongraspError("The message's data do not match their checksum.")
+    return Message(_arrays(header, section), meta)
+
+
+def _portable(name: str, value: Any) -> np.ndarray:
+    """A contiguous little-endian array of a known dtype."""
+    array = np.asarray(value)
+    array = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False)).reshape(array.shape)
+    if array.dtype not in _NAMES:
+        raise CongraspError(f"The array {name!r} has dtype {array.dtype}.", f"Messages hold {', '.join(_DTYPES)}.")
+    if not isinstance(name, str) or name == "__metadata__":
+        raise CongraspError(f"{name!r} cannot be the name of an array.")
+    return array
+
+
+def _header(text: bytes) -> dict[str, Any]:
     try:
-        header = json.loads(data[8 : 8 + size], object_pairs_hook=_unique)
-        metadata = header.pop("__metadata__")
-        meta = json.loads(metadata["meta"])
-        checksum = int(metadata["crc32"])
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise CongraspError(f"The message's header cannot be read ({error}).") from None
-    if not isinstance(meta, dict):
-        raise CongraspError("The message's metadata is not a JSON object.")
-    body = memoryview(data)[8 + size :]
-    arrays, end = {}, 0
-    for name, entry in header.items():
-        arrays[name], end = _array(name, entry, body, end)
-    if end != len(body):
-        raise CongraspError(f"The message has {len(body) - end} bytes that belong to no array.")
-    if zlib.crc32(body) != checksum:
-        raise CongraspError("The message's checksum is wrong: it was damaged on its way.")
-    return Message(arrays, meta)
+        header = json.loads(text.decode(), object_pairs_hook=_unique, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise CongraspError(f"The message's header is not JSON: {str(error)[:80]}.") from None
+    if not isinstance(header, dict):
+        raise CongraspError("The message's header is not a JSON object.")
+    return header
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    if len({key for key, _ in pairs}) != len(pairs):
-        raise ValueError("a name stands twice")
-    return dict(pairs)
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        raise CongraspError("The message's header has a key twice.")
+    return result
 
 
-def _array(name: str, entry: Any, body: memoryview, start: int) -> tuple[np.ndarray, int]:
+def _no_constant(name: str) -> Any:
+    raise CongraspError(f"The message's header holds {name}, which is not JSON.")
+
+
+def _metadata(entry: Any) -> tuple[dict[str, Any], int]:
+    if not isinstance(entry, dict) or not isinstance(entry.get("meta"), str) or not isinstance(entry.get("crc32"), str):
+        raise CongraspError("The message lacks its meta data or its checksum.")
     try:
-        dtype = np.dtype(_DTYPES[entry["dtype"]])
-        shape = tuple(entry["shape"])
-        first, last = entry["data_offsets"]
-    except (KeyError, TypeError, ValueError):
-        raise CongraspError(f"The message's entry '{name}' is malformed.") from None
-    whole = all(type(n) is int and n >= 0 for n in (*shape, first, last))
-    if not whole or first != start or last > len(body) or last - first != math.prod(shape) * dtype.itemsize:
-        raise CongraspError(f"The message's array '{name}' does not lie where its header says.")
-    return np.frombuffer(body[first:last], dtype).reshape(shape), last
+        crc = int(entry["crc32"], 16)
+    except ValueError:
+        raise CongraspError("The message's checksum is not a hexadecimal number.") from None
+    return _header(entry["meta"].encode(errors="replace")), crc
+
+
+def _arrays(header: dict[str, Any], section: memoryview) -> dict[str, np.ndarray]:
+    entries = sorted(((name, *_entry(name, entry)) for name, entry in header.items()), key=lambda entry: entry[3:])
+    arrays, position = {}, 0
+    for name, dtype, shape, begin, end in entries:
+        if begin != position:
+            raise CongraspError(f"The array {_short(name)} starts at byte {begin}, not at {position}: a gap or an overlap.")
+        if end - begin != math.prod(shape) * dtype.itemsize:
+            raise CongraspError(f"The array {_short(name)} has {end - begin} bytes, which is not {dtype} times {shape}.")
+        if end > len(section):
+            raise CongraspError(f"The message is cut: the array {_short(name)} ends at {end} of {len(section)} bytes.")
+        is_bool = dtype.kind == "b"
+        array = np.frombuffer(section[begin:end], np.uint8 if is_bool else dtype)
+        if is_bool:
+            if array.size and array.max() > 1:
+                raise CongraspError(f"The array {_short(name)} has booleans other than 0 and 1.")
+            array = array.view(bool)
+        arrays[name] = array.reshape(shape)
+        position = end
+    if position != len(section):
+        raise CongraspError(f"The message has {len(section) - position} bytes that belong to no array.")
+    return arrays
+
+
+def _entry(name: str, entry: Any) -> tuple[np.dtype, tuple[int, ...], int, int]:
+    """Dtype, shape and byte range of a header's entry."""
+    if not isinstance(entry, dict) or entry.keys() != {"dtype", "shape", "data_offsets"}:
+        raise CongraspError(f"The array {_short(name)} is not described by dtype, shape and data_offsets.")
+    dtype, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
+    if not isinstance(dtype, str) or dtype not in _DTYPES:
+        raise CongraspError(f"The array {_short(name)} has dtype {_short(dtype)}.", f"Messages hold {', '.join(_DTYPES)}.")
+    if not _is_counts(shape) or len(shape) > _MAX_DIMENSIONS or math.prod(size or 1 for size in shape) >= _MAX_ITEMS:
+        raise CongraspError(f"The array {_short(name)} has shape {_short(shape)}, which is none.")
+    if not _is_counts(offsets) or len(offsets) != 2:
+        raise CongraspError(f"The array {_short(name)} has data_offsets {_short(offsets)}, which is no range.")
+    return _DTYPES[dtype], tuple(shape), offsets[0], offsets[1]
+
+
+def _is_counts(value: Any) -> bool:
+    return isinstance(value, list) and all(type(item) is int and 0 <= item < _MAX_ITEMS for item in value)
+
+
+def _short(value: Any) -> str:
+    """A stranger's value as printable text of bounded length."""
+    return ascii(value)[:60]

@@ -1,107 +1,252 @@
-"""What each kind of message must hold; everything that arrives over the wire is checked against it."""
+"""What each kind of message must hold, and the check that it does.
+
+A spec names arrays with their dtypes and shapes. A shape is made of numbers and of symbols such as T; a symbol stands
+for one size throughout a message. Values must be finite wherever they are floating-point numbers.
+"""
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from common.errors import CongraspError
+from common.transport.keys import check_name
 from common.wire.codec import Message
+
+REAL = ("float32", "float64")
+_INFINITE_HALF = 0x7C00  # exponent bits of a float16 that is infinite or not a number
+_BLOCK = 1 << 16
+_COUNTS = 1 << 53
 
 
 @dataclasses.dataclass(frozen=True)
-class Field:
-    """One array: its shape in symbols or numbers, its types, and whether its values must be finite."""
+class ArraySpec:
+    """One array of a message."""
 
-    shape: tuple[str | int, ...]
     dtypes: tuple[str, ...]
+    """Names of the dtypes that it may have."""
+    shape: tuple[str | int, ...] | None
+    """Sizes and symbols; None admits any shape."""
+    optional: bool = False
+    """Whether the array may be absent."""
 
 
-ROLLOUT = {
-    "observation": Field(("T", "B", "D"), ("float16", "float32")),
-    "action": Field(("T", "B", "A"), ("float32",)),
-    "log_probability": Field(("T", "B"), ("float32",)),
-    "reward": Field(("T", "B"), ("float32",)),
-    "terminal": Field(("T", "B"), ("bool",)),
-    "last_observation": Field(("B", "D"), ("float16", "float32")),
-}
-ROLLOUT_META = {
-    "actor": str,
-    "incarnation": str,
-    "sequence": int,
-    "version": int,
-    "epoch": str,
-    "schema": str,
-    "steps": int,
-}
-_EPISODE = Field(("E",), ("float32",))
-BUNDLE_META = {
-    "version": int,
-    "epoch": str,
-    "schema": str,
-    "hand": str,
-    "layout": list,
-    "action_size": int,
-    "network": dict,
-    "task": dict,
-    "format": int,
-}
+@dataclasses.dataclass(frozen=True)
+class MessageSpec:
+    """One kind of message."""
+
+    kind: str
+    """What errors call it."""
+    arrays: Mapping[str, ArraySpec] = dataclasses.field(default_factory=dict)
+    """Specs by name; a name that ends in `/*` stands for any number of arrays below it."""
+    meta: Mapping[str, type | tuple[type, ...]] = dataclasses.field(default_factory=dict)
+    """Types of the entries of the meta data that must be there; others may be."""
 
 
-def check_meta(meta: Mapping[str, object], spec: Mapping[str, type], kind: str) -> None:
-    """Raises a CongraspError that names the missing or mistyped entry."""
-    for name, kind_of in spec.items():
-        value = meta.get(name)
-        if not isinstance(value, kind_of) or (kind_of is int and isinstance(value, bool)):
-            raise CongraspError(f"The {kind}'s '{name}' is missing or is not of type {kind_of.__name__}.")
+_F32 = ("float32",)
+_INDEX = ("int32", "int64")
+
+ROLLOUT = MessageSpec(
+    "rollout",
+    {
+        "observation": ArraySpec(("float16", "float32"), ("T", "B", "D")),
+        "action": ArraySpec(_F32, ("T", "B", "A")),
+        "log_probability": ArraySpec(_F32, ("T", "B")),
+        "reward": ArraySpec(_F32, ("T", "B")),
+        "terminal": ArraySpec(("bool",), ("T", "B")),
+        "last_observation": ArraySpec(("float16", "float32"), ("B", "D")),
+        "episode/*": ArraySpec(_F32, ("E",)),
+        "term/*": ArraySpec(_F32, ("E",)),
+    },
+    {
+        "actor": str,
+        "incarnation": str,
+        "sequence": int,
+        "version": int,
+        "epoch": str,
+        "schema": str,
+        "steps": int,
+    },
+)
+"""Actor to learner: T control steps of B worlds, D observation and A action sizes, E episodes that ended."""
+
+BUNDLE = MessageSpec(
+    "bundle",
+    {
+        "actor/*": ArraySpec(REAL, None),
+        "critic/*": ArraySpec(REAL, None),
+        "observation/mean": ArraySpec(REAL, ("D",)),
+        "observation/m2": ArraySpec(REAL, ("D",)),
+        "observation/count": ArraySpec(REAL, ()),
+        "value/mean": ArraySpec(REAL, ()),
+        "value/m2": ArraySpec(REAL, ()),
+        "value/count": ArraySpec(REAL, ()),
+    },
+    {"version": int, "epoch": str, "schema": str, "hand": str, "layout": list, "action_size": int, "format": int},
+)
+"""Learner to everyone: weights and normalisers of one version."""
+
+EPISODE = MessageSpec(
+    "episode",
+    {
+        "link_position": ArraySpec(REAL, ("T", "L", 3)),
+        "link_quaternion": ArraySpec(REAL, ("T", "L", 4)),
+        "object_position": ArraySpec(REAL, ("T", 3)),
+        "object_quaternion": ArraySpec(REAL, ("T", 4)),
+        "contact_force": ArraySpec(REAL, ("T", "L", 3)),
+        "q": ArraySpec(REAL, ("T", "F")),
+        "u": ArraySpec(REAL, ("T", 6)),
+        "q_target": ArraySpec(REAL, ("T", "F")),
+        "u_target": ArraySpec(REAL, ("T", 6)),
+        "action": ArraySpec(REAL, ("T", "A")),
+        "table": ArraySpec(("bool",), ("T",)),
+        "reward/*": ArraySpec(REAL, ("T",)),
+        "goal/*": ArraySpec(REAL, None),
+        "piece_kind": ArraySpec(_INDEX, ("n",)),
+        "piece_size": ArraySpec(REAL, ("n", 3)),
+        "piece_pos": ArraySpec(REAL, ("n", 3)),
+        "piece_quat": ArraySpec(REAL, ("n", 4)),
+        "piece_part": ArraySpec(_INDEX, ("n",)),
+        "visual_vertices": ArraySpec(REAL, ("V", 3)),
+        "visual_faces": ArraySpec(_INDEX, ("Fc", 3)),
+        "surface_points": ArraySpec(REAL, ("N", 3)),
+        "surface_minus": ArraySpec(("bool",), ("N",)),
+    },
+    {"hand": str, "object": str, "control_dt": float, "version": int, "actor": str, "success": bool, "metrics": dict},
+)
+"""Actor to whoever listens: one world for T steps, for drawing."""
+
+METRICS = MessageSpec("metrics", meta={"time": (int, float), "values": dict})
+EVENT = MessageSpec("event", meta={"time": (int, float), "level": str, "text": str})
+TICKET = MessageSpec("ticket request", meta={"actor": str, "incarnation": str, "ticket": str})
+ANNOUNCEMENT = MessageSpec("announcement", meta={"version": int, "epoch": str, "life": str})
+"""Learner to everyone: there is a new version. `life` differs each time the learner's process starts."""
 
 
-def check_arrays(arrays: Mapping[str, np.ndarray], spec: Mapping[str, Field], kind: str, **sizes: int) -> None:
-    """Raises a CongraspError that names the array and the rule it breaks.
+def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int]:
+    """Checks a message against its kind.
 
     Args:
-      arrays: what arrived.
-      spec: what must be there, and nothing else.
-      kind: word for the message in errors.
-      **sizes: sizes of symbols that are known; the others must only agree with each other.
+      message: the message; arrays that live on a device are not checked for finite values, as they never left this
+        process.
+      spec: the kind.
+      **sizes: values of symbols that are known beforehand.
+
+    Returns:
+      The values of all symbols.
+
+    Raises:
+      CongraspError: naming the array or the entry, and the rule that it breaks.
     """
-    if missing := spec.keys() - arrays.keys():
-        raise CongraspError(f"The {kind} lacks the array '{min(missing)}'.")
-    if extra := arrays.keys() - spec.keys():
-        raise CongraspError(f"The {kind} has an array '{min(extra)}' that it should not have.")
-    for name, field in spec.items():
-        array = arrays[name]
-        if str(array.dtype) not in field.dtypes:
-            raise CongraspError(f"The {kind}'s '{name}' is {array.dtype}, not {' or '.join(field.dtypes)}.")
-        if len(array.shape) != len(field.shape):
-            raise CongraspError(f"The {kind}'s '{name}' has shape {array.shape}, not {field.shape}.")
-        for size, symbol in zip(array.shape, field.shape, strict=True):
-            expected = sizes.setdefault(symbol, size) if isinstance(symbol, str) else symbol
-            if size != expected:
-                raise CongraspError(f"The {kind}'s '{name}' has shape {array.shape}: {symbol} should be {expected}.")
-        # A sum is finite only if every value is (and no finite float16 or float32 array sums beyond float64).
-        if array.dtype.kind == "f" and not np.isfinite(np.sum(array, dtype=np.float64)):
-            raise CongraspError(f"The {kind}'s '{name}' holds values that are not finite.")
-
-
-def validate_rollout(message: Message, *, observation_size: int, action_size: int, schema: str) -> None:
-    """Checks a rollout of any number of steps, worlds and finished episodes."""
-    check_meta(message.meta, ROLLOUT_META, "rollout")
-    if message.meta["schema"] != schema:
-        raise CongraspError(
-            f"The rollout's schema {message.meta['schema']} is not the learner's {schema}.",
-            "Run actor and learner from the same version.",
-        )
-    episodes = {name: _EPISODE for name in message.arrays if name.startswith(("episode/", "term/"))}
-    check_arrays(message.arrays, ROLLOUT | episodes, "rollout", D=observation_size, A=action_size)
-    steps, worlds = message.arrays["reward"].shape
-    if steps * worlds == 0 or message.meta["steps"] != steps * worlds:
-        raise CongraspError(f"The rollout says {message.meta['steps']} steps and holds {steps} x {worlds}.")
-
-
-def validate_bundle(message: Message) -> None:
-    """Checks a policy bundle's metadata and that its arrays are finite."""
-    check_meta(message.meta, BUNDLE_META, "policy bundle")
+    for name, kind in spec.meta.items():
+        value = message.meta.get(name)
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise CongraspError(f"The {spec.kind}'s meta entry '{name}' is {ascii(value)[:60]}, not {_type_name(kind)}.")
+    for name, array_spec in spec.arrays.items():
+        if not name.endswith("/*") and not array_spec.optional and name not in message.arrays:
+            raise CongraspError(f"The {spec.kind} lacks the array '{name}'.")
+    known = dict(sizes)
     for name, array in message.arrays.items():
-        if np.asarray(array).dtype.kind == "f" and not np.all(np.isfinite(np.asarray(array))):
-            raise CongraspError(f"The policy bundle's '{name}' holds values that are not finite.")
+        array_spec = spec.arrays.get(name) or spec.arrays.get(name.partition("/")[0] + "/*")  # type: ignore[assignment]
+        if array_spec is None:
+            raise CongraspError(f"The {spec.kind} has an unknown array {ascii(name)[:60]}.")
+        _check(f"The {spec.kind}'s array {ascii(name)[:60]}", array, array_spec, known)
+    return known
+
+
+def _check(what: str, array: Any, spec: ArraySpec, known: dict[str, int]) -> None:
+    if str(array.dtype) not in spec.dtypes:
+        raise CongraspError(f"{what} has dtype {array.dtype}, not {' or '.join(spec.dtypes)}.")
+    if spec.shape is not None:
+        fits = len(array.shape) == len(spec.shape) and all(
+            size == (known.setdefault(symbol, size) if isinstance(symbol, str) else symbol)
+            for symbol, size in zip(spec.shape, array.shape, strict=True)
+        )
+        if not fits:
+            rule = ", ".join(f"{s}={known[s]}" if isinstance(s, str) and s in known else str(s) for s in spec.shape)
+            raise CongraspError(f"{what} has shape {tuple(array.shape)}, not ({rule}).")
+    if isinstance(array, np.ndarray) and not is_finite(array):
+        raise CongraspError(f"{what} has values that are not finite.")
+
+
+def is_finite(array: np.ndarray) -> bool:
+    """Whether every value is a finite number; four times as fast for float16 as `np.isfinite`."""
+    if array.dtype != np.float16:
+        return bool(np.isfinite(array).all())
+    bits = array.reshape(-1).view(np.uint16)
+    return all(
+        (bits[start : start + _BLOCK] & 0x7FFF).max() < _INFINITE_HALF for start in range(0, len(bits), _BLOCK)
+    )
+
+
+def _type_name(kind: type | tuple[type, ...]) -> str:
+    return kind.__name__ if isinstance(kind, type) else " or ".join(one.__name__ for one in kind)
+
+
+class RolloutHeader(NamedTuple):
+    """Who made a rollout, and under which policy."""
+
+    actor: str
+    incarnation: str
+    """Random, one for each start of the actor's process."""
+    sequence: int
+    """Counts the rollouts of an incarnation from zero."""
+    version: int
+    """Version of the policy that acted."""
+    epoch: str
+    schema: str
+    steps: int
+    """T*B."""
+
+    @property
+    def owner(self) -> tuple[str, str]:
+        """Actor and incarnation."""
+        return self.actor, self.incarnation
+
+
+def validate_rollout(
+    message: Message, *, observation_size: int, action_size: int, schema: str | None = None
+) -> RolloutHeader:
+    """Checks a rollout.
+
+    Args:
+      message: a rollout.
+      observation_size: D.
+      action_size: A.
+      schema: the policy schema that it must have been made with, if that matters.
+
+    Raises:
+      CongraspError: naming the array or the entry, and the rule that it breaks.
+    """
+    sizes = validate(message, ROLLOUT, D=observation_size, A=action_size)
+    header = RolloutHeader(*(message.meta[name] for name in RolloutHeader._fields))
+    check_name("actor", header.actor)
+    check_name("incarnation", header.incarnation)
+    if not (0 <= header.sequence < _COUNTS and 0 <= header.version < _COUNTS):
+        raise CongraspError("The rollout's meta entries 'sequence' and 'version' must be counts.")
+    if header.steps != sizes["T"] * sizes["B"] or header.steps == 0:
+        raise CongraspError(f"The rollout's meta entry 'steps' is {header.steps}, not T*B = {sizes['T']}*{sizes['B']}.")
+    if schema is not None and header.schema != schema:
+        raise CongraspError(
+            f"The rollout was made with the policy schema {ascii(header.schema)[:40]}, not {schema}.",
+            "Start the actor anew, with the version of congrasp that the learner has.",
+        )
+    return header
+
+
+def validate_bundle(message: Message, *, schema: str | None = None) -> None:
+    """Checks a policy bundle as far as that needs no network.
+
+    Args:
+      message: a bundle.
+      schema: the policy schema that it must have, if that matters.
+
+    Raises:
+      CongraspError: naming the array or the entry, and the rule that it breaks.
+    """
+    validate(message, BUNDLE)
+    if not any(name.startswith("actor/") for name in message.arrays):
+        raise CongraspError("The bundle has no arrays of an actor.")
+    if schema is not None and message.meta["schema"] != schema:
+        raise CongraspError(f"The bundle has the policy schema {ascii(message.meta['schema'])[:40]}, not {schema}.")

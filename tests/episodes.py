@@ -1,0 +1,82 @@
+"""A made-up but whole episode: the hand nears a cylinder, closes, and holds it when the table goes."""
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from common.hands import get_hand
+from common.hands.kinematics import grasp_frame
+from common.logs.poses import link_poses
+from common.wire.codec import Message
+
+RADIUS, HEIGHT, CONTROL_DT = 0.03, 0.12, 0.01
+FORCE = 1.5  # N on each fingertip while it touches
+
+
+def episode(steps: int = 12, *, removal: int = 8, mask: tuple[int, ...] = (1, 1, 1, 1), success: bool = True) -> Message:
+    """`steps` control steps; the table goes at `removal`, the tips touch from two thirds of that on."""
+    hand = get_hand("human")
+    frame = grasp_frame(hand)
+    direction = np.array([-1.0, 0.3, -0.35]) / np.linalg.norm([-1.0, 0.3, -0.35])
+    cross = np.cross(direction, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(direction, [0.0, 0.0, 1.0]))
+    wrist_turn = Rotation.align_vectors([direction, cross], [frame.heading, frame.cross])[0]
+    center = np.array([0.0, 0.0, HEIGHT / 2])
+    tips = list(hand.tip_links)
+    frames = []
+    for step in range(steps):
+        share = min(step / (2 * removal / 3), 1.0)
+        wrist = center - wrist_turn.apply(frame.center) - 0.12 * (1 - share) * direction
+        q = hand.q_open + 0.4 * share * (hand.q_closed - hand.q_open)
+        position, quaternion = link_poses(hand, q)
+        force = np.zeros((len(hand.links), 3))
+        force[tips] = [0.0, 0.0, FORCE * (share == 1.0)]
+        turned = wrist_turn * Rotation.from_quat(quaternion, scalar_first=True)
+        frames.append((wrist_turn.apply(position) + wrist, turned.as_quat(scalar_first=True), force, q))
+    positions, quaternions, forces, q = (np.array(a, np.float32) for a in zip(*frames, strict=True))
+    mesh = trimesh.creation.cylinder(RADIUS, HEIGHT, sections=24)
+    points = np.asarray(trimesh.sample.sample_surface(mesh, 128, seed=0)[0], np.float32)
+    wrist_local = wrist - center
+    turn = wrist_turn.as_quat(scalar_first=True).astype(np.float32)
+    arrays = {
+        "link_position": positions,
+        "link_quaternion": quaternions,
+        "object_position": np.tile(center.astype(np.float32), (steps, 1)),
+        "object_quaternion": np.tile(np.array([1, 0, 0, 0], np.float32), (steps, 1)),
+        "contact_force": forces,
+        "q": q,
+        "u": np.zeros((steps, 6), np.float32),
+        "q_target": q,
+        "u_target": np.zeros((steps, 6), np.float32),
+        "action": np.zeros((steps, len(hand.joints) + 6), np.float32),
+        "table": np.arange(steps) < removal,
+        "reward/contact": np.linspace(0, 0.5, steps, dtype=np.float32),
+        "reward/distance": np.linspace(-0.5, -0.1, steps, dtype=np.float32),
+        "goal/heading_position": np.zeros(3, np.float32),
+        "goal/heading_direction": direction.astype(np.float32),
+        "goal/heading_cross": cross.astype(np.float32),
+        "goal/pose_q": q[-1],
+        "goal/pose_position": wrist_local.astype(np.float32),
+        "goal/pose_quaternion": turn,
+        "goal/trajectory_position": np.linspace(wrist_local - 0.12 * direction, wrist_local, 5).astype(np.float32),
+        "goal/trajectory_quaternion": np.tile(turn, (5, 1)),
+        "goal/mask": np.array(mask, np.float32),
+        "piece_kind": np.array([1], np.int32),
+        "piece_size": np.array([[RADIUS, HEIGHT / 2, 0]], np.float32),
+        "piece_pos": np.zeros((1, 3), np.float32),
+        "piece_quat": np.array([[1, 0, 0, 0]], np.float32),
+        "piece_part": np.zeros(1, np.int32),
+        "visual_vertices": np.asarray(mesh.vertices, np.float32),
+        "visual_faces": np.asarray(mesh.faces, np.int32),
+        "surface_points": points,
+        "surface_minus": points[:, 2] > HEIGHT / 4,
+    }
+    meta = {
+        "hand": "human",
+        "object": "cylinder-0",
+        "control_dt": CONTROL_DT,
+        "version": 3,
+        "actor": "a0",
+        "success": success,
+        "metrics": {"return": 12.5, "links_at_removal": 5.0},
+    }
+    return Message(arrays, meta)

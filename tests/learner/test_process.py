@@ -1,0 +1,272 @@
+"""The learner process with actors that act with its bundles on made-up observations."""
+
+import contextlib
+import dataclasses
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from actors.link import ActorLink, RunEnded
+from common.config import NetworkConfig, PPOConfig, RunConfig
+from common.errors import CongraspError, PhysicsError, TransportError
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle
+from common.transport import keys
+from common.transport.memory import MemoryBroker, MemoryTransport
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message
+from learner import update as updates
+from learner.process import create_run, open_run, run_learner
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+CONFIG = RunConfig(
+    name="t",
+    environments=2,
+    rollout_steps=4,
+    updates=3,
+    checkpoint_every=2,
+    network=NetworkConfig(hidden=(8,), encoder=2),
+    ppo=PPOConfig(epochs=1, minibatches=2),
+)
+
+
+class MadeUpActor(threading.Thread):
+    """Sends rollouts of random observations until the run ends; keeps the versions that it acted with."""
+
+    def __init__(self, transport, name: str = "a", reward: float = 1.0):
+        super().__init__(daemon=True)
+        self.versions: list[int] = []
+        self.ended = ""
+        self.stop = threading.Event()
+        self._transport, self._actor, self._reward = transport, name, reward
+        self.start()
+
+    def run(self) -> None:
+        link = ActorLink(self._transport, run=CONFIG.name, actor=self._actor, patience=30.0)
+        try:
+            link.config()
+            self._act(link)
+        except (RunEnded, TransportError) as error:
+            self.ended = str(error)
+        link.close(drain=0.5)
+
+    def _act(self, link: ActorLink) -> None:
+        rng, bundle = np.random.default_rng(0), None
+        while (ticket := link.acquire_ticket(self.stop)) is not None:
+            if bundle is None or ticket.version > bundle.version:
+                bundle = PolicyBundle.from_message(link.weights(-1 if bundle is None else bundle.version))
+            observation = rng.normal(size=(5, 2, sum(size for _, size in bundle.spec.layout))).astype(np.float16)
+            action, log_probability = bundles.sample_action(
+                bundle.spec.layout, bundle.acting, observation[:-1], jax.random.PRNGKey(len(self.versions))
+            )
+            arrays = {
+                "observation": observation[:-1],
+                "last_observation": observation[-1],
+                "action": np.asarray(action),
+                "log_probability": np.asarray(log_probability),
+                "reward": self._reward * rng.normal(size=(4, 2)).astype(np.float32),
+                "terminal": rng.random((4, 2)) < 0.3,
+                "episode/success": np.array([0.0, 1.0, 1.0, 1.0], np.float32),
+            }
+            meta = {"version": bundle.version, "schema": bundle.spec.schema, "steps": 8}
+            link.upload(Message(arrays, meta), ticket)
+            self.versions.append(bundle.version)
+
+
+@pytest.fixture
+def broker() -> MemoryBroker:
+    return MemoryBroker()
+
+
+def learn(run_dir, broker, config=CONFIG, stop_event=None, **options) -> PolicyBundle:
+    with MemoryTransport(broker) as transport:
+        return run_learner(run_dir, config, transport, stop_event=stop_event or threading.Event(), **options)
+
+
+@pytest.mark.timeout(120)
+def test_a_run_from_beginning_to_end(tmp_path, broker):
+    create_run(tmp_path, CONFIG)
+    logs = MemoryTransport(broker).subscribe(keys.key("t", "log", "*", "learner", "*"), depth=1000)
+    actors = [MadeUpActor(MemoryTransport(broker), name) for name in "ab"]
+    entered = []
+
+    @contextlib.contextmanager
+    def recorder():
+        entered.append("in")
+        yield
+        entered.append("out")
+
+    last = learn(tmp_path, broker, recorder=recorder())
+    for actor in actors:
+        actor.join(10.0)
+        assert actor.ended == "The run has ended."
+    assert entered == ["in", "out"]
+
+    assert (last.version, last.transitions) == (3, 3 * 2 * 8)
+    shipped = bundles.load(tmp_path / "policy.safetensors")
+    assert (shipped.version, shipped.epoch) == (3, last.epoch)
+    jax.tree.map(np.testing.assert_array_equal, shipped.params, jax.device_get(last.params))
+    assert open_run(tmp_path) == CONFIG
+    assert (tmp_path / "checkpoints" / "latest").resolve().name == "checkpoint_000000003.safetensors"
+
+    received = [logs.receive(0.0) for _ in range(len(logs._ring))]
+    kinds = {kind: [m.meta for k, m in received if k.split("/")[3] == kind] for kind in ("metrics", "version", "event")}
+    assert [meta["update"] for meta in kinds["metrics"]] == [1, 2, 3]
+    assert [meta["version"] for meta in kinds["version"]] == [0, 1, 2, 3]
+    values = kinds["metrics"][-1]["values"]
+    assert values["episode/success"] == 0.75 and values["episodes"] == 8
+    assert 0 <= values["staleness_mean"] <= values["staleness_max"] <= CONFIG.ppo.max_staleness
+    assert all(np.isfinite(value) for value in values.values())
+    assert any("complete after 3 updates" in meta["text"] for meta in kinds["event"])
+
+
+@pytest.mark.timeout(120)
+def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, broker):
+    create_run(tmp_path, CONFIG)
+    actor = MadeUpActor(MemoryTransport(broker))
+    stop = threading.Event()
+    forever = dataclasses.replace(CONFIG, updates=10**6)
+    first = learn(tmp_path, broker, forever, stop, on_update=lambda values: values["update"] == 3 and stop.set())
+    assert first.version == 3
+    assert actor.is_alive()
+    compiled = updates._optimise._cache_size()
+    last = learn(tmp_path, broker, dataclasses.replace(CONFIG, updates=6), resume=True)
+    assert updates._optimise._cache_size() == compiled
+    actor.join(10.0)
+    assert actor.ended == "The run has ended."
+    assert (last.version, last.transitions, last.epoch) == (6, 6 * 2 * 8, first.epoch)
+    assert open_run(tmp_path).updates == 6
+    assert actor.versions == sorted(actor.versions)
+
+
+LEARNER = """
+import pathlib, sys, threading
+from common.transport.zenoh_transport import ZenohTransport
+from learner import update as updates
+from learner.process import open_run, run_learner
+
+run_dir = pathlib.Path(sys.argv[1])
+with ZenohTransport(listen=sys.argv[2]) as transport:
+    last = run_learner(
+        run_dir, open_run(run_dir), transport, stop_event=threading.Event(), resume=sys.argv[3] == "resume",
+        on_update=lambda values: print(int(values["update"]), int(values["version"]), flush=True),
+    )
+"""
+
+
+@pytest.mark.timeout(150)
+def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path, free_port):
+    """Killed after update five, checkpointed at four; the second life redoes the fifth under another version."""
+    create_run(tmp_path, dataclasses.replace(CONFIG, updates=8, checkpoint_every=4))
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    def start(mode: str) -> subprocess.Popen:
+        command = [sys.executable, "-c", LEARNER, str(tmp_path), endpoint, mode]
+        cache = str(tmp_path / "compiled")  # as on a machine where the learner has run before
+        environment = {
+            **os.environ,
+            "JAX_PLATFORMS": "cpu",
+            "JAX_COMPILATION_CACHE_DIR": cache,
+            "PYTHONPATH": str(ROOT),
+        }
+        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+    lives = [start("fresh")]
+    try:
+        with ZenohTransport(connect=endpoint, patience=60.0) as transport:
+            actor = MadeUpActor(transport)
+            seen = [lives[0].stdout.readline().split() for _ in range(5)]
+            lives[0].send_signal(signal.SIGKILL)
+            lives[0].wait(10.0)
+            assert seen[-1] == ["5", "5"]
+            lives.append(start("resume"))
+            text, _ = lives[1].communicate(timeout=90.0)
+            actor.join(10.0)
+            assert actor.ended == "The run has ended."
+    finally:
+        for life in lives:
+            life.kill()
+            life.wait(10.0)
+            life.stdout.close()
+    assert lives[1].returncode == 0
+    second = [tuple(map(int, line.split())) for line in text.splitlines()]
+    assert [update for update, _ in second] == [5, 6, 7, 8]
+    assert second[0][1] > 5 and [version for _, version in second] == sorted({version for _, version in second})
+    assert actor.versions == sorted(actor.versions) and actor.versions[-1] > 5
+
+
+@pytest.mark.timeout(120)
+def test_values_that_are_not_finite_stop_the_run_and_are_kept(tmp_path, broker):
+    create_run(tmp_path, CONFIG)
+    actor = MadeUpActor(MemoryTransport(broker), reward=1e38)
+    with pytest.raises(PhysicsError, match=r"update 1: .*failure") as caught:
+        learn(tmp_path, broker)
+    actor.stop.set()
+    actor.join(10.0)
+    assert "\n" not in str(caught.value)
+    assert {path.name for path in (tmp_path / "failure").iterdir()} == {"state.safetensors", "batch.safetensors"}
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_dead_thread_ends_the_run_and_leaves_a_checkpoint(tmp_path, broker):
+    create_run(tmp_path, CONFIG)
+
+    def die() -> None:
+        time.sleep(0.2)
+        raise ZeroDivisionError("for a test")
+
+    thread = threading.Thread(target=die, name="ingest")
+    with pytest.raises(CongraspError, match="'ingest' died of ZeroDivisionError: for a test"):
+        learn(tmp_path, broker, on_event=lambda level, text: None, recorder=_started(thread))
+    thread.join(5.0)
+    assert (tmp_path / "checkpoints" / "latest").exists()
+
+
+@contextlib.contextmanager
+def _started(thread: threading.Thread):
+    thread.start()
+    yield
+
+
+@pytest.mark.timeout(120)
+def test_training_goes_on_from_a_given_policy(tmp_path, broker):
+    create_run(tmp_path / "one", CONFIG)
+    create_run(tmp_path / "two", CONFIG)
+    stopped = threading.Event()
+    stopped.set()
+    given = learn(tmp_path / "one", broker, dataclasses.replace(CONFIG, seed=7), stopped)
+    begun = learn(tmp_path / "two", broker, CONFIG, stopped, initial=given)
+    assert begun.version == 0 and begun.epoch != given.epoch
+    jax.tree.map(np.testing.assert_array_equal, begun.params, given.params)
+    other = dataclasses.replace(given, spec=dataclasses.replace(given.spec, hand="claw"))
+    create_run(tmp_path / "three", CONFIG)
+    with pytest.raises(CongraspError, match=r"'claw'.*'human'"):
+        learn(tmp_path / "three", broker, CONFIG, stopped, initial=other)
+
+
+def test_directories_that_are_no_runs_or_runs_already(tmp_path, broker):
+    with pytest.raises(CongraspError, match="not a run directory"):
+        learn(tmp_path, broker)
+    create_run(tmp_path, CONFIG)
+    with pytest.raises(CongraspError, match="holds a run already"):
+        create_run(tmp_path, CONFIG)
+    with pytest.raises(CongraspError, match="no checkpoint"):
+        learn(tmp_path, broker, resume=True)
+
+
+def test_resuming_with_other_networks_is_refused(tmp_path, broker):
+    create_run(tmp_path, CONFIG)
+    stopped = threading.Event()
+    stopped.set()
+    learn(tmp_path, broker, CONFIG, stopped)
+    with pytest.raises(CongraspError, match="does not fit this run: 'params/actor"):
+        learn(tmp_path, broker, dataclasses.replace(CONFIG, network=NetworkConfig(hidden=(9,), encoder=2)), resume=True)
