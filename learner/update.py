@@ -18,7 +18,7 @@ import numpy as np
 import optax
 
 from common.config import NetworkConfig, PPOConfig
-from common.errors import PhysicsError
+from common.errors import CongraspError, PhysicsError
 from common.policy import network, normalizer
 from common.policy.network import Layout, Params
 from common.policy.normalizer import Affine, Statistics
@@ -119,8 +119,14 @@ def update(
 
     Raises:
       NonFiniteUpdate: naming the first term that was not finite.
+      CongraspError: if there are more minibatches than transitions.
     """
     arrays = {name: batch[name] for name in FIELDS}
+    if arrays["reward"].size < ppo.minibatches:
+        raise CongraspError(
+            f"A batch of {arrays['reward'].size} transitions does not make {ppo.minibatches} minibatches.",
+            "Use fewer minibatches, more environments or longer rollouts.",
+        )
     seen = normalizer.moments(arrays["observation"], event_axes=1)
     frozen = state.observation if state.observation.count else normalizer.merge(seen)
     learnt, returns, failure, scalars = _optimise(
@@ -211,14 +217,15 @@ def _optimise(
     kl = jnp.mean(terms.kl[-1])
     metrics = {name: jnp.mean(term) for name, term in terms._asdict().items()}
     metrics |= {f"{name}_grad_norm": jnp.mean(norm) for name, norm in norms.items()}
+    log_weight = log_proximal - batch["log_probability"]
     metrics |= {
         "kl": kl,
         "learning_rate": learning_rate,
         "action_std": jnp.mean(jnp.exp(params["actor"]["log_std"])),
         "importance_mean": jnp.mean(weight),
         "importance_max": jnp.max(weight),
-        "importance_truncated": jnp.mean((weight >= hyper["importance_max"]).astype(jnp.float32)),
-        "behaviour_kl": jnp.mean(batch["log_probability"] - log_proximal),
+        "importance_truncated": jnp.mean((log_weight > jnp.log(hyper["importance_max"])).astype(jnp.float32)),
+        "behaviour_kl": -jnp.mean(log_weight),
         "explained_variance": 1.0 - jnp.var(returns - value) / (jnp.var(returns) + 1e-8),
         "reward_mean": jnp.mean(batch["reward"]),
         "return_mean": jnp.mean(returns),

@@ -13,7 +13,9 @@ RADIUS, HEIGHT, CONTROL_DT = 0.03, 0.12, 0.01
 FORCE = 1.5  # N on each fingertip while it touches
 
 
-def episode(steps: int = 12, *, removal: int = 8, mask: tuple[int, ...] = (1, 1, 1, 1), success: bool = True) -> Message:
+def episode(
+    steps: int = 12, *, removal: int = 8, mask: tuple[int, ...] = (1, 1, 1, 1), success: bool = True
+) -> Message:
     """`steps` control steps; the table goes at `removal`, the tips touch from two thirds of that on."""
     hand = get_hand("human")
     frame = grasp_frame(hand)

@@ -65,6 +65,10 @@ class MjxPhysics:
         self._host_model = pool.model
         self._body_of_geom = np.array(pool.model.geom_bodyid)
         self._model = mjx.put_model(pool.model, impl=implementation)
+        if implementation == "warp":
+            # Warp's kernels print every overflow and iteration limit; thousands of worlds would flood the log.
+            quiet = self._model.opt._impl.replace(warn_overflow=0)
+            self._model = self._model.replace(opt=self._model.opt.replace(_impl=quiet))
         self._object_leaves = {
             name: jnp.asarray(value, jnp.float32).reshape(len(objects), *getattr(self._model, name).shape)
             for name, value in pool.leaves.items()

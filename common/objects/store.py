@@ -1,19 +1,17 @@
 """Objects on disk: one safetensors file each, and folders of them."""
 
 import hashlib
-import json
 import os
 import pathlib
 import re
-import tempfile
 from typing import Any
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 
 from common.errors import CongraspError
+from common.files import write_atomically
 from common.objects.spec import GraspObject, Piece
+from common.wire.codec import Message, decode, encode
 
 SUFFIX = ".safetensors"
 _FORMAT = 1
@@ -24,7 +22,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 def digest(obj: GraspObject) -> str:
     """Sixteen hex digits that identify the object's content."""
-    return _digest(*_pack(obj))
+    return hashlib.sha256(encode(_to_message(obj))).hexdigest()[:16]
 
 
 def save(obj: GraspObject, path: str | os.PathLike[str]) -> None:
@@ -34,28 +32,15 @@ def save(obj: GraspObject, path: str | os.PathLike[str]) -> None:
       CongraspError: the file cannot be written.
     """
     path = pathlib.Path(path)
-    arrays, meta = _pack(obj)
-    meta["digest"] = _digest(arrays, meta)
-    data = safetensors.numpy.save(arrays, metadata={"congrasp_object": json.dumps(meta, sort_keys=True)})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            temporary = pathlib.Path(file.name)
-            try:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            except OSError:
-                temporary.unlink()
-                raise
-        temporary.chmod(0o644)
-        temporary.replace(path)
     except OSError as error:
-        raise CongraspError(f"The object cannot be written to {path}: {error.strerror}.") from None
+        raise CongraspError(f"The folder {path.parent} cannot be made: {error.strerror}.") from None
+    write_atomically(path, encode(_to_message(obj)))
 
 
 def load(path: str | os.PathLike[str]) -> GraspObject:
-    """Reads an object.
+    """Reads an object. Its arrays are read-only.
 
     Raises:
       CongraspError: no such file, another kind of file, or damaged content.
@@ -65,19 +50,12 @@ def load(path: str | os.PathLike[str]) -> GraspObject:
     if not path.is_file():
         raise CongraspError(f"There is no object file {path}.", "'congrasp objects list' shows what a folder holds.")
     try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            text = (file.metadata() or {}).get("congrasp_object")
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        meta = json.loads(text) if text else {}
-    except (safetensors.SafetensorError, OSError, ValueError) as error:
-        raise CongraspError(f"{path} cannot be read as an object: {error}.", remedy) from None
-    if meta.get("format") != _FORMAT:
-        found = "is not an object of congrasp" if not meta else f"has format {meta.get('format')}, not {_FORMAT}"
-        raise CongraspError(f"{path} {found}.", remedy)
-    stored = meta.pop("digest", "")
-    if stored != _digest(arrays, meta):
-        raise CongraspError(f"{path} is damaged: its content does not match its digest.", remedy)
-    return _unpack(arrays, meta)
+        message = decode(path.read_bytes())
+    except (CongraspError, OSError) as error:
+        raise CongraspError(f"{path} cannot be read as an object: {error}", remedy) from None
+    if message.meta.get("kind") != "object" or message.meta.get("format") != _FORMAT:
+        raise CongraspError(f"{path} is not an object of this version of congrasp.", remedy)
+    return _from_message(message)
 
 
 class Catalogue:
@@ -125,8 +103,8 @@ class Catalogue:
         return self.folder / f"{name}{SUFFIX}"
 
 
-def _pack(obj: GraspObject) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    arrays = {name: np.ascontiguousarray(getattr(obj, name)) for name in _ARRAYS}
+def _to_message(obj: GraspObject) -> Message:
+    arrays = {name: np.asarray(getattr(obj, name)) for name in _ARRAYS}
     pieces = obj.pieces
     meshes = [np.zeros((0, 3)) if piece.vertices is None else piece.vertices for piece in pieces]
     arrays["piece_kind"] = np.array([_KINDS.index(piece.kind) for piece in pieces], np.int32)
@@ -135,7 +113,8 @@ def _pack(obj: GraspObject) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         arrays[f"piece_{name}"] = np.array([getattr(piece, name) for piece in pieces], np.float64)
     arrays["piece_vertex_count"] = np.array([len(vertices) for vertices in meshes], np.int32)
     arrays["piece_vertices"] = np.concatenate(meshes).astype(np.float64)
-    meta = {
+    meta: dict[str, Any] = {
+        "kind": "object",
         "format": _FORMAT,
         "name": obj.name,
         "family": obj.family,
@@ -143,10 +122,11 @@ def _pack(obj: GraspObject) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         "mass": float(obj.mass),
         "units": "m, kg, kg.m^2; quaternions (w, x, y, z); object frame with its origin at the centre of mass",
     }
-    return arrays, meta
+    return Message(arrays, meta)
 
 
-def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> GraspObject:
+def _from_message(message: Message) -> GraspObject:
+    arrays, meta = message.arrays, message.meta
     ends = np.cumsum(arrays["piece_vertex_count"])
     vertices = np.split(arrays["piece_vertices"], ends[:-1])
     pieces = tuple(
@@ -168,11 +148,3 @@ def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> GraspObject:
         mass=meta["mass"],
         **{name: arrays[name] for name in _ARRAYS},
     )
-
-
-def _digest(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> str:
-    content = hashlib.sha256(json.dumps(meta, sort_keys=True).encode())
-    for name in sorted(arrays):
-        content.update(f"{name} {arrays[name].dtype} {arrays[name].shape} ".encode())
-        content.update(arrays[name].tobytes())
-    return content.hexdigest()[:16]

@@ -1,96 +1,205 @@
-"""The transport within one process: messages are passed by reference, so that arrays stay on the device."""
+"""Messages within one process: the same behaviour as over the wire, and nothing is copied.
 
+Arrays may stay on a device. All endpoints of a `MemoryHub` see each other.
+"""
+
+import contextlib
+import logging
+import queue
 import threading
+import time
 from collections.abc import Callable
-
-import zenoh
+from concurrent.futures import Future
+from typing import NamedTuple, Self
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Handler, Subscription
+from common.transport.base import Damage, Handler, RefusedError, Subscription
+from common.transport.keys import matches
 from common.wire.codec import Message
 
+_log = logging.getLogger(__name__)
 
-class MemoryBroker:
-    """Where the endpoints of one process meet."""
+
+class _Question(NamedTuple):
+    key: str
+    request: Message
+    answer: "Future[Message]"
+
+
+class _Server(NamedTuple):
+    key: str
+    questions: "queue.Queue[_Question | None]"
+    workers: int
+    ended: threading.Event
+
+
+class _Watcher(NamedTuple):
+    expression: str
+    changes: "queue.Queue[tuple[str, bool] | None]"
+
+
+class MemoryHub:
+    """What the endpoints of one process share."""
 
     def __init__(self) -> None:
-        """Nobody is here yet."""
-        self.lock = threading.RLock()
-        self.handlers: dict[str, tuple[object, Handler]] = {}
-        self.subscriptions: list[tuple[object, zenoh.KeyExpr, Subscription]] = []
-        self.alive: dict[str, object] = {}
-        self.watchers: list[tuple[object, zenoh.KeyExpr, Callable[[str, bool], None]]] = []
+        self.lock = threading.Lock()
+        self.servers: list[_Server] = []
+        self.subscriptions: list[tuple[str, Subscription]] = []
+        self.tokens: list[str] = []
+        self.watchers: list[_Watcher] = []
 
-    def change(self, key: str, alive: bool) -> None:
-        """Tells the watchers."""
-        for _, expression, on_change in list(self.watchers):
-            if expression.includes(zenoh.KeyExpr(key)):
-                on_change(key, alive)
+    def notify(self, key: str, alive: bool) -> None:
+        """Tells the watchers; the caller holds the lock."""
+        for watcher in self.watchers:
+            if matches(watcher.expression, key):
+                watcher.changes.put((key, alive))
 
 
 class MemoryTransport:
-    """An endpoint of a `MemoryBroker`; handlers run in the asker's thread."""
+    """A `Transport` between the endpoints of a hub."""
 
-    def __init__(self, broker: MemoryBroker):
-        """Joins the broker."""
-        self._broker = broker
+    def __init__(self, hub: MemoryHub):
+        """Makes an endpoint."""
+        self._hub = hub
+        self._servers: list[_Server] = []
+        self._subscriptions: list[Subscription] = []
+        self._tokens: list[str] = []
+        self._watchers: list[_Watcher] = []
+        self._closed = False
 
-    def serve(self, key: str, handler: Handler, *, workers: int = 1, depth: int = 4) -> None:
-        """See `Transport.serve`."""
-        self._broker.handlers[key] = (self, handler)
+    def serve(
+        self, key: str, handler: Handler, *, workers: int = 1, depth: int = 4, on_damage: Damage | None = None
+    ) -> None:
+        """See `Transport.serve`; nothing is ever damaged here."""
+        self._check_open()
+        server = _Server(key, queue.Queue(depth), workers, threading.Event())
+        with self._hub.lock:
+            self._hub.servers.append(server)
+        self._servers.append(server)
+        for _ in range(workers):
+            threading.Thread(target=_serve, args=(server, handler), daemon=True, name=f"memory-{key}").start()
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
-        found = self._broker.handlers.get(key)
-        if found is None:
-            raise TransportError(f"Nobody answers on '{key}'.")
+        self._check_open()
+        deadline = time.monotonic() + timeout
+        with self._hub.lock:
+            server = next((server for server in self._hub.servers if matches(server.key, key)), None)
+        if server is None:
+            raise TransportError(f"Nobody answers {key}.", "The process that serves it may have ended.")
+        question = _Question(key, request, Future())
         try:
-            return found[1](key, request)
-        except CongraspError as error:
-            raise TransportError(str(error)) from None
+            server.questions.put(question, timeout=timeout)
+            if server.ended.is_set():
+                _refuse_waiting(server)
+            return question.answer.result(max(0.0, deadline - time.monotonic()))
+        except (queue.Full, TimeoutError):
+            raise TransportError(f"No answer for {key} within {timeout:g} s.") from None
 
     def publish(self, key: str, message: Message) -> None:
         """See `Transport.publish`."""
-        for _, expression, subscription in list(self._broker.subscriptions):
-            if expression.includes(zenoh.KeyExpr(key)):
-                subscription.deliver(key, message)
+        with self._hub.lock:
+            subscriptions = [ring for expression, ring in self._hub.subscriptions if matches(expression, key)]
+        for ring in subscriptions:
+            ring.push(key, lambda: message)
 
-    def subscribe(self, key_expression: str, *, depth: int = 64) -> Subscription:
+    def subscribe(self, key_expression: str, *, depth: int) -> Subscription:
         """See `Transport.subscribe`."""
-        subscription = Subscription(depth)
-        self._broker.subscriptions.append((self, zenoh.KeyExpr(key_expression), subscription))
+        self._check_open()
+
+        def remove() -> None:
+            with self._hub.lock, contextlib.suppress(ValueError):
+                self._hub.subscriptions.remove((key_expression, subscription))
+
+        subscription = Subscription(depth, remove)
+        with self._hub.lock:
+            self._hub.subscriptions.append((key_expression, subscription))
+        self._subscriptions.append(subscription)
         return subscription
 
     def declare_alive(self, key: str) -> None:
         """See `Transport.declare_alive`."""
-        self._broker.alive[key] = self
-        self._broker.change(key, True)
+        self._check_open()
+        with self._hub.lock:
+            self._hub.tokens.append(key)
+            self._hub.notify(key, True)
+        self._tokens.append(key)
 
     def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
         """See `Transport.watch_alive`."""
-        expression = zenoh.KeyExpr(key_expression)
-        self._broker.watchers.append((self, expression, on_change))
-        for key in list(self._broker.alive):
-            if expression.includes(zenoh.KeyExpr(key)):
-                on_change(key, True)
+        self._check_open()
+        watcher = _Watcher(key_expression, queue.Queue())
+        with self._hub.lock:
+            self._hub.watchers.append(watcher)
+            for key in self._hub.tokens:
+                if matches(key_expression, key):
+                    watcher.changes.put((key, True))
+        self._watchers.append(watcher)
+        threading.Thread(target=_watch, args=(watcher, on_change), daemon=True, name="memory-alive").start()
 
     def close(self) -> None:
-        """Leaves the broker; see `Transport.close`."""
-        broker = self._broker
-        with broker.lock:
-            broker.handlers = {k: v for k, v in broker.handlers.items() if v[0] is not self}
-            broker.subscriptions = [s for s in broker.subscriptions if s[0] is not self]
-            broker.watchers = [w for w in broker.watchers if w[0] is not self]
-            mine = [key for key, owner in broker.alive.items() if owner is self]
-            for key in mine:
-                del broker.alive[key]
-        for key in mine:
-            broker.change(key, False)
+        """See `Transport.close`."""
+        if self._closed:
+            return
+        self._closed = True
+        with self._hub.lock:
+            for server in self._servers:
+                self._hub.servers.remove(server)
+            for watcher in self._watchers:
+                self._hub.watchers.remove(watcher)
+            for key in self._tokens:
+                self._hub.tokens.remove(key)
+                self._hub.notify(key, False)
+        for watcher in self._watchers:
+            watcher.changes.put(None)
+        for server in self._servers:
+            server.ended.set()
+            _refuse_waiting(server)
+        for subscription in self._subscriptions:
+            subscription.close()
 
-    def __enter__(self) -> "MemoryTransport":
-        """The endpoint itself."""
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        """Closes."""
+    def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise TransportError("The transport is closed.")
+
+
+def _refuse_waiting(server: _Server) -> None:
+    """Answers what waits at a server that ended, and wakes its workers."""
+    while True:
+        try:
+            question = server.questions.get_nowait()
+        except queue.Empty:
+            break
+        if question is not None:
+            question.answer.set_exception(TransportError(f"Nobody answers {question.key} any more."))
+    for _ in range(server.workers):
+        with contextlib.suppress(queue.Full):
+            server.questions.put_nowait(None)
+
+
+def _serve(server: _Server, handler: Handler) -> None:
+    while not server.ended.is_set():
+        question = server.questions.get()
+        if question is None:
+            continue
+        try:
+            question.answer.set_result(handler(question.key, question.request))
+        except CongraspError as error:
+            question.answer.set_exception(RefusedError(str(error)))
+        except Exception as error:
+            _log.exception("The answer to %s failed.", question.key)
+            question.answer.set_exception(RefusedError(f"The peer failed on {question.key}: {type(error).__name__}."))
+
+
+def _watch(watcher: _Watcher, on_change: Callable[[str, bool], None]) -> None:
+    while (change := watcher.changes.get()) is not None:
+        try:
+            on_change(*change)
+        except Exception:
+            _log.exception("Could not take notice of %s.", change[0])

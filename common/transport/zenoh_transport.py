@@ -1,230 +1,321 @@
-"""The transport over Zenoh: one session for bulk messages and one for everything else.
+"""Messages over Zenoh.
 
-Large rollouts on a shared link would hold up small queries behind them (head-of-line blocking), so bulk keys have a
-session and a port of their own: the port after the one that the user names. Publications use DROP; whatever must not
-be lost is a query, because a Zenoh `put` never says that it failed.
+One process listens (the learner or a policy server), the others connect to it, and it forwards between them. Each flow
+has a session, so a TCP connection, of its own: on one shared link a rollout of some megabytes would delay a ticket, and
+a recorder that reads slowly would delay both. Flow number i uses the port i above the one that was given.
+
+Everything is received through channels that own daemon threads drain; a callback would keep the process from ending.
 """
 
+import contextlib
+import functools
 import json
+import logging
 import re
+import secrets
+import struct
 import threading
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+import weakref
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Self
 
 import zenoh
-from zenoh.handlers import FifoChannel, RingChannel
+from zenoh.handlers import FifoChannel
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Handler, Subscription
-from common.transport.keys import BULK, relative
+from common.transport.base import Damage, Handler, RefusedError, Subscription
+from common.transport.keys import FLOWS, Flow, flow
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-"""Loopback only: without certificates nobody outside this machine is let in."""
-_LEASE_MS = {"control": 3000, "bulk": 10000}
-
-
-def _next_port(endpoint: str) -> str:
-    match = re.fullmatch(r"(\w+/.*:)(\d+)", endpoint)
-    if not match or not 0 < int(match[2]) < 65535:
-        raise CongraspError(f"'{endpoint}' is not an endpoint.", "Write it as tcp/HOST:PORT, for example tcp/10.0.0.5:7447.")
-    return f"{match[1]}{int(match[2]) + 1}"
-
-
-def _config(flow: str, listen: list[str], connect: list[str], extra: Mapping[str, Any]) -> zenoh.Config:
-    config = zenoh.Config()
-    settings: dict[str, Any] = {
-        "mode": "peer" if listen else "client",
-        "listen/endpoints": listen,
-        "connect/endpoints": connect,
-        "connect/timeout_ms": 1000,
-        "connect/exit_on_failure": True,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/shared_memory/enabled": False,
-        "transport/link/tx/lease": _LEASE_MS[flow],
-        "transport/link/rx/max_message_size": MAX_MESSAGE,
-        **extra,
-    }
-    for name, value in settings.items():
-        config.insert_json5(name, json.dumps(value))
-    return config
+"""Where the learner listens unless told otherwise: on this machine only."""
+_ENDPOINT = re.compile(r"(?P<address>[a-z]+/[^/]+):(?P<port>\d{1,5})(?P<rest>[?#].*)?")
+_LEASE_MS: dict[Flow, int] = {"control": 3000, "bulk": 10000, "log": 10000, "policy": 3000}
+_BLOCK_US: dict[Flow, int] = {"control": 2_000_000, "bulk": 5_000_000, "log": 1_000_000, "policy": 2_000_000}
+_OVERHEAD = 64 << 10  # bytes that Zenoh may add to a message
+_ATTEMPT = 1.0  # seconds of one attempt to connect; signals are seen between two
+_CLOSE = 0.5  # seconds that closing may take
+_QUEUE = 256  # samples that wait for a thread that only moves them on
+_STAMP = struct.Struct("<8sQ")  # sender and count, by which a listener sees gaps
+_log = logging.getLogger(__name__)
 
 
 class ZenohTransport:
-    """An endpoint on the network; see `common.transport.base.Transport`."""
+    """A `Transport` over Zenoh sessions."""
 
     def __init__(
         self,
         *,
-        listen: str | None = None,
-        connect: str | None = None,
-        patience: float = 10.0,
-        bulk: bool = True,
+        connect: Sequence[str] = (),
+        listen: Sequence[str] = (),
+        flows: Sequence[Flow] = FLOWS,
+        max_message: int = MAX_MESSAGE,
+        wait: float = 10.0,
         extra: Mapping[str, Any] | None = None,
     ):
-        """Listens or connects.
+        """Opens the sessions.
 
         Args:
-          listen: endpoint to listen on, such as tcp/127.0.0.1:7447 (bulk messages use the next port).
-          connect: endpoint to connect to; exactly one of the two is given.
-          patience: seconds to wait for the other side to appear.
-          bulk: whether this endpoint carries bulk messages at all.
-          extra: further Zenoh settings by their configuration key (certificates, access control).
+          connect: endpoints to connect to, such as `tcp/192.168.0.5:7447`; the first that answers is taken, and found
+            again whenever it comes back.
+          listen: endpoints to listen on, instead.
+          flows: which flows to open; flow i uses the port i above the endpoint's, so both ends must start alike.
+          max_message: bytes of the longest message.
+          wait: seconds to wait for somebody to listen at `connect`.
+          extra: Zenoh configuration keys and their JSON values, set last (TLS, access control).
 
         Raises:
-          CongraspError: the port is busy, or the endpoint is malformed.
-          TransportError: nobody listens at `connect` within `patience`.
+          CongraspError: an endpoint or key is malformed, or a port is in use.
+          TransportError: nobody answers.
         """
-        endpoint = listen or connect
-        if endpoint is None or (listen and connect):
-            raise CongraspError("An endpoint needs either 'listen' or 'connect'.")
-        self._closed = threading.Event()
-        self._kept: list[Any] = []
-        self._threads: list[threading.Thread] = []
-        self._sessions: dict[str, zenoh.Session] = {}
-        flows = {"control": endpoint} | ({"bulk": _next_port(endpoint)} if bulk else {})
+        if bool(connect) == bool(listen):
+            raise CongraspError("A transport needs endpoints either to connect to or to listen on.")
+        self._max_message = max_message
+        self._sender = secrets.token_bytes(8)
+        self._counts: dict[str, int] = {}
+        self._counts_lock = threading.Lock()
+        self._declared: list[Any] = []
+        self._sessions: dict[Flow, zenoh.Session] = {}
+        self._finalizer = weakref.finalize(self, _close, self._sessions)
+        deadline = time.monotonic() + wait
         try:
-            for flow, where in flows.items():
-                self._sessions[flow] = self._open(flow, where, bool(listen), patience, extra or {})
+            for index, name in enumerate(flows):
+                endpoints = [_shifted(endpoint, index) for endpoint in (connect or listen)]
+                config = _config(name, endpoints, bool(listen), max_message, extra or {})
+                self._sessions[name] = _listen(config, endpoints) if listen else _connect(config, endpoints, deadline)
         except BaseException:
             self.close()
             raise
 
-    def _open(
-        self, flow: str, endpoint: str, listen: bool, patience: float, extra: Mapping[str, Any]
-    ) -> zenoh.Session:
-        deadline = time.monotonic() + patience
-        while True:
-            try:
-                ends = ([endpoint], []) if listen else ([], [endpoint])
-                return zenoh.open(_config(flow, *ends, extra))
-            except zenoh.ZError as error:
-                if listen:
-                    raise CongraspError(
-                        f"Cannot listen on {endpoint}: the port is busy or not this machine's.",
-                        "Choose another with --listen, or stop what uses it.",
-                    ) from error
-                if time.monotonic() > deadline:
-                    raise TransportError(
-                        f"Nobody listens at {endpoint} (waited {patience:.0f} s).",
-                        "Start the learner there, or correct --connect.",
-                    ) from error
-                time.sleep(0.1)
-
-    def _session(self, key: str) -> zenoh.Session:
-        flow = "bulk" if "bulk" in self._sessions and relative(key) in BULK else "control"
-        return self._sessions[flow]
-
-    def serve(self, key: str, handler: Handler, *, workers: int = 1, depth: int = 4) -> None:
+    def serve(
+        self, key: str, handler: Handler, *, workers: int = 1, depth: int = 4, on_damage: Damage | None = None
+    ) -> None:
         """See `Transport.serve`."""
         queryable = self._session(key).declare_queryable(key, FifoChannel(depth))
-        self._kept.append(queryable)
+        self._declared.append(queryable)
         for _ in range(workers):
-            self._thread(lambda: self._answer(queryable, handler), f"serve {key}")
-
-    def _answer(self, queryable: Any, handler: Handler) -> None:
-        while not self._closed.is_set():
-            try:
-                query = queryable.recv()
-            except zenoh.ZError:
-                return
-            with query:
-                try:
-                    request = decode(query.payload.to_bytes()) if query.payload is not None else Message({}, {})
-                    query.reply(str(query.key_expr), encode(handler(str(query.key_expr), request)))
-                except CongraspError as error:
-                    self._reply_error(query, str(error))
-                except zenoh.ZError:
-                    continue  # the asker has gone
-
-    @staticmethod
-    def _reply_error(query: Any, text: str) -> None:
-        try:
-            query.reply_err(text)
-        except zenoh.ZError:
-            return
+            _start(_serve, queryable.handler, handler, on_damage or (lambda *_: None), self._max_message)
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
+        payload = self._encode(request)
+        refusal = None
         try:
-            replies = list(self._session(key).get(key, payload=encode(request), timeout=timeout))
+            replies = self._session(key).get(
+                key, FifoChannel(4), payload=payload, timeout=timeout, congestion_control=zenoh.CongestionControl.BLOCK
+            )
+            for reply in replies:
+                if reply.ok:
+                    return decode(reply.ok.payload.to_bytes(), max_bytes=self._max_message)
+                if reply.err:
+                    refusal = reply.err.payload.to_bytes()
         except zenoh.ZError as error:
-            raise TransportError(f"The query on '{key}' could not be sent ({error}).") from None
-        for reply in replies:
-            if reply.ok is not None:
-                return decode(reply.ok.payload.to_bytes())
-        if replies:
-            text = replies[0].err.payload.to_string()
-            raise TransportError(f"No answer on '{key}' within {timeout:g} s." if text == "Timeout" else text)
-        raise TransportError(f"Nobody answers on '{key}'.")
+            raise TransportError(f"The query for {key} failed: {_first_line(error)}.") from None
+        if refusal == b"Timeout":
+            raise TransportError(f"No answer for {key} within {timeout:g} s.")
+        if refusal is not None:
+            raise RefusedError(refusal.decode(errors="replace"))
+        raise TransportError(f"Nobody answers {key}.", "The process that serves it may have ended.")
 
     def publish(self, key: str, message: Message) -> None:
         """See `Transport.publish`."""
-        if not self._closed.is_set():
-            self._session(key).put(key, encode(message), congestion_control=zenoh.CongestionControl.DROP)
+        payload = self._encode(message)
+        with self._counts_lock:
+            count = self._counts.get(key, 0)
+            self._counts[key] = count + 1
+        with contextlib.suppress(zenoh.ZError):
+            self._session(key).put(
+                key,
+                payload,
+                congestion_control=zenoh.CongestionControl.DROP,
+                express=flow(key) == "control",
+                attachment=_STAMP.pack(self._sender, count),
+            )
 
-    def subscribe(self, key_expression: str, *, depth: int = 64) -> Subscription:
+    def subscribe(self, key_expression: str, *, depth: int) -> Subscription:
         """See `Transport.subscribe`."""
-        subscription = Subscription(depth)
-        subscriber = self._sessions["control"].declare_subscriber(key_expression, RingChannel(depth))
-        self._kept.append(subscriber)
-        self._thread(lambda: self._collect(subscriber, subscription), f"subscribe {key_expression}")
-        return subscription
+        subscriber = self._session(key_expression).declare_subscriber(key_expression, FifoChannel(_QUEUE))
+        self._declared.append(subscriber)
 
-    def _collect(self, subscriber: Any, subscription: Subscription) -> None:
-        while not self._closed.is_set():
-            try:
-                sample = subscriber.recv()
-            except zenoh.ZError:
-                return
-            try:
-                subscription.deliver(str(sample.key_expr), decode(sample.payload.to_bytes()))
-            except CongraspError:
-                subscription.dropped += 1
+        def undeclare() -> None:
+            with contextlib.suppress(zenoh.ZError):
+                subscriber.undeclare()
+
+        subscription = Subscription(depth, undeclare)
+        _start(_listen_to, subscriber.handler, subscription, self._max_message)
+        return subscription
 
     def declare_alive(self, key: str) -> None:
         """See `Transport.declare_alive`."""
-        self._kept.append(self._sessions["control"].liveliness().declare_token(key))
+        self._declared.append(self._session(key).liveliness().declare_token(key))
 
     def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
         """See `Transport.watch_alive`."""
-        subscriber = (
-            self._sessions["control"]
-            .liveliness()
-            .declare_subscriber(key_expression, FifoChannel(256), history=True)
-        )
-        self._kept.append(subscriber)
-
-        def watch() -> None:
-            while not self._closed.is_set():
-                try:
-                    sample = subscriber.recv()
-                except zenoh.ZError:
-                    return
-                on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
-
-        self._thread(watch, f"alive {key_expression}")
-
-    def _thread(self, target: Callable[[], None], name: str) -> None:
-        thread = threading.Thread(target=target, name=name, daemon=True)
-        thread.start()
-        self._threads.append(thread)
+        liveliness = self._session(key_expression).liveliness()
+        subscriber = liveliness.declare_subscriber(key_expression, FifoChannel(_QUEUE), history=True)
+        self._declared.append(subscriber)
+        _start(_watch, subscriber.handler, on_change)
 
     def close(self) -> None:
-        """See `Transport.close`."""
-        if self._closed.is_set():
-            return
-        self._closed.set()
-        for session in self._sessions.values():
-            session.close()
+        """See `Transport.close`; takes half a second at most."""
+        self._finalizer()
 
-    def __enter__(self) -> "ZenohTransport":
-        """The endpoint itself."""
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        """Closes."""
+    def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def _session(self, key: str) -> zenoh.Session:
+        name = flow(key)
+        if name not in self._sessions:
+            state = "has no flow for" if self._finalizer.alive else "is closed, which ends"
+            raise TransportError(f"The transport {state} {key}.")
+        return self._sessions[name]
+
+    def _encode(self, message: Message) -> bytes:
+        payload = encode(message)
+        if len(payload) > self._max_message:
+            raise CongraspError(
+                f"A message of {len(payload)} bytes is longer than the {self._max_message} that are allowed.",
+                "Send fewer environments or steps in one rollout.",
+            )
+        return payload
+
+
+def _shifted(endpoint: str, offset: int) -> str:
+    match = _ENDPOINT.fullmatch(endpoint)
+    if not match or not 0 < int(match["port"]) + offset < 1 << 16:
+        raise CongraspError(f"'{endpoint}' is not an endpoint.", f"Write it like {DEFAULT_ENDPOINT}.")
+    return f"{match['address']}:{int(match['port']) + offset}{match['rest'] or ''}"
+
+
+def _config(
+    name: Flow, endpoints: list[str], listens: bool, max_message: int, extra: Mapping[str, Any]
+) -> zenoh.Config:
+    settings = {
+        "mode": "peer" if listens else "client",
+        "listen/endpoints": endpoints if listens else [],
+        "connect/endpoints": [] if listens else endpoints,
+        "connect/timeout_ms": int(1000 * _ATTEMPT),
+        "connect/exit_on_failure": True,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,  # leaks in the receiver (zenoh #2787)
+        "transport/link/tx/lease": _LEASE_MS[name],
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": _BLOCK_US[name],
+        "transport/link/rx/max_message_size": max_message + _OVERHEAD,
+        **extra,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise CongraspError(f"Zenoh does not take the setting {key}: {_first_line(error)}.") from None
+    return config
+
+
+def _listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        where = ", ".join(endpoints)
+        if "os error 98" in str(error) or "in use" in str(error):
+            raise CongraspError(
+                f"The port of {where} is in use.",
+                f"Stop what listens there, or choose another ({', '.join(FLOWS)} take one port each, from that one on).",
+            ) from None
+        raise CongraspError(f"Cannot listen on {where}: {_first_line(error)}.") from None
+
+
+def _connect(config: zenoh.Config, endpoints: list[str], deadline: float) -> zenoh.Session:
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            if time.monotonic() >= deadline:
+                where = ", ".join(endpoints)
+                remedy = "Start the learner or the server there, or correct the address."
+                if "Unable to connect" in str(error):
+                    raise TransportError(f"Nobody answers at {where}.", remedy) from None
+                raise TransportError(f"Cannot connect to {where}: {_first_line(error)}.", remedy) from None
+
+
+def _first_line(error: Exception) -> str:
+    """Zenoh's words without the places in its source."""
+    return re.split(r" at /|\n", str(error))[0][:200].rstrip(". ")
+
+
+def _close(sessions: dict[Flow, zenoh.Session]) -> None:
+    threads = []
+    for session in sessions.values():
+        try:
+            threads.append(_start(session.close))
+        except RuntimeError:  # the interpreter is ending and starts no threads
+            session.close()
+    sessions.clear()
+    deadline = time.monotonic() + _CLOSE
+    for thread in threads:
+        thread.join(max(0.0, deadline - time.monotonic()))
+
+
+def _start(function: Callable[..., None], *arguments: Any) -> threading.Thread:
+    thread = threading.Thread(target=function, args=arguments, daemon=True, name=f"zenoh-{function.__name__}")
+    thread.start()
+    return thread
+
+
+def _received(channel: Any) -> Iterable[Any]:
+    """What comes out of a channel until it is closed."""
+    with contextlib.suppress(zenoh.ZError):
+        while True:
+            yield channel.recv()
+
+
+def _serve(queries: Any, handler: Handler, on_damage: Damage, max_message: int) -> None:
+    for query in _received(queries):
+        with contextlib.suppress(zenoh.ZError), query:
+            key = str(query.key_expr)
+            try:
+                request = decode(query.payload.to_bytes() if query.payload else b"", max_bytes=max_message)
+            except CongraspError as error:
+                on_damage(key, error)
+                query.reply_err(str(error).encode())
+                continue
+            try:
+                query.reply(key, encode(handler(key, request)))
+            except CongraspError as error:
+                query.reply_err(str(error).encode(errors="replace"))
+            except zenoh.ZError:
+                raise
+            except Exception as error:
+                _log.exception("The answer to %s failed.", key)
+                query.reply_err(f"The peer failed on {key}: {type(error).__name__}.".encode())
+
+
+def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:
+    last: dict[str, tuple[bytes, int]] = {}
+    for sample in _received(samples):
+        key, lost = str(sample.key_expr), 0
+        stamp = sample.attachment.to_bytes() if sample.attachment else b""
+        if len(stamp) == _STAMP.size:
+            sender, count = _STAMP.unpack(stamp)
+            known_sender, known_count = last.get(key, (sender, count - 1))
+            lost = max(0, count - known_count - 1) if sender == known_sender else 0
+            last[key] = sender, count
+        subscription.push(key, functools.partial(_decoded, sample.payload, max_message), lost)
+
+
+def _decoded(payload: zenoh.ZBytes, max_message: int) -> Message:
+    return decode(payload.to_bytes(), max_bytes=max_message)
+
+
+def _watch(samples: Any, on_change: Callable[[str, bool], None]) -> None:
+    for sample in _received(samples):
+        try:
+            on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+        except Exception:
+            _log.exception("Could not take notice of %s.", sample.key_expr)

@@ -93,7 +93,9 @@ def _encode(message: Message) -> bytes:
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > MAX_HEADER:
-        raise CongraspError(f"A message's header has {len(text)} bytes.", f"At most {MAX_HEADER} fit: send less meta data.")
+        raise CongraspError(
+            f"A message's header has {len(text)} bytes.", f"At most {MAX_HEADER} fit: send less meta data."
+        )
     return b"".join([len(text).to_bytes(8, "little"), text, *parts])
 
 
@@ -171,9 +173,13 @@ def _arrays(header: dict[str, Any], section: memoryview) -> dict[str, np.ndarray
     arrays, position = {}, 0
     for name, dtype, shape, begin, end in entries:
         if begin != position:
-            raise CongraspError(f"The array {_short(name)} starts at byte {begin}, not at {position}: a gap or an overlap.")
+            raise CongraspError(
+                f"The array {_short(name)} starts at byte {begin}, not at {position}: a gap or an overlap."
+            )
         if end - begin != math.prod(shape) * dtype.itemsize:
-            raise CongraspError(f"The array {_short(name)} has {end - begin} bytes, which is not {dtype} times {shape}.")
+            raise CongraspError(
+                f"The array {_short(name)} has {end - begin} bytes, which is not {dtype} times {shape}."
+            )
         if end > len(section):
             raise CongraspError(f"The message is cut: the array {_short(name)} ends at {end} of {len(section)} bytes.")
         is_bool = dtype.kind == "b"
@@ -195,7 +201,9 @@ def _entry(name: str, entry: Any) -> tuple[np.dtype, tuple[int, ...], int, int]:
         raise CongraspError(f"The array {_short(name)} is not described by dtype, shape and data_offsets.")
     dtype, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
     if not isinstance(dtype, str) or dtype not in _DTYPES:
-        raise CongraspError(f"The array {_short(name)} has dtype {_short(dtype)}.", f"Messages hold {', '.join(_DTYPES)}.")
+        raise CongraspError(
+            f"The array {_short(name)} has dtype {_short(dtype)}.", f"Messages hold {', '.join(_DTYPES)}."
+        )
     if not _is_counts(shape) or len(shape) > _MAX_DIMENSIONS or math.prod(size or 1 for size in shape) >= _MAX_ITEMS:
         raise CongraspError(f"The array {_short(name)} has shape {_short(shape)}, which is none.")
     if not _is_counts(offsets) or len(offsets) != 2:

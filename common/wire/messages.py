@@ -142,7 +142,9 @@ def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int
     for name, kind in spec.meta.items():
         value = message.meta.get(name)
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise CongraspError(f"The {spec.kind}'s meta entry '{name}' is {ascii(value)[:60]}, not {_type_name(kind)}.")
+            raise CongraspError(
+                f"The {spec.kind}'s meta entry '{name}' is {ascii(value)[:60]}, not {_type_name(kind)}."
+            )
     for name, array_spec in spec.arrays.items():
         if not name.endswith("/*") and not array_spec.optional and name not in message.arrays:
             raise CongraspError(f"The {spec.kind} lacks the array '{name}'.")
@@ -175,9 +177,7 @@ def is_finite(array: np.ndarray) -> bool:
     if array.dtype != np.float16:
         return bool(np.isfinite(array).all())
     bits = array.reshape(-1).view(np.uint16)
-    return all(
-        (bits[start : start + _BLOCK] & 0x7FFF).max() < _INFINITE_HALF for start in range(0, len(bits), _BLOCK)
-    )
+    return all((bits[start : start + _BLOCK] & 0x7FFF).max() < _INFINITE_HALF for start in range(0, len(bits), _BLOCK))
 
 
 def _type_name(kind: type | tuple[type, ...]) -> str:

@@ -1,174 +1,395 @@
-"""Both transports keep the same promises."""
+"""Both transports behave alike; Zenoh's ends refuse what they should and always let their process end."""
 
+import random
+import signal
 import socket
+import subprocess
+import sys
+import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Transport
-from common.transport.keys import alive_key, key, relative
-from common.transport.memory import MemoryBroker, MemoryTransport
+from common.transport.base import RefusedError
+from common.transport.keys import FLOWS, Keys, check_name, flow, matches, parse_alive
+from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.zenoh_transport import ZenohTransport
-from common.wire.codec import Message
+from common.wire.codec import Message, encode
 
 pytestmark = pytest.mark.timeout(60)
-Pair = tuple[Transport, Callable[[], Transport]]
+KEYS = Keys("test")
 
 
-def free_port() -> int:
-    """A port whose successor is free as well."""
+def base_port(count=len(FLOWS)):
+    """The first of `count` free ports in a row."""
     while True:
-        with socket.socket() as first, socket.socket() as second:
-            first.bind(("127.0.0.1", 0))
-            port = first.getsockname()[1]
-            try:
-                second.bind(("127.0.0.1", port + 1))
-            except (OSError, OverflowError):
-                continue
-            return port
+        base = random.randrange(20000, 60000)
+        try:
+            for port in range(base, base + count):
+                with socket.socket() as probe:
+                    probe.bind(("127.0.0.1", port))
+            return base
+        except OSError:
+            continue
 
 
-@pytest.fixture(params=["memory", "zenoh"])
-def pair(request) -> Iterator[Pair]:
-    opened: list[Transport] = []
-
-    def keep(transport: Transport) -> Transport:
-        opened.append(transport)
-        return transport
-
-    if request.param == "memory":
-        broker = MemoryBroker()
-        server: Transport = keep(MemoryTransport(broker))
-        yield server, lambda: keep(MemoryTransport(broker))
-    else:
-        endpoint = f"tcp/127.0.0.1:{free_port()}"
-        server = keep(ZenohTransport(listen=endpoint))
-        yield server, lambda: keep(ZenohTransport(connect=endpoint))
-    for transport in reversed(opened):
-        transport.close()
-
-
-def _eventually(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
+def wait_for(condition, timeout=5.0):
+    deadline = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < deadline, "it did not happen in time"
         time.sleep(0.01)
 
 
-def test_queries_are_answered_on_both_flows(pair):
-    server, connect = pair
-    for name in ("config", "rollout"):
-        server.serve(key("r", name), lambda k, m: Message({"twice": m.arrays["x"] * 2}, {"key": relative(k)}))
-    client = connect()
-    for name in ("config", "rollout"):
-        reply = client.query(key("r", name), Message({"x": np.arange(3.0)}, {}), timeout=5.0)
-        np.testing.assert_array_equal(reply.arrays["twice"], [0.0, 2.0, 4.0])
-        assert reply.meta == {"key": name}
+@pytest.fixture(params=["memory", "zenoh"])
+def pair(request):
+    """Two endpoints that see each other; the first is the one that listens."""
+    if request.param == "memory":
+        hub = MemoryHub()
+        ends = MemoryTransport(hub), MemoryTransport(hub)
+    else:
+        endpoint = f"tcp/127.0.0.1:{base_port()}"
+        ends = ZenohTransport(listen=[endpoint]), ZenohTransport(connect=[endpoint])
+    yield ends
+    for end in ends:
+        end.close()
+        end.close()
 
 
-def test_a_refusal_arrives_in_words(pair):
-    server, connect = pair
-
-    def refuse(k: str, m: Message) -> Message:
-        raise CongraspError("The hand 'paw' is unknown.", "Choose human.")
-
-    server.serve(key("r", "config"), refuse)
-    with pytest.raises(TransportError, match="'paw' is unknown. Choose human"):
-        connect().query(key("r", "config"), Message({}, {}), timeout=5.0)
-
-
-def test_nobody_there_is_an_error_at_once(pair):
-    _, connect = pair
-    began = time.monotonic()
-    with pytest.raises(TransportError, match="Nobody answers"):
-        connect().query(key("r", "config"), Message({}, {}), timeout=30.0)
-    assert time.monotonic() - began < 10.0
+def test_flows_and_keys():
+    assert KEYS.rollout == "congrasp/test/rollout"
+    assert [flow(key) for key in (KEYS.config, KEYS.ticket, KEYS.status, KEYS.announcement)] == ["control"] * 4
+    assert flow(KEYS.everyone) == flow(KEYS.alive("actor", "a", "0f")) == "control"
+    assert flow(KEYS.rollout) == flow(KEYS.weights) == "bulk"
+    assert flow(KEYS.logs) == flow(KEYS.log("metrics", "actor", "a")) == "log"
+    assert flow(KEYS.act) == flow(KEYS.health) == "policy"
+    assert parse_alive(KEYS.alive("actor", "a", "0f")) == ("actor", "a", "0f")
+    assert parse_alive(KEYS.config) is None
+    with pytest.raises(CongraspError, match=r"'\*\*'"):
+        Keys("**")
+    with pytest.raises(CongraspError, match="actor"):
+        check_name("actor", "a/b")
 
 
-def test_subscriptions_keep_the_newest_and_count_what_they_drop(pair):
-    server, connect = pair
-    subscription = server.subscribe(key("r", "log/**"), depth=3)
-    client = connect()
-    for n in range(10):
-        client.publish(key("r", "log/metrics/actor/a"), Message({}, {"n": n}))
-        time.sleep(0.02)
-    client.publish(key("r", "other"), Message({}, {"n": -1}))
-    _eventually(lambda: subscription.dropped == 7)
-    got = [subscription.receive(1.0) for _ in range(3)]
-    assert [message.meta["n"] for _, message in got] == [7, 8, 9]
-    assert subscription.receive(0.05) is None
+@pytest.mark.parametrize(
+    ("expression", "key", "expected"),
+    [
+        ("a/b", "a/b", True),
+        ("a/b", "a/bc", False),
+        ("a/*", "a/b", True),
+        ("a/*", "a/b/c", False),
+        ("a/**", "a", True),
+        ("a/**", "a/b/c", True),
+        ("**/c", "a/b/c", True),
+        ("a/**/c", "a/c", True),
+        ("a/**/c", "a/b/d", False),
+        ("a.c", "abc", False),
+    ],
+)
+def test_expressions_match_as_zenoh_matches(expression, key, expected):
+    import zenoh
+
+    assert matches(expression, key) is expected
+    assert zenoh.KeyExpr(expression).includes(zenoh.KeyExpr(key)) is expected
 
 
-def test_life_and_death_are_seen(pair):
-    server, connect = pair
-    seen: list[tuple[str, bool]] = []
-    server.watch_alive(alive_key("r", "*", "*", "*"), lambda k, alive: seen.append((k, alive)))
-    client = connect()
-    token = alive_key("r", "actor", "a", "1")
-    client.declare_alive(token)
-    _eventually(lambda: (token, True) in seen)
-    client.close()
-    _eventually(lambda: (token, False) in seen)
+def test_query_is_answered_with_its_arrays(pair):
+    server, client = pair
+    server.serve(KEYS.act, lambda key, m: Message({"y": m.arrays["x"] * 2}, {"key": key, **m.meta}))
+    for index in range(20):
+        x = np.arange(index, dtype=np.float32)
+        reply = client.query(KEYS.act, Message({"x": x}, {"n": index}), timeout=5)
+        np.testing.assert_array_equal(reply.arrays["y"], 2 * x)
+        assert reply.meta == {"key": KEYS.act, "n": index}
 
 
-def test_closing_twice_is_fine_and_quick(pair):
-    server, connect = pair
-    client = connect()
-    began = time.monotonic()
-    client.close()
-    client.close()
-    assert time.monotonic() - began < 2.0
+def test_both_ends_can_serve(pair):
+    server, client = pair
+    client.serve(KEYS.act, lambda key, m: Message(meta={"from": "client"}))
+    wait_for(lambda: _answers(server, KEYS.act))
+    assert server.query(KEYS.act, Message(), timeout=5).meta == {"from": "client"}
 
 
-def test_a_busy_port_is_named():
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with ZenohTransport(listen=endpoint), pytest.raises(CongraspError, match="busy"):
-        ZenohTransport(listen=endpoint)
+def _answers(transport, key):
+    try:
+        return transport.query(key, Message(), timeout=1)
+    except TransportError:
+        return False
 
 
-def test_waiting_for_nobody_ends():
-    with pytest.raises(TransportError, match="Nobody listens"):
-        ZenohTransport(connect=f"tcp/127.0.0.1:{free_port()}", patience=0.5)
+def test_errors_travel_in_words(pair):
+    server, client = pair
+
+    def handler(key, message):
+        if message.meta["bug"]:
+            raise ValueError("secret")
+        raise CongraspError("The hand is unknown.", "Choose another.")
+
+    server.serve(KEYS.act, handler)
+    with pytest.raises(RefusedError, match=r"^The hand is unknown\. Choose another\.$"):
+        client.query(KEYS.act, Message(meta={"bug": False}), timeout=5)
+    with pytest.raises(RefusedError, match="ValueError") as caught:
+        client.query(KEYS.act, Message(meta={"bug": True}), timeout=5)
+    assert "secret" not in str(caught.value)
 
 
-@pytest.mark.parametrize("endpoint", ["127.0.0.1:7447", "tcp/host", "tcp/host:99999", "nonsense"])
-def test_malformed_endpoints_are_named(endpoint):
-    with pytest.raises(CongraspError, match="endpoint"):
-        ZenohTransport(connect=endpoint, patience=0.1)
-
-
-def test_a_client_outlives_a_restart_of_its_server():
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    server = ZenohTransport(listen=endpoint)
-    client = ZenohTransport(connect=endpoint)
-    server.close()
-    with ZenohTransport(listen=endpoint) as again:
-        again.serve(key("r", "config"), lambda k, m: Message({}, {"ok": 1}))
-
-        def answered() -> bool:
-            try:
-                return client.query(key("r", "config"), Message({}, {}), timeout=1.0).meta == {"ok": 1}
-            except TransportError:
-                return False
-
-        _eventually(answered)
-    client.close()
-
-
-def test_a_slow_handler_meets_the_deadline():
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+def test_silence_has_a_deadline(pair):
+    server, client = pair
     release = threading.Event()
-    with ZenohTransport(listen=endpoint) as server, ZenohTransport(connect=endpoint) as client:
-        server.serve(key("r", "config"), lambda k, m: (release.wait(5.0), m)[1])
-        with pytest.raises(TransportError, match="within 0.3 s"):
-            client.query(key("r", "config"), Message({}, {}), timeout=0.3)
-        release.set()
+    server.serve(KEYS.act, lambda key, m: release.wait(20) and Message() or Message())
+    start = time.monotonic()
+    with pytest.raises(TransportError, match=r"within 0\.3 s") as caught:
+        client.query(KEYS.act, Message(), timeout=0.3)
+    assert not isinstance(caught.value, RefusedError)
+    assert 0.25 < time.monotonic() - start < 3
+    with pytest.raises(TransportError, match="Nobody"):
+        client.query(KEYS.health, Message(), timeout=5)
+    release.set()
 
 
-def test_names_that_break_keys_are_refused():
-    with pytest.raises(CongraspError, match="cannot be used"):
-        key("my run", "config")
+def test_workers_answer_at_the_same_time(pair):
+    server, client = pair
+    together = threading.Barrier(3)
+    server.serve(KEYS.act, lambda key, m: Message(meta={"n": together.wait(10)}), workers=3)
+    seen = []
+    ask = lambda: seen.append(client.query(KEYS.act, Message(), timeout=10).meta["n"])  # noqa: E731
+    threads = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(15)
+    assert sorted(seen) == [0, 1, 2]
+
+
+def test_query_after_the_server_closed_fails_at_once(pair):
+    server, client = pair
+    entered = threading.Event()
+
+    def handler(key, message):
+        entered.set()
+        time.sleep(0.5)
+        return Message()
+
+    server.serve(KEYS.act, handler)
+    failures = []
+
+    def ask():
+        try:
+            client.query(KEYS.act, Message(), timeout=30)
+        except TransportError as error:
+            failures.append(error)
+
+    waiting = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
+    for thread in waiting:
+        thread.start()
+    assert entered.wait(5)
+    server.close()
+    for thread in waiting:
+        thread.join(10)
+    assert not any(thread.is_alive() for thread in waiting)
+    assert len(failures) >= 2  # one may have been in the handler, whose answer still counts
+    with pytest.raises(TransportError):
+        client.query(KEYS.act, Message(), timeout=1)
+    with pytest.raises(TransportError, match="closed"):
+        server.query(KEYS.act, Message(), timeout=1)
+    server.publish(KEYS.announcement, Message())
+
+
+def test_subscription_keeps_the_newest_and_counts_the_rest(pair):
+    server, client = pair
+    subscription = client.subscribe(KEYS.logs, depth=4)
+    sent = 0
+
+    def arrived():
+        nonlocal sent
+        server.publish(KEYS.log("metrics", "learner", "0"), Message(meta={"n": sent}))
+        sent += 1
+        return subscription.receive(0.05)
+
+    wait_for(arrived)
+    while subscription.receive(0.2):
+        pass
+    dropped = subscription.dropped
+    for n in range(10):
+        server.publish(KEYS.log("event", "learner", "0"), Message({"x": np.zeros(3)}, {"n": n}))
+    wait_for(lambda: subscription.dropped - dropped == 6)
+    received = [subscription.receive(1.0) for _ in range(4)]
+    assert [message.meta["n"] for _, message in received] == [6, 7, 8, 9]
+    assert {key for key, _ in received} == {KEYS.log("event", "learner", "0")}
+    assert subscription.receive(0.05) is None
+    assert subscription.dropped - dropped == 6
+
+
+def test_closed_subscription_lets_its_reader_go(pair):
+    subscription = pair[1].subscribe(KEYS.logs, depth=1)
+    threading.Timer(0.2, subscription.close).start()
+    start = time.monotonic()
+    assert subscription.receive(20) is None
+    assert time.monotonic() - start < 5
+
+
+def test_tokens_show_who_is_there(pair):
+    server, client = pair
+    early, late = KEYS.alive("actor", "a", "01"), KEYS.alive("actor", "b", "02")
+    seen = []
+    client.declare_alive(early)
+    server.watch_alive(KEYS.everyone, lambda key, alive: seen.append((key, alive)))
+    wait_for(lambda: (early, True) in seen)
+    client.declare_alive(late)
+    wait_for(lambda: (late, True) in seen)
+    client.close()
+    wait_for(lambda: (early, False) in seen and (late, False) in seen)
+
+
+def test_memory_copies_nothing():
+    hub = MemoryHub()
+    server, client = MemoryTransport(hub), MemoryTransport(hub)
+    server.serve(KEYS.act, lambda key, message: message)
+    message = Message({"x": object()})
+    assert client.query(KEYS.act, message, timeout=5) is message
+    server.close()
+    client.close()
+
+
+# --- Zenoh only ---
+
+
+def test_busy_port_is_named():
+    base = base_port()
+    with (
+        ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"]),
+        pytest.raises(CongraspError, match=f"port of tcp/127.0.0.1:{base} is in use.* choose another"),
+    ):
+        ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"])
+    with ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"]):
+        pass
+
+
+def test_busy_port_of_a_later_flow_frees_the_earlier_ones():
+    base = base_port()
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", base + 1))
+        other.listen()
+        with pytest.raises(CongraspError, match=f"{base + 1} is in use"):
+            ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"])
+    with ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"]):
+        pass
+
+
+@pytest.mark.parametrize("endpoint", ["127.0.0.1:7447", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "", "tcp/h:65535"])
+def test_malformed_endpoint_is_named(endpoint):
+    with pytest.raises(CongraspError, match="is not an endpoint.*Write it like tcp/"):
+        ZenohTransport(listen=[endpoint])
+
+
+def test_absent_peer_is_an_error_with_a_deadline():
+    endpoint = f"tcp/127.0.0.1:{base_port()}"
+    start = time.monotonic()
+    with pytest.raises(TransportError, match=f"Nobody answers at {endpoint}"):
+        ZenohTransport(connect=[endpoint], wait=0.2)
+    assert time.monotonic() - start < 5
+
+
+def test_settings_are_passed_on_and_checked():
+    endpoint = f"tcp/127.0.0.1:{base_port()}"
+    with pytest.raises(CongraspError, match="no/such/key"):
+        ZenohTransport(listen=[endpoint], extra={"no/such/key": 1})
+    deny = {"access_control": {"enabled": True, "default_permission": "deny"}}
+    with ZenohTransport(listen=[endpoint], extra=deny) as server, ZenohTransport(connect=[endpoint]) as client:
+        server.serve(KEYS.act, lambda key, message: message)
+        with pytest.raises(TransportError, match="Nobody"):
+            client.query(KEYS.act, Message(), timeout=1)
+
+
+def test_flows_decide_the_ports():
+    base = base_port(1)
+    with (
+        ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"], flows=["policy"]) as server,
+        ZenohTransport(connect=[f"tcp/127.0.0.1:{base}"], flows=["policy"]) as client,
+    ):
+        server.serve(KEYS.act, lambda key, message: message)
+        assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=5).meta == {"n": 1}
+        with pytest.raises(TransportError, match="no flow"):
+            client.query(KEYS.rollout, Message(), timeout=5)
+
+
+def test_damaged_and_oversized_messages_are_refused():
+    import zenoh
+
+    endpoint = f"tcp/127.0.0.1:{base_port()}"
+    damaged = []
+    with ZenohTransport(listen=[endpoint], max_message=1 << 20) as server, ZenohTransport(connect=[endpoint]) as client:
+        server.serve(KEYS.act, lambda key, message: message, on_damage=lambda key, error: damaged.append(str(error)))
+        session = client._session(KEYS.act)
+        whole = encode(Message({"x": np.zeros(8)}))
+        for payload in (b"", whole[:-1], b"\xff" * 8 + whole[8:], whole[:-1] + b"\x01"):
+            reply = next(iter(session.get(KEYS.act, payload=payload, timeout=5.0)))
+            assert reply.err is not None and b"message" in reply.err.payload.to_bytes().lower()
+        assert len(damaged) == 4 and "checksum" in damaged[3]
+        # Zenoh drops what is longer than the receiver takes, and the link goes on.
+        assert not [r for r in session.get(KEYS.act, payload=bytes(2 << 20), timeout=0.5) if r.ok]
+        assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=5).meta == {"n": 1}
+        with pytest.raises(CongraspError, match="longer than the 1048576"):
+            server.publish(KEYS.log("rollout", "actor", "a"), Message({"x": np.zeros(1 << 20)}))
+        assert isinstance(session, zenoh.Session)
+
+
+def test_peer_that_comes_back_is_found_again():
+    endpoint = f"tcp/127.0.0.1:{base_port()}"
+    server = ZenohTransport(listen=[endpoint])
+    with ZenohTransport(connect=[endpoint]) as client:
+        seen = []
+        client.declare_alive(KEYS.alive("actor", "a", "01"))
+        server.close()
+        with pytest.raises(TransportError):
+            client.query(KEYS.act, Message(), timeout=1)
+        with ZenohTransport(listen=[endpoint]) as server:
+            server.serve(KEYS.act, lambda key, message: message)
+            server.watch_alive(KEYS.everyone, lambda key, alive: seen.append(alive))
+            wait_for(lambda: _answers(client, KEYS.act))
+            wait_for(lambda: seen == [True])
+
+
+BUSY_PROCESS = """
+    import sys, time
+    from common.transport.keys import Keys
+    from common.transport.zenoh_transport import ZenohTransport
+    from common.wire.codec import Message
+    keys = Keys("test")
+    server = ZenohTransport(listen=[sys.argv[1]])
+    client = ZenohTransport(connect=[sys.argv[1]])
+    server.serve(keys.act, lambda key, message: message, workers=2)
+    server.watch_alive(keys.everyone, lambda key, alive: None)
+    client.declare_alive(keys.alive("actor", "a", "01"))
+    subscription = server.subscribe(keys.logs, depth=1)
+    client.publish(keys.log("event", "actor", "a"), Message())
+    client.query(keys.act, Message(), timeout=5)
+    print("ready", flush=True)
+    {end}
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "code"),
+    [
+        ("pass", 0),
+        ("raise RuntimeError('unhandled')", 1),
+        ("server.close(); client.close(); server.close()", 0),
+        ("time.sleep(60)", -signal.SIGTERM),
+    ],
+)
+def test_process_always_ends(end, code):
+    script = textwrap.dedent(BUSY_PROCESS).replace("{end}", end)
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, f"tcp/127.0.0.1:{base_port()}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    try:
+        assert process.stdout.readline() == b"ready\n"
+        if code < 0:
+            process.send_signal(signal.SIGTERM)
+        assert process.wait(5) == code
+    finally:
+        process.kill()
+        process.communicate()

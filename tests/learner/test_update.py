@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from common.errors import PhysicsError
+from common.errors import CongraspError, PhysicsError
 from common.policy import bundle as bundles
 from common.policy import network, normalizer
 from learner import update as updates
@@ -125,6 +125,12 @@ def test_an_optimisation_that_breaks_is_named_and_keeps_the_last_finite_weights(
     with pytest.raises(updates.NonFiniteUpdate, match="optimisation of update 1: value loss") as caught:
         updates.update(state, batch, toy.LAYOUT, dataclasses.replace(toy.PPO, reward_scale=1e25))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(caught.value.state.params))
+
+
+def test_more_minibatches_than_transitions_are_refused():
+    batch = rollout(toy.bundle_of(fresh()), 0, worlds=1)
+    with pytest.raises(CongraspError, match="10 transitions does not make 16 minibatches"):
+        updates.update(fresh(), batch, toy.LAYOUT, dataclasses.replace(toy.PPO, minibatches=16))
 
 
 def test_other_hyperparameters_do_not_compile_again():
