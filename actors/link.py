@@ -1,176 +1,352 @@
-"""The actor's end of the wire: configuration, tickets, weights, and uploads that survive a learner's restart."""
+"""The actor's end of the link: configuration, tickets, weights, and rollouts that arrive exactly once.
 
-import dataclasses
+A rollout gets its identity (actor, incarnation, sequence) when it is handed over, and is sent under that identity until
+the learner has answered it, across restarts of the learner. Sending happens in the background, so that the next rollout
+is made meanwhile; at most `window` rollouts are on their way, further ones wait in `upload`.
+"""
+
+import contextlib
+import itertools
 import queue
 import secrets
 import threading
 import time
-from typing import Any
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any, Literal, NamedTuple, Self
 
 from common.errors import CongraspError, TransportError
-from common.transport import keys
-from common.transport.base import Transport
-from common.wire.codec import Message
+from common.transport.base import RefusedError, Transport
+from common.transport.keys import Keys
+from common.wire.codec import Message, SharedMessage
 
-_RETRY_SECONDS = 0.2
-_MAX_REFUSALS = 3
-
-
-class RunEnded(CongraspError):
-    """The learner has finished its run, or has started another one."""
-
-    exit_code = 0
+Outcome = Literal["accepted", "duplicate", "stale", "refused"]
+"""What became of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""
+_BACKOFF = (0.1, 1.0)  # first and longest pause between two attempts, s
+_POLL = 0.2
 
 
-@dataclasses.dataclass(frozen=True)
-class Ticket:
-    """Permission for one rollout."""
+class RunRestarted(CongraspError):
+    """The learner began another training: read the configuration anew and start over."""
 
-    identity: str
+
+class RunFinished(CongraspError):
+    """The learner needs no more rollouts."""
+
+
+class RunInfo(NamedTuple):
+    """What the learner says about its run."""
+
+    config: str
+    """The run's configuration as JSON text."""
+    epoch: str
+    """Identifies the training."""
+    schema: str
+    """Policy schema that rollouts must have."""
+
+
+class Ticket(NamedTuple):
+    """Permission to make one rollout."""
+
+    id: str
     version: int
-    """The learner's version when it was granted."""
+    """The learner's policy version when it was granted."""
+
+
+class _Upload(NamedTuple):
+    message: Message
+    outcome: "Future[Outcome]"
 
 
 class ActorLink:
-    """Talks to the learner; every wait has a deadline.
+    """An actor's connection to its learner; one thread uses it."""
 
-    Uploads run in a thread of their own, one at a time, so that stepping and sending overlap. The same rollout is sent
-    under the same identity until the learner acknowledges it.
-    """
-
-    def __init__(self, transport: Transport, *, run: str, actor: str, patience: float = 60.0):
-        """Shows the actor as alive.
+    def __init__(
+        self,
+        transport: Transport,
+        run: str,
+        actor: str,
+        *,
+        window: int = 1,
+        max_refusals: int = 5,
+        request_timeout: float = 10.0,
+        patience: float = 300.0,
+    ):
+        """Announces the actor.
 
         Args:
-          transport: the actor's endpoint.
+          transport: a connected transport.
           run: name of the run.
           actor: the actor's name, unique in the run.
-          patience: seconds without a learner after which the actor gives up.
+          window: rollouts on their way at a time.
+          max_refusals: rollouts refused in a row after which the link fails.
+          request_timeout: seconds that one request may take.
+          patience: seconds without any answer after which the link gives the learner up.
         """
-        self.actor, self.incarnation = actor, secrets.token_hex(8)
-        self._transport, self._run, self._patience = transport, run, patience
-        self._sequence = 0
+        self.keys = Keys(run)
+        self.actor = actor
+        self.incarnation = secrets.token_hex(4)
+        self._transport = transport
+        self._max_refusals = max_refusals
+        self._timeout = request_timeout
+        self._patience = patience
+        self._info: RunInfo | None = None
+        self._learner = (-1, "")  # version and life that the learner showed last
+        self._held_life = ""
+        self._finished = False
+        self._answered = time.monotonic()
+        self._wanted = secrets.token_hex(8)  # the next ticket's id, kept until it is granted
+        self._sequence = itertools.count()
         self._refusals = 0
-        self._epoch = ""
-        self._outbox: queue.Queue[Message] = queue.Queue(maxsize=1)
-        self._idle = threading.Event()
-        self._idle.set()
         self._failure: CongraspError | None = None
-        self._stop = threading.Event()
-        self._uploader = threading.Thread(target=self._upload_all, name="upload", daemon=True)
-        self._uploader.start()
-        transport.declare_alive(keys.alive_key(run, "actor", actor, self.incarnation))
+        self._free = threading.Semaphore(window)
+        self._uploads: queue.SimpleQueue[_Upload | None] = queue.SimpleQueue()
+        self._pending: set[Future[Outcome]] = set()
+        self._closed = threading.Event()
+        self._announcements = transport.subscribe(self.keys.announcement, depth=1)
+        transport.declare_alive(self.keys.alive("actor", actor, self.incarnation))
+        for index in range(window):
+            threading.Thread(target=self._upload_all, daemon=True, name=f"upload-{index}").start()
 
-    def config(self) -> str:
-        """The run's configuration as JSON text; it also binds this actor to the learner's present training."""
-        reply = self._ask(keys.CONFIG, {})
-        self._epoch = reply.meta["epoch"]
-        return reply.meta["config"]
-
-    def acquire_ticket(self, stop: threading.Event) -> Ticket | None:
-        """Waits for a ticket; None when `stop` is set.
+    def config(self, timeout: float) -> RunInfo:
+        """Reads the run's configuration, and follows its epoch from now on.
 
         Raises:
-          RunEnded: the run is over, or the learner trains anew (read the configuration again).
-          TransportError: there was no learner for `patience` seconds.
+          TransportError: the learner did not answer within `timeout` seconds.
         """
-        while not stop.is_set():
-            self._raise_failure()
-            reply = self._ask(keys.TICKET, {"actor": self.actor, "incarnation": self.incarnation}, stop)
-            if reply is None:
+        reply = self._ask(self.keys.config, {}, time.monotonic() + timeout)
+        self._info = RunInfo(str(reply.meta["config"]), str(reply.meta["epoch"]), str(reply.meta["schema"]))
+        self._note(reply.meta)
+        self._failure, self._refusals = None, 0
+        return self._info
+
+    def acquire_ticket(self, timeout: float) -> Ticket | None:
+        """Waits for permission to make a rollout; None if there is none within `timeout` seconds.
+
+        A learner that is away counts as one that grants nothing.
+
+        Raises:
+          RunRestarted, RunFinished: see there.
+          CongraspError: the learner refused too many rollouts, or has been silent for too long.
+        """
+        deadline = time.monotonic() + timeout
+        while True:
+            self._check()
+            try:
+                reply = self._ask(self.keys.ticket, self._identity(self._wanted), deadline)
+            except RefusedError:
+                raise
+            except TransportError as error:
+                self._despair(self._answered, error)
                 return None
-            if reply.meta["done"]:
-                raise RunEnded("The run has ended.")
-            if reply.meta["epoch"] != self._epoch:
-                raise RunEnded("The learner has started a new training.")
-            if reply.meta["ticket"] is not None:
-                return Ticket(reply.meta["ticket"], reply.meta["version"])
-            stop.wait(float(reply.meta["retry_after"]))
-        return None
+            self._note(reply.meta)
+            self._check()
+            if reply.meta["granted"]:
+                ticket, self._wanted = self._wanted, secrets.token_hex(8)
+                return Ticket(ticket, int(reply.meta["version"]))
+            pause = min(float(reply.meta["retry_after"]), deadline - time.monotonic())
+            if pause <= 0:
+                return None
+            self._listen(pause)
+
+    def give_back(self, ticket: Ticket) -> None:
+        """Returns a ticket that is not needed; if that fails, it expires."""
+        request = Message(meta={**self._identity(ticket.id), "give_back": True})
+        with contextlib.suppress(TransportError):
+            self._transport.query(self.keys.ticket, request, timeout=self._timeout)
 
     def weights(self, newer_than: int) -> Message | None:
-        """The newest policy bundle, or None if it is not newer than this version."""
-        reply = self._ask(keys.WEIGHTS, {"newer_than": newer_than})
-        return reply if reply.arrays else None
+        """The latest policy bundle, or None if it is the one that the caller has or the learner is away.
 
-    def upload(self, rollout: Message, ticket: Ticket) -> None:
-        """Hands a rollout to the uploader; blocks while the previous one has not been acknowledged.
+        Costs no request as long as the learner has shown no other version.
+
+        Args:
+          newer_than: the version that the caller has; -1 for none.
 
         Raises:
-          CongraspError: an earlier upload failed for good.
+          RunRestarted: see there.
         """
+        self._listen(0.0)
+        self._check()
+        if newer_than >= 0 and (newer_than, self._held_life) == self._learner:
+            return None
+        life = self._learner[1]
+        request = Message(meta={"newer_than": newer_than, "life": self._held_life})
+        try:
+            reply = self._transport.query(self.keys.weights, request, timeout=self._timeout)
+        except TransportError:
+            return None
+        if not reply.arrays:
+            self._note(reply.meta)
+            self._check()
+            return None
+        if self._info and reply.meta.get("epoch") != self._info.epoch:
+            self._failure = _restarted(self._info.epoch, reply.meta.get("epoch"))
+        self._check()
+        self._held_life = life
+        return reply
+
+    def upload(self, rollout: Message, ticket: Ticket) -> "Future[Outcome]":
+        """Hands a rollout over, to be sent in the background; waits while `window` others are on their way.
+
+        Args:
+          rollout: arrays and meta entries `version`, `schema` and `steps`; the link adds who made it.
+          ticket: what it was made under.
+
+        Returns:
+          Its outcome, once the learner has answered.
+
+        Raises:
+          RunRestarted: see there; this rollout is not sent.
+          CongraspError: the learner refused too many rollouts, or has been silent for too long.
+        """
+        self._check()
+        if self._info is None:
+            raise CongraspError("The link has no configuration yet.", "Call 'config' first.")
+        while not self._free.acquire(timeout=_POLL):
+            self._check()
+        self._check()
         meta = {
             **rollout.meta,
-            "actor": self.actor,
-            "incarnation": self.incarnation,
-            "sequence": self._sequence,
-            "epoch": self._epoch,
-            "ticket": ticket.identity,
+            **self._identity(ticket.id),
+            "sequence": next(self._sequence),
+            "epoch": self._info.epoch,
         }
-        self._sequence += 1
-        deadline = time.monotonic() + self._patience
-        while time.monotonic() < deadline:
-            self._raise_failure()
-            if self._idle.wait(0.1):
-                self._idle.clear()
-                self._outbox.put(Message(rollout.arrays, meta))
-                return
-        raise TransportError(f"The learner acknowledged no rollout for {self._patience:.0f} s.")
+        upload = _Upload(SharedMessage(rollout.arrays, meta), Future())
+        self._pending.add(upload.outcome)
+        upload.outcome.add_done_callback(self._pending.discard)
+        self._uploads.put(upload)
+        return upload.outcome
 
-    def publish(self, kind: str, message: Message) -> None:
-        """Sends to a log stream of this actor; may be lost."""
-        self._transport.publish(keys.log_key(self._run, kind, "actor", self.actor), message)
-
-    def close(self, drain: float = 2.0) -> None:
-        """Waits up to `drain` seconds for the last acknowledgement and ends the uploader."""
-        self._idle.wait(drain)
-        self._stop.set()
-        self._uploader.join(1.0)
-
-    def _raise_failure(self) -> None:
-        if self._failure is not None:
-            raise self._failure
-
-    def _ask(self, key: str, meta: dict[str, Any], stop: threading.Event | None = None) -> Any:
-        """A query that outlives a learner's restart; None when `stop` is set meanwhile."""
-        deadline = time.monotonic() + self._patience
-        while True:
+    def flush(self, timeout: float) -> bool:
+        """Waits until every rollout has its outcome; False if that takes longer than `timeout` seconds."""
+        deadline = time.monotonic() + timeout
+        for outcome in list(self._pending):
             try:
-                return self._transport.query(keys.key(self._run, key), Message({}, meta), timeout=5.0)
+                outcome.exception(max(0.0, deadline - time.monotonic()))
+            except TimeoutError:
+                return False
+        return True
+
+    def close(self) -> None:
+        """Stops sending; what has no outcome yet is given up. The transport stays open."""
+        self._closed.set()
+        self._uploads.put(None)
+        self._announcements.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _identity(self, ticket: str) -> dict[str, Any]:
+        return {"actor": self.actor, "incarnation": self.incarnation, "ticket": ticket}
+
+    def _check(self) -> None:
+        if self._failure:
+            raise self._failure
+        if self._finished:
+            raise RunFinished("The run is finished.")
+        if self._closed.is_set():
+            raise CongraspError("The link is closed.")
+
+    def _note(self, meta: Any) -> None:
+        """Takes in what every answer and announcement of the learner says about itself."""
+        self._answered = time.monotonic()
+        self._learner = int(meta["version"]), str(meta["life"])
+        self._finished = bool(meta["finished"])
+        if self._info and meta["epoch"] != self._info.epoch:
+            self._failure = _restarted(self._info.epoch, meta["epoch"])
+
+    def _listen(self, timeout: float) -> None:
+        """Waits for an announcement; returns early when one comes."""
+        if received := self._announcements.receive(timeout):
+            self._note(received[1].meta)
+
+    def _ask(self, key: str, meta: dict[str, Any], deadline: float) -> Message:
+        """Asks until there is an answer; a refusal is one."""
+        pauses = _pauses()
+        while True:
+            rest = max(0.05, deadline - time.monotonic())
+            try:
+                return self._transport.query(key, Message(meta=meta), timeout=min(self._timeout, rest))
+            except RefusedError:
+                raise
             except TransportError:
-                if time.monotonic() > deadline:
+                rest = deadline - time.monotonic()
+                if rest <= 0 or self._closed.wait(min(next(pauses), rest)):
                     raise
-                if stop is not None and stop.is_set():
-                    return None
-                time.sleep(_RETRY_SECONDS)
 
     def _upload_all(self) -> None:
-        while not self._stop.is_set():
+        while (upload := self._uploads.get()) is not None:
             try:
-                message = self._outbox.get(timeout=0.2)
-            except queue.Empty:
-                continue
-            self._upload_one(message)
-            self._idle.set()
+                upload.outcome.set_result(self._deliver(upload.message))
+            except CongraspError as error:
+                self._failure = self._failure or error
+                upload.outcome.set_exception(error)
+            except Exception as error:  # an answer that is none: the thread must not die in silence
+                self._failure = CongraspError(f"The learner's answer cannot be understood: {error!r}.")
+                upload.outcome.set_exception(self._failure)
+            finally:
+                self._free.release()
+        self._uploads.put(None)
 
-    def _upload_one(self, message: Message) -> None:
-        deadline = time.monotonic() + self._patience
-        while not self._stop.is_set():
+    def _deliver(self, message: Message) -> Outcome:
+        """Sends one rollout until it has an outcome."""
+        answered = time.monotonic()
+        damaged = 0
+        pauses = _pauses()
+        while not self._closed.is_set():
+            pause = next(pauses)
             try:
-                reply = self._transport.query(keys.key(self._run, keys.ROLLOUT), message, timeout=10.0)
+                reply = self._transport.query(self.keys.rollout, message, timeout=self._timeout)
+            except RefusedError as error:  # it arrived damaged, or the learner failed on it
+                damaged += 1
+                answered = time.monotonic()
+                if damaged >= self._max_refusals:
+                    return self._refused(str(error))
             except TransportError as error:
-                if time.monotonic() > deadline:
-                    self._failure = error
-                    return
-                self._stop.wait(_RETRY_SECONDS)
-                continue
-            outcome = reply.meta["outcome"]
-            if outcome == "refused":
-                self._refusals += 1
-                if self._refusals >= _MAX_REFUSALS:
-                    self._failure = CongraspError(f"The learner refused {_MAX_REFUSALS} rollouts: {reply.meta['why']}")
-            elif outcome == "other_epoch":
-                self._failure = RunEnded(reply.meta["why"])
+                self._despair(answered, error)
             else:
-                self._refusals = 0
-            return
+                answered = time.monotonic()
+                self._note(reply.meta)
+                if self._failure:
+                    raise self._failure
+                outcome = reply.meta["outcome"]
+                if outcome == "refused":
+                    return self._refused(str(reply.meta["why"]))
+                if outcome != "retry":
+                    self._refusals = 0
+                    return outcome
+                pauses = _pauses()
+                pause = float(reply.meta["retry_after"])
+            self._closed.wait(pause)
+        raise TransportError("The link was closed before the rollout was acknowledged.")
+
+    def _despair(self, answered: float, error: TransportError) -> None:
+        """Gives the learner up if its last answer was too long ago."""
+        if time.monotonic() - answered > self._patience:
+            raise TransportError(
+                f"The learner has not answered for {self._patience:g} s: {error}", "Start the actor again later."
+            ) from None
+
+    def _refused(self, why: str) -> Outcome:
+        self._refusals += 1
+        if self._refusals >= self._max_refusals:
+            self._failure = CongraspError(
+                f"The learner refused {self._refusals} rollouts in a row: {why}",
+                "Start the actor with the version of congrasp that the learner has.",
+            )
+        return "refused"
+
+
+def _restarted(before: str, now: Any) -> RunRestarted:
+    return RunRestarted(f"The learner began another training (epoch {now} after {before}).", "The actor starts over.")
+
+
+def _pauses() -> "itertools.chain[float]":
+    """Seconds to wait after the first, second, ... failed attempt."""
+    first, longest = _BACKOFF
+    growing: Callable[[int], float] = lambda index: min(longest, first * 2**index)  # noqa: E731
+    return itertools.chain(map(growing, range(10)), itertools.repeat(longest))

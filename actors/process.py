@@ -9,18 +9,20 @@ import numpy as np
 
 from actors.environment import EnvironmentState
 from actors.episode import episode_message
-from actors.link import ActorLink, RunEnded, Ticket
+from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes, goal_of_world
 from actors.taskset import build_taskset
 from common.config import PhysicsName, RunConfig, run_config_from_json
-from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects.pool import load_pool
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
 from common.task.types import Surface
 from common.transport.base import Transport
 from common.wire.codec import Message
+
+_TICKET_SECONDS = 1.0
+_FLUSH_SECONDS = 2.0
 
 
 def run_actor(
@@ -47,21 +49,27 @@ def run_actor(
     Raises:
       CongraspError: the learner is gone, or refuses this actor's rollouts.
     """
-    link = ActorLink(transport, run=run, actor=actor, patience=patience)
-    try:
-        config = run_config_from_json(link.config())
-        _Actor(config, link, physics or config.physics, threads).act(stop)
-    except RunEnded:
-        return
-    finally:
-        link.close()
+    while not stop.is_set():
+        with ActorLink(transport, run, actor, patience=patience) as link:
+            try:
+                config = run_config_from_json(link.config(patience).config)
+                _Actor(config, link, transport, physics or config.physics, threads).act(stop)
+                link.flush(_FLUSH_SECONDS)
+                return
+            except RunFinished:
+                link.flush(_FLUSH_SECONDS)
+                return
+            except RunRestarted:
+                continue
 
 
 class _Actor:
     """Worlds, policy and counters of one actor."""
 
-    def __init__(self, config: RunConfig, link: ActorLink, physics: PhysicsName, threads: int):
-        self._config, self._link = config, link
+    def __init__(
+        self, config: RunConfig, link: ActorLink, transport: Transport, physics: PhysicsName, threads: int
+    ):
+        self._config, self._link, self._transport = config, link, transport
         self._hand = get_hand(config.task.hand)
         number = zlib.crc32(link.actor.encode())
         self._objects = load_pool(config.objects, number)
@@ -85,24 +93,27 @@ class _Actor:
     def act(self, stop: threading.Event) -> None:
         """Rollouts until `stop` is set or the run ends."""
         try:
-            while (ticket := self._link.acquire_ticket(stop)) is not None:
-                self._refresh(ticket)
+            while not stop.is_set():
+                ticket = self._link.acquire_ticket(_TICKET_SECONDS)
+                if ticket is None:
+                    continue
+                if not self._refresh():
+                    self._link.give_back(ticket)
+                    stop.wait(_TICKET_SECONDS)
+                    continue
                 assert self._bundle is not None
                 self._rollout(self._bundle, ticket)
         finally:
             self._physics.close()
 
-    def _refresh(self, ticket: Ticket) -> None:
-        version = -1 if self._bundle is None else self._bundle.version
-        if ticket.version <= version:
-            return
-        message = self._link.weights(version)
+    def _refresh(self) -> bool:
+        """Takes the newest policy; whether there is one at all."""
+        message = self._link.weights(-1 if self._bundle is None else self._bundle.version)
         if message is not None:
             bundle = PolicyBundle.from_message(message, "of the learner")
             self._spec.require(bundle.spec, "of the learner")
             self._bundle = bundle
-        if self._bundle is None:
-            raise CongraspError("The learner granted a rollout before it had a policy.")
+        return self._bundle is not None
 
     def _rollout(self, bundle: PolicyBundle, ticket: Ticket) -> None:
         config, env = self._config, self._worker.env
@@ -115,17 +126,8 @@ class _Actor:
         meta = {"version": bundle.version, "schema": self._spec.schema, "steps": steps}
         self._link.upload(Message(arrays, meta), ticket)
         seconds = time.time() - began
-        self._link.publish(
-            "metrics",
-            Message(
-                {},
-                {
-                    "time": time.time(),
-                    "version": bundle.version,
-                    "values": {"steps_per_second": steps / seconds, "rollouts": self._rollouts + 1.0},
-                },
-            ),
-        )
+        values = {"steps_per_second": steps / seconds, "rollouts": self._rollouts + 1.0}
+        self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
         if self._rollouts % config.episode_every == 0 and started_fresh:
             self._publish_episode(bundle, rollout, env)
         self._rollouts += 1
@@ -145,4 +147,7 @@ class _Actor:
             "metrics": metrics,
         }
         message = episode_message(self._hand, self._config.task, rollout.trace, goal, surface, obj, meta)
-        self._link.publish("episode", message)
+        self._publish("episode", message)
+
+    def _publish(self, kind: str, message: Message) -> None:
+        self._transport.publish(self._link.keys.log(kind, "actor", self._link.actor), message)

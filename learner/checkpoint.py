@@ -8,6 +8,7 @@ import contextlib
 import json
 import os
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -88,7 +89,7 @@ def flatten(tree: Any) -> dict[str, np.ndarray]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(leaf) for path, leaf in leaves}
 
 
-def restore(arrays: dict[str, Any], template: Any, source: str) -> Any:
+def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
     """The inverse of `flatten`: a tree like `template`, whose leaves say what becomes of each array.
 
     A JAX array goes to the default device, a NumPy array stays on the host, an integer becomes one.
@@ -97,7 +98,7 @@ def restore(arrays: dict[str, Any], template: Any, source: str) -> Any:
       CongraspError: naming `source` and the first leaf that is missing or has another shape or type.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
-    restored = []
+    restored: list[Any] = []
     for path, leaf in leaves:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
         array, expected = arrays.get(name), np.asarray(leaf)

@@ -1,38 +1,75 @@
-"""The learner's end of the wire: configuration, tickets, rollouts, weights, status and who is alive."""
+"""The learner's end of the link: it takes rollouts in, hands out tickets and weights, and says how things stand.
+
+A rollout is identified by (actor, incarnation, sequence). It is acknowledged when it is in the queue, and an
+acknowledged one is never taken twice, however often its actor sends it. What a checkpoint keeps of the hub
+(`durable`) fits the weights beside it: rollouts acknowledged after the checkpoint are undone with the updates that used
+them when training resumes from it, and are counted as `rolled_back` from the gap that they leave in the sequences.
+"""
 
 import collections
 import dataclasses
+import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any
 
 from common.errors import CongraspError
-from common.transport import keys
 from common.transport.base import Transport
-from common.wire.codec import Message
-from common.wire.messages import validate_bundle, validate_rollout
-from learner.staleness import Ledger, StalenessManager
+from common.transport.keys import Alive, Keys, check_name, parse_alive
+from common.wire.codec import Message, SharedMessage
+from common.wire.messages import TICKET, RolloutHeader, validate, validate_bundle, validate_rollout
+from learner.staleness import Owner, StalenessManager
 
-RETRY_SECONDS = 0.05
-"""What an actor without a ticket is told to wait."""
+_INCARNATIONS = 1024  # whose marks are kept
+_WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another
+_RETRY_SECONDS = 0.25
+_RATE_SECONDS = 10.0
+_EVENT_SECONDS = 1.0  # between two events of one kind
 
 
-@dataclasses.dataclass(frozen=True)
-class RolloutSizes:
-    """What a rollout of this run must look like."""
+@dataclasses.dataclass
+class _Marks:
+    """Which rollouts of an incarnation were accepted: all below `next`, and those in `ahead`."""
 
-    observation: int
-    action: int
-    schema: str
+    next: int = 0
+    ahead: set[int] = dataclasses.field(default_factory=set)
+    resumed_at: int | None = None
+    """First sequence number that a checkpoint did not know; None if it did not know the incarnation."""
+    first: int | None = None
+    """Lowest sequence number from there on that arrived since."""
+    rollouts: int = 0
+    version: int = -1
+
+    def __contains__(self, sequence: int) -> bool:
+        return sequence < self.next or sequence in self.ahead
+
+    def arrive(self, sequence: int) -> None:
+        if self.resumed_at is not None and sequence >= self.resumed_at:
+            self.first = sequence if self.first is None else min(self.first, sequence)
+
+    def add(self, header: RolloutHeader) -> None:
+        self.rollouts += 1
+        self.version = header.version
+        self.ahead.add(header.sequence)
+        if len(self.ahead) > _WINDOW:
+            self.next = min(self.ahead)
+        while self.next in self.ahead:
+            self.ahead.remove(self.next)
+            self.next += 1
+
+    @property
+    def end(self) -> int:
+        """One above the highest accepted."""
+        return max(self.ahead, default=self.next - 1) + 1
+
+    @property
+    def rolled_back(self) -> int:
+        return 0 if self.resumed_at is None or self.first is None else self.first - self.resumed_at
 
 
 class LearnerHub:
-    """Serves actors and keeps accepted rollouts until the learner takes them.
-
-    A rollout is identified by (actor, incarnation, sequence): one that was accepted before is answered as a duplicate
-    and not queued again, so that an actor may send it until it hears an answer.
-    """
+    """Serves a run's keys for the learner; its methods may be called from any thread."""
 
     def __init__(
         self,
@@ -41,203 +78,272 @@ class LearnerHub:
         run: str,
         config_json: str,
         epoch: str,
-        sizes: RolloutSizes,
+        schema: str,
+        observation_size: int,
+        action_size: int,
         staleness: StalenessManager,
-        on_event: Callable[[str, str], None] = lambda level, text: None,
+        queue_limit: int = 64,
+        name: str = "0",
+        durable: Mapping[str, Any] | None = None,
     ):
-        """Starts to serve.
+        """Starts to answer; tickets are granted from the first `publish_weights` on.
 
         Args:
-          transport: the learner's endpoint.
+          transport: a transport that listens.
           run: name of the run.
-          config_json: the run's configuration, given to every actor that asks.
-          epoch: identifies this training; it stays the same when the run is resumed.
-          sizes: what rollouts must look like.
-          staleness: admission.
-          on_event: called with (level, text) when something worth a line happens.
+          config_json: the run's configuration, for actors that connect.
+          epoch: identifies this training; another one after a start from scratch, the same after a resume.
+          schema: policy schema that rollouts must have.
+          observation_size: D.
+          action_size: A.
+          staleness: admission, at its start.
+          queue_limit: rollouts that wait for an update.
+          name: the learner's name, for logs.
+          durable: what `durable` returned when the checkpoint was written, to go on from it.
+
+        Raises:
+          CongraspError: the durable state is of another epoch.
         """
-        self._run, self._config_json, self._epoch, self._sizes = run, config_json, epoch, sizes
-        self._staleness, self._on_event, self._transport = staleness, on_event, transport
-        self._lock = threading.Condition()
-        self._queue: collections.deque[Message] = collections.deque()
-        self._seen: dict[str, dict[str, Any]] = {}
-        self._bundle: Message | None = None
-        self._version = -1
-        self._done = False
-        self._alive: dict[str, float] = {}
-        self._actors: dict[str, dict[str, Any]] = {}
-        self._progress: dict[str, float] = {}
-        transport.watch_alive(keys.alive_key(run, "*", "*", "*"), self._on_alive)
-        transport.serve(keys.key(run, keys.CONFIG), self._serve_config)
-        transport.serve(keys.key(run, keys.TICKET), self._serve_ticket)
-        transport.serve(keys.key(run, keys.ROLLOUT), self._serve_rollout, workers=2)
-        transport.serve(keys.key(run, keys.WEIGHTS), self._serve_weights, workers=2)
-        transport.serve(keys.key(run, keys.STATUS), lambda key, request: Message({}, self.status()))
+        self.keys = Keys(run)
+        self.epoch = epoch
+        self.life = secrets.token_hex(4)
+        self._transport = transport
+        self._config = config_json
+        self._schema = schema
+        self._observation_size, self._action_size = observation_size, action_size
+        self._staleness = staleness
+        self._limit = queue_limit
+        self._name = check_name("learner", name)
+        self._changed = threading.Condition()
+        self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
+        self._marks: collections.OrderedDict[Owner, _Marks] = collections.OrderedDict()
+        self._rolled_back = 0
+        self._bundle: SharedMessage | None = None
+        self._alive: set[Alive] = set()
+        self._arrivals: collections.deque[tuple[float, int]] = collections.deque()
+        self._last_event: dict[str, float] = {}
+        self._finished = False
+        if durable is not None:
+            self._restore(durable)
+        transport.serve(self.keys.config, self._on_config)
+        transport.serve(self.keys.ticket, self._on_ticket, depth=64)
+        transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
+        transport.serve(self.keys.weights, self._on_weights, workers=2, depth=16)
+        transport.serve(self.keys.rollout, self._on_rollout, workers=2, depth=8, on_damage=self._on_damage)
+        transport.watch_alive(self.keys.everyone, self._on_alive)
+        transport.declare_alive(self.keys.alive("learner", name, self.life))
 
     def next_batch(self, count: int, timeout: float) -> list[Message] | None:
-        """The oldest `count` rollouts that are fresh enough for the present version, or None after `timeout` s."""
+        """The `count` oldest rollouts that are fresh enough; None if there are not so many within `timeout` seconds."""
         deadline = time.monotonic() + timeout
-        with self._lock:
+        with self._changed:
             while True:
                 self._drop_stale()
                 if len(self._queue) >= count:
                     batch = [self._queue.popleft() for _ in range(count)]
-                    break
-                if not self._lock.wait(max(0.0, deadline - time.monotonic())) and time.monotonic() >= deadline:
+                    for header, _ in batch:
+                        self._staleness.take(header.version)
+                    return [message for _, message in batch]
+                rest = deadline - time.monotonic()
+                if rest <= 0:
                     return None
-        for _ in batch:
-            self._staleness.leave_queue(stale=False)
-        return batch
+                self._changed.wait(rest)
 
     def publish_weights(self, bundle: Message, version: int) -> None:
-        """Makes a bundle the newest; actors pull it, others hear of it."""
-        validate_bundle(bundle)
-        with self._lock:
-            self._bundle, self._version = bundle, version
-        self._transport.publish(
-            keys.key(self._run, keys.ANNOUNCE), Message({}, {"version": version, "epoch": self._epoch})
-        )
+        """Makes a policy bundle the latest one, and says so to everyone.
 
-    def set_progress(self, values: dict[str, float]) -> None:
-        """Figures that `status` shows beside the ledger."""
-        self._progress = values
+        Args:
+          bundle: a policy bundle of this epoch and schema.
+          version: its version; one more than the last, except after a resume.
+        """
+        validate_bundle(bundle, schema=self._schema)
+        if (bundle.meta["version"], bundle.meta["epoch"]) != (version, self.epoch):
+            raise CongraspError(f"The bundle is not version {version} of epoch {self.epoch}.")
+        with self._changed:
+            self._bundle = SharedMessage(bundle.arrays, bundle.meta)
+            self._staleness.publish(version)
+        self._transport.publish(self.keys.announcement, Message(meta=self._state()))
 
     def finish(self) -> None:
-        """The run is over: actors that ask for a ticket are sent home."""
-        self._done = True
+        """Tells actors that the run is over."""
+        self._finished = True
+        self._transport.publish(self.keys.announcement, Message(meta=self._state()))
 
     def status(self) -> dict[str, Any]:
-        """The run as JSON: versions, roles alive, rollouts on their way, ledger, progress, actors."""
-        with self._lock:
+        """How things stand, as JSON: roles, versions, rates and the ledger."""
+        with self._changed:
+            now = time.monotonic()
+            self._forget_arrivals(now)
+            span = min(_RATE_SECONDS, max(1.0, now - self._arrivals[0][0])) if self._arrivals else _RATE_SECONDS
+            roles: list[dict[str, Any]] = []
+            for alive in sorted(self._alive):
+                marks = self._marks.get((alive.id, alive.incarnation)) if alive.role == "actor" else None
+                entry = {"rollouts": marks.rollouts, "version": marks.version} if marks else {}
+                roles.append({**alive._asdict(), **entry})
             return {
-                "run": self._run,
-                "epoch": self._epoch,
-                "version": self._version,
-                "done": self._done,
-                "alive": sorted(self._alive),
-                "running": self._staleness.running,
-                "queued": self._staleness.queued,
-                "ledger": dataclasses.asdict(self._staleness.ledger),
-                "progress": dict(self._progress),
-                "actors": {name: dict(entry) for name, entry in self._actors.items()},
-                "time": time.time(),
+                **self._state(),
+                "run": self.keys.run,
+                "schema": self._schema,
+                "roles": roles,
+                "rates": {
+                    "rollouts_per_second": len(self._arrivals) / span,
+                    "steps_per_second": sum(steps for _, steps in self._arrivals) / span,
+                },
+                "queue": {"length": len(self._queue), "limit": self._limit},
+                "ledger": self._staleness.ledger() | {"rolled_back": self._total_rolled_back()},
             }
 
-    def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps: ledger and identities of accepted rollouts (rollouts still queued are not in it)."""
-        with self._lock:
-            ledger = dataclasses.asdict(self._staleness.ledger)
-            ledger["accepted"] -= len(self._queue)
-            waiting = {_identity(message) for message in self._queue}
-            seen = {}
-            for owner, marks in self._seen.items():
-                extra = {n for n in marks["extra"] if (owner, n) not in waiting}
-                low = min([marks["below"], *(n for o, n in waiting if o == owner)])
-                extra |= {n for n in range(low, marks["below"]) if (owner, n) not in waiting}
-                seen[owner] = {"below": low, "extra": sorted(extra)}
-            return {"ledger": ledger, "seen": seen}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """The inverse of `state`, before actors come back."""
-        with self._lock:
-            self._staleness.ledger = Ledger(**state["ledger"])
-            self._seen = {
-                owner: {"below": marks["below"], "extra": set(marks["extra"])} for owner, marks in state["seen"].items()
+    def durable(self) -> dict[str, Any]:
+        """What a checkpoint must keep of the hub, as JSON; call it between two updates, when no batch is in hand."""
+        with self._changed:
+            waiting = {(header.owner, header.sequence) for header, _ in self._queue}
+            marks = []
+            for owner, mark in self._marks.items():
+                queued = {sequence for of, sequence in waiting if of == owner}
+                start = min(queued | {mark.next})
+                settled = set(range(start, mark.next)) | mark.ahead
+                marks.append([*owner, start, sorted(settled - queued)])
+            return {
+                "epoch": self.epoch,
+                "version": self._staleness.version,
+                "ledger": self._staleness.durable(),
+                "rolled_back": self._total_rolled_back(),
+                "marks": marks,
             }
 
-    def _serve_config(self, key: str, request: Message) -> Message:
-        return Message({}, {"config": self._config_json, "epoch": self._epoch})
+    def _restore(self, durable: Mapping[str, Any]) -> None:
+        if durable["epoch"] != self.epoch:
+            raise CongraspError(f"The checkpoint is of epoch {durable['epoch']}, not {self.epoch}.")
+        self._staleness.restore(durable["ledger"], durable["version"])
+        self._rolled_back = durable["rolled_back"]
+        for actor, incarnation, start, ahead in durable["marks"]:
+            marks = self._marks[actor, incarnation] = _Marks(start, set(ahead))
+            marks.resumed_at = marks.end
 
-    def _serve_ticket(self, key: str, request: Message) -> Message:
-        actor, incarnation = _owner(request)
-        common = {"epoch": self._epoch, "version": self._version, "done": self._done}
-        if self._done or self._version < 0:
-            return Message({}, {**common, "ticket": None, "retry_after": 10 * RETRY_SECONDS})
-        ticket = self._staleness.grant((actor, incarnation))
-        return Message({}, {**common, "ticket": ticket, "retry_after": RETRY_SECONDS})
+    def _total_rolled_back(self) -> int:
+        return self._rolled_back + sum(marks.rolled_back for marks in self._marks.values())
 
-    def _serve_rollout(self, key: str, request: Message) -> Message:
-        ticket = str(request.meta.get("ticket", ""))
-        try:
-            actor, _ = _owner(request)
-            validate_rollout(
-                request,
-                observation_size=self._sizes.observation,
-                action_size=self._sizes.action,
-                schema=self._sizes.schema,
-            )
-        except CongraspError as error:
-            self._staleness.give_back(ticket)
-            self._staleness.ledger.refused += 1
-            self._on_event("warning", f"Refused a rollout: {error}")
-            return Message({}, {"outcome": "refused", "why": str(error)})
-        if request.meta["epoch"] != self._epoch:
-            self._staleness.give_back(ticket)
-            self._staleness.ledger.refused += 1
-            return Message({}, {"outcome": "other_epoch", "why": "The learner has started a new training."})
-        with self._lock:
-            if not self._mark(request):
-                self._staleness.give_back(ticket)
-                self._staleness.ledger.duplicate += 1
-                return Message({}, {"outcome": "duplicate"})
-            self._staleness.accept(ticket)
-            self._queue.append(request)
-            entry = self._actors.setdefault(actor, {"rollouts": 0, "steps": 0})
-            entry["rollouts"] += 1
-            entry["steps"] += request.meta["steps"]
-            entry["version"] = request.meta["version"]
-            entry["time"] = time.time()
-            self._lock.notify_all()
-        return Message({}, {"outcome": "accepted"})
+    def _state(self) -> dict[str, Any]:
+        version = self._staleness.version if self._bundle else -1
+        return {"version": version, "epoch": self.epoch, "life": self.life, "finished": self._finished}
 
-    def _mark(self, message: Message) -> bool:
-        """Remembers a rollout's identity; false if it is known. `below` and `extra` stay small when order is kept."""
-        owner, sequence = _identity(message)
-        marks = self._seen.setdefault(owner, {"below": 0, "extra": set()})
-        if sequence < marks["below"] or sequence in marks["extra"]:
-            return False
-        marks["extra"].add(sequence)
-        while marks["below"] in marks["extra"]:
-            marks["extra"].discard(marks["below"])
-            marks["below"] += 1
-        return True
+    def _on_config(self, key: str, request: Message) -> Message:
+        return Message(meta={**self._state(), "config": self._config, "schema": self._schema})
 
-    def _serve_weights(self, key: str, request: Message) -> Message:
-        newer_than = request.meta.get("newer_than", -1)
-        with self._lock:
-            bundle, version = self._bundle, self._version
-        if bundle is None or (isinstance(newer_than, int) and newer_than >= version):
-            return Message({}, {"version": version, "epoch": self._epoch})
+    def _on_ticket(self, key: str, request: Message) -> Message:
+        validate(request, TICKET)
+        meta = request.meta
+        owner = check_name("actor", meta["actor"]), check_name("incarnation", meta["incarnation"])
+        ticket_id = check_name("ticket", meta["ticket"])
+        if meta.get("give_back"):
+            self._staleness.give_back(owner, ticket_id)
+            return Message(meta=self._state())
+        may = self._bundle is not None and not self._finished
+        ticket = self._staleness.grant(owner, ticket_id) if may else None
+        return Message(meta={**self._state(), "granted": ticket is not None, "retry_after": _RETRY_SECONDS})
+
+    def _on_weights(self, key: str, request: Message) -> Message:
+        bundle, state = self._bundle, self._state()
+        known = request.meta.get("newer_than"), request.meta.get("life", self.life)
+        if bundle is None or known == (bundle.meta["version"], self.life):
+            return Message(meta=state)
         return bundle
 
-    def _on_alive(self, key: str, alive: bool) -> None:
-        _, role, name, incarnation = keys.relative(key).split("/")
-        label = f"{role}/{name}/{incarnation}"
-        with self._lock:
-            if alive:
-                self._alive[label] = time.time()
-            else:
-                self._alive.pop(label, None)
-        if alive:
-            self._on_event("info", f"The {role} '{name}' has joined.")
-        elif role == "actor":
-            returned = self._staleness.forget((name, incarnation))
-            self._on_event("warning", f"The actor '{name}' has left; {returned} ticket(s) returned.")
+    def _on_rollout(self, key: str, message: Message) -> Message:
+        meta = message.meta
+        ticket = str(meta.get("ticket", ""))
+        try:
+            header = validate_rollout(
+                message,
+                observation_size=self._observation_size,
+                action_size=self._action_size,
+                schema=self._schema,
+            )
+        except CongraspError as error:
+            self._staleness.refuse_damaged((str(meta.get("actor")), str(meta.get("incarnation"))), ticket)
+            self._event("warning", f"A rollout was refused: {error}", kind="refused")
+            return self._answer("refused", why=str(error))
+        if header.epoch != self.epoch:
+            self._staleness.refuse_stale(header.owner, ticket)
+            return self._answer("stale", why=f"It is of epoch {header.epoch}, not {self.epoch}.")
+        with self._changed:
+            return self._admit(header, ticket, message)
+
+    def _admit(self, header: RolloutHeader, ticket: str, message: Message) -> Message:
+        if self._bundle is None:
+            return self._answer("retry", why="The learner is starting.")
+        marks = self._marks_of(header.owner)
+        marks.arrive(header.sequence)
+        if header.sequence in marks:
+            self._staleness.refuse_duplicate(header.owner, ticket)
+            return self._answer("duplicate")
+        if len(self._queue) >= self._limit:
+            return self._answer("retry", why=f"{self._limit} rollouts wait already.")
+        if self._finished:
+            self._staleness.refuse_stale(header.owner, ticket)
+            return self._answer("stale", why="The run is finished.")
+        verdict = self._staleness.arrive(header.owner, ticket, header.version)
+        if verdict == "full":
+            return self._answer("retry", why="No more rollouts are needed at this version.")
+        if verdict == "stale":
+            why = f"It was made by version {header.version}, and the learner is at {self._staleness.version}."
+            self._event("info", f"A rollout of {header.actor} was refused. {why}", kind="stale")
+            return self._answer("stale", why=why)
+        marks.add(header)
+        self._queue.append((header, message))
+        now = time.monotonic()
+        self._arrivals.append((now, header.steps))
+        self._forget_arrivals(now)
+        self._changed.notify_all()
+        return self._answer("accepted")
+
+    def _answer(self, outcome: str, *, why: str = "") -> Message:
+        return Message(meta={**self._state(), "outcome": outcome, "why": why, "retry_after": _RETRY_SECONDS})
+
+    def _marks_of(self, owner: Owner) -> _Marks:
+        marks = self._marks.setdefault(owner, _Marks())
+        self._marks.move_to_end(owner)
+        if len(self._marks) > _INCARNATIONS:
+            _, oldest = self._marks.popitem(last=False)
+            self._rolled_back += oldest.rolled_back
+        return marks
+
+    def _forget_arrivals(self, now: float) -> None:
+        while self._arrivals and self._arrivals[0][0] < now - _RATE_SECONDS:
+            self._arrivals.popleft()
 
     def _drop_stale(self) -> None:
-        oldest = self._version - self._staleness.max_staleness
-        while self._queue and self._queue[0].meta["version"] < oldest:
-            message = self._queue.popleft()
-            self._staleness.leave_queue(stale=True)
-            self._on_event("warning", f"Dropped a rollout of '{message.meta['actor']}': too old.")
+        stale = [header for header, _ in self._queue if self._staleness.is_stale(header.version)]
+        if not stale:
+            return
+        self._queue = collections.deque(
+            entry for entry in self._queue if not self._staleness.is_stale(entry[0].version)
+        )
+        for header in stale:
+            self._staleness.take(header.version)
+        actors = ", ".join(sorted({header.actor for header in stale}))
+        self._event("warning", f"Dropped as too old at version {self._staleness.version}: {len(stale)} of {actors}.")
 
+    def _on_damage(self, key: str, error: CongraspError) -> None:
+        self._staleness.refuse_damaged()
+        self._event("warning", f"A damaged message arrived at {key}: {error}", kind="damaged")
 
-def _owner(message: Message) -> tuple[str, str]:
-    actor, incarnation = message.meta.get("actor"), message.meta.get("incarnation")
-    if not isinstance(actor, str) or not isinstance(incarnation, str):
-        raise CongraspError("The request does not name its actor and incarnation.")
-    return actor, incarnation
+    def _on_alive(self, key: str, alive: bool) -> None:
+        who = parse_alive(key)
+        if who is None:
+            return
+        with self._changed:
+            (self._alive.add if alive else self._alive.discard)(who)
+        if alive:
+            return
+        tickets = self._staleness.forget((who.id, who.incarnation)) if who.role == "actor" else 0
+        self._event("info", f"The {who.role} {who.id} left; {tickets} of its tickets returned.")
 
-
-def _identity(message: Message) -> tuple[str, int]:
-    return f"{message.meta['actor']}/{message.meta['incarnation']}", message.meta["sequence"]
+    def _event(self, level: str, text: str, *, kind: str = "") -> None:
+        """Publishes an event; at most one of a kind each second, if strangers can cause it at will."""
+        now = time.monotonic()
+        if kind and now - self._last_event.get(kind, -_EVENT_SECONDS) < _EVENT_SECONDS:
+            return
+        self._last_event[kind] = now
+        meta = {"time": time.time(), "level": level, "text": text}
+        self._transport.publish(self.keys.log("event", "learner", self._name), Message(meta=meta))

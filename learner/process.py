@@ -21,12 +21,12 @@ from common.errors import CongraspError, PhysicsError
 from common.files import write_atomically
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, PolicySpec
-from common.transport import keys
 from common.transport.base import Transport
+from common.transport.keys import Keys
 from common.wire.codec import Message, encode
 from learner import update as updates
 from learner.checkpoint import Checkpoints, flatten
-from learner.hub import LearnerHub, RolloutSizes
+from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from learner.statistics import Pace, episode_means, staleness
 from learner.update import NonFiniteUpdate
@@ -137,7 +137,7 @@ class _Learner:
         on_event: Notify,
     ):
         self._run_dir, self._config, self._transport, self._name = run_dir, config, transport, name
-        self._on_event = on_event
+        self._on_event, self._keys = on_event, Keys(config.name)
         self._spec: PolicySpec = bundles.policy_spec(config.task, config.network)
         self._checkpoints = Checkpoints(run_dir / "checkpoints")
         self._state = updates.init_state(
@@ -158,13 +158,13 @@ class _Learner:
             run=config.name,
             config_json=to_json(config),
             epoch=self._epoch,
-            sizes=RolloutSizes(sum(size for _, size in self._spec.layout), self._spec.action_size, self._spec.schema),
-            staleness=StalenessManager(max_staleness=config.ppo.max_staleness, batch=config.ppo.rollouts_per_update),
-            on_event=self._event,
+            schema=self._spec.schema,
+            observation_size=sum(size for _, size in self._spec.layout),
+            action_size=self._spec.action_size,
+            staleness=StalenessManager(config.ppo.max_staleness, config.ppo.rollouts_per_update),
+            name=name,
+            durable=hub_state,
         )
-        if hub_state is not None:
-            self._hub.restore(hub_state)
-        transport.declare_alive(keys.alive_key(config.name, "learner", name, secrets.token_hex(8)))
 
     @property
     def version(self) -> int:
@@ -202,7 +202,6 @@ class _Learner:
             values["steps_per_second"] = pace.steps_per_second(sum(message.meta["steps"] for message in messages))
             values["transitions"] = float(self._state.transitions)
             self._log("metrics", {"update": self._state.version, "version": self.version, "values": values})
-            self._hub.set_progress({"updates": float(self._config.updates), **values})
             on_update({"update": float(self._state.version), "version": float(self.version), **values})
             if self._state.version % self._config.checkpoint_every == 0:
                 saved = self._save()
@@ -278,7 +277,7 @@ class _Learner:
         updates.update(copy, batch, spec.layout, config.ppo)
 
     def _save(self) -> int:
-        meta = {"epoch": self._epoch, "skipped": self._skipped, "hub": self._hub.state()}
+        meta = {"epoch": self._epoch, "skipped": self._skipped, "hub": self._hub.durable()}
         self._checkpoints.save(self._state, meta, self._state.version)
         bundles.save(self.bundle(), self._run_dir / POLICY_FILE)
         return self._state.version
@@ -287,7 +286,7 @@ class _Learner:
         """Sends the actors home, and gives them a moment to hear it."""
         self._hub.finish()
         deadline = time.monotonic() + _FAREWELL_SECONDS
-        while time.monotonic() < deadline and any(who.startswith("actor/") for who in self._hub.status()["alive"]):
+        while time.monotonic() < deadline and any(who["role"] == "actor" for who in self._hub.status()["roles"]):
             time.sleep(_POLL_SECONDS / 4)
 
     def _event(self, level: str, text: str) -> None:
@@ -295,5 +294,5 @@ class _Learner:
         self._log("event", {"level": level, "text": text})
 
     def _log(self, kind: str, meta: dict[str, object]) -> None:
-        key = keys.log_key(self._config.name, kind, "learner", self._name)
-        self._transport.publish(key, Message({}, {"time": time.time(), **meta}))
+        message = Message(meta={"time": time.time(), **meta})
+        self._transport.publish(self._keys.log(kind, "learner", self._name), message)

@@ -1,60 +1,109 @@
-"""Admission: how many rollouts may be on their way, so that none is too old when it is used. Knows no transport."""
+"""Admission by staleness: how many rollouts may be under way, and which are too old to learn from.
+
+An actor asks for a ticket before it makes a rollout. A ticket is granted while
+
+    accepted + running < (max_staleness + version + 1) * batch
+
+(AReaL, arXiv 2505.24298, section on staleness control), where `version` counts the updates, `accepted` all rollouts
+that its updates have used or that wait for one, and `running` the tickets that are out. So nothing is made that could
+only be thrown away, unless its actor is slow. A rollout that arrives more than `max_staleness` versions after the
+policy that made it is refused, and dropped if it grows that old while it waits.
+
+A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes.
+"""
 
 import dataclasses
-import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Literal, NamedTuple
 
 Owner = tuple[str, str]
-"""(actor, incarnation)."""
+"""Actor and incarnation."""
+Verdict = Literal["accepted", "stale", "full"]
+
+
+class Ticket(NamedTuple):
+    """Permission to make one rollout."""
+
+    owner: Owner
+    id: str
+    """Chosen by the owner, so that asking twice yields one ticket."""
+    version: int
+    """Policy version when it was granted."""
+    deadline: float
 
 
 @dataclasses.dataclass
 class Ledger:
-    """What became of tickets and rollouts since the run began."""
+    """What became of tickets and rollouts.
+
+    Always `granted = running + redeemed + returned + expired` and `accepted = consumed + dropped + queued`.
+    """
 
     granted: int = 0
+    """Tickets given out."""
+    redeemed: int = 0
+    """Tickets whose rollout arrived, whatever was said to it."""
+    returned: int = 0
+    """Tickets given back, by their owner or by its death."""
     expired: int = 0
+    """Tickets whose deadline passed."""
     accepted: int = 0
-    duplicate: int = 0
-    refused: int = 0
-    stale: int = 0
+    """Rollouts taken in; their actors were told so."""
     consumed: int = 0
+    """Accepted rollouts that were handed to an update."""
+    dropped: int = 0
+    """Accepted rollouts that were too old when their turn came."""
+    stale: int = 0
+    """Rollouts refused on arrival as too old."""
+    duplicate: int = 0
+    """Arrivals of a rollout that had been accepted before."""
+    damaged: int = 0
+    """Messages refused because they were damaged or broke the rules of a rollout."""
 
 
 class StalenessManager:
-    """Grants tickets for rollouts while `queued + running < (eta + 1) * batch`.
-
-    This is `accepted + running < (eta + version + 1) * batch` with the `version * batch` rollouts of past updates
-    taken off both sides: with first-in-first-out consumption a rollout started at version v is used at v + eta at the
-    latest. Tickets of owners that died, or that ran out of time, return. All methods are thread safe.
-    """
+    """Tickets and the ledger; knows neither messages nor a transport. Safe to call from several threads."""
 
     def __init__(
         self,
-        *,
         max_staleness: int,
-        batch: int,
+        rollouts_per_update: int,
+        *,
         ticket_seconds: float = 120.0,
+        tickets_per_owner: int = 4,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Nothing is on its way.
+        """Starts at version 0 with nothing under way.
 
         Args:
           max_staleness: eta, versions.
-          batch: rollouts that one update consumes.
-          ticket_seconds: after this a ticket that was not redeemed returns.
+          rollouts_per_update: the batch.
+          ticket_seconds: seconds until an unused ticket expires.
+          tickets_per_owner: tickets that one owner can hold, so that nobody takes all there are.
           clock: seconds, monotonic.
         """
-        self.max_staleness = max_staleness
-        self.batch = batch
-        self.ledger = Ledger()
-        self._ticket_seconds = ticket_seconds
+        self._max_staleness = max_staleness
+        self._batch = rollouts_per_update
+        self._seconds = ticket_seconds
+        self._per_owner = tickets_per_owner
         self._clock = clock
-        self._lock = threading.Lock()
-        self._tickets: dict[str, tuple[Owner, float]] = {}
-        self._queued = 0
+        self._lock = threading.RLock()
+        self._tickets: dict[tuple[Owner, str], Ticket] = {}
+        self._version = 0
+        self._in_update = 0
+        self._ledger = Ledger()
+
+    @property
+    def version(self) -> int:
+        """The current policy version."""
+        return self._version
+
+    @property
+    def rollouts_per_update(self) -> int:
+        """The batch."""
+        return self._batch
 
     @property
     def running(self) -> int:
@@ -65,53 +114,140 @@ class StalenessManager:
 
     @property
     def queued(self) -> int:
-        """Rollouts accepted and not yet consumed."""
-        return self._queued
+        """Accepted rollouts that wait for an update."""
+        return self._ledger.accepted - self._ledger.consumed - self._ledger.dropped
 
-    def grant(self, owner: Owner) -> str | None:
-        """A new ticket, or None while enough is on its way."""
+    @property
+    def capacity(self) -> int:
+        """Tickets that could be granted now."""
+        with self._lock:
+            # Every version stands for one batch; so a resumed run, or an update of another size, leaves no debt.
+            accepted = self._version * self._batch + self._in_update + self.queued
+            return (self._max_staleness + self._version + 1) * self._batch - accepted - self.running
+
+    def grant(self, owner: Owner, ticket_id: str) -> Ticket | None:
+        """A ticket, or None if there is none now; asking again with the same id returns the same ticket."""
         with self._lock:
             self._expire()
-            if self._queued + len(self._tickets) >= (self.max_staleness + 1) * self.batch:
+            if held := self._tickets.get((owner, ticket_id)):
+                return held
+            mine = sum(ticket.owner == owner for ticket in self._tickets.values())
+            if mine >= self._per_owner or self.capacity <= 0:
                 return None
-            ticket = secrets.token_hex(8)
-            self._tickets[ticket] = (owner, self._clock() + self._ticket_seconds)
-            self.ledger.granted += 1
+            ticket = Ticket(owner, ticket_id, self._version, self._clock() + self._seconds)
+            self._tickets[owner, ticket_id] = ticket
+            self._ledger.granted += 1
             return ticket
 
-    def accept(self, ticket: str) -> None:
-        """A rollout was accepted; its ticket (which may have expired meanwhile) is redeemed."""
+    def give_back(self, owner: Owner, ticket_id: str) -> None:
+        """Ends a ticket that its owner does not need; an unknown one is ignored."""
         with self._lock:
-            self._tickets.pop(ticket, None)
-            self._queued += 1
-            self.ledger.accepted += 1
-
-    def give_back(self, ticket: str) -> None:
-        """A ticket returns without a rollout (it was refused, or a duplicate)."""
-        with self._lock:
-            self._tickets.pop(ticket, None)
+            if self._tickets.pop((owner, ticket_id), None):
+                self._ledger.returned += 1
 
     def forget(self, owner: Owner) -> int:
-        """The tickets of a dead owner return; their number."""
+        """Ends all tickets of an owner that died; returns their number."""
         with self._lock:
-            mine = [ticket for ticket, (holder, _) in self._tickets.items() if holder == owner]
-            for ticket in mine:
-                del self._tickets[ticket]
-            self.ledger.expired += len(mine)
+            mine = [key for key in self._tickets if key[0] == owner]
+            for key in mine:
+                del self._tickets[key]
+            self._ledger.returned += len(mine)
             return len(mine)
 
-    def leave_queue(self, *, stale: bool) -> None:
-        """A queued rollout was consumed, or dropped because it had become too old."""
+    def arrive(self, owner: Owner, ticket_id: str, version: int) -> Verdict:
+        """Decides about a valid rollout that arrived for the first time.
+
+        Its ticket ends unless the verdict is `full`: it has none (any more), and nothing more may come in. It may come
+        again later.
+
+        Args:
+          owner: who made it.
+          ticket_id: the ticket it was made under.
+          version: the policy version it was made with.
+        """
         with self._lock:
-            self._queued -= 1
-            if stale:
-                self.ledger.stale += 1
-            else:
-                self.ledger.consumed += 1
+            if self.is_stale(version) or version > self._version:
+                self.refuse_stale(owner, ticket_id)
+                return "stale"
+            self._expire()
+            if (owner, ticket_id) not in self._tickets and self.capacity <= 0:
+                return "full"
+            self.redeem(owner, ticket_id)
+            self._ledger.accepted += 1
+            return "accepted"
+
+    def redeem(self, owner: Owner, ticket_id: str) -> None:
+        """Ends the ticket of a rollout that was answered; an unknown one is ignored."""
+        with self._lock:
+            if self._tickets.pop((owner, ticket_id), None):
+                self._ledger.redeemed += 1
+
+    def refuse_stale(self, owner: Owner, ticket_id: str) -> None:
+        """Notes a rollout that is too old, or that another training made."""
+        with self._lock:
+            self.redeem(owner, ticket_id)
+            self._ledger.stale += 1
+
+    def refuse_duplicate(self, owner: Owner, ticket_id: str) -> None:
+        """Notes that an accepted rollout came again."""
+        with self._lock:
+            self.redeem(owner, ticket_id)
+            self._ledger.duplicate += 1
+
+    def refuse_damaged(self, owner: Owner | None = None, ticket_id: str = "") -> None:
+        """Notes a message that is no valid rollout."""
+        with self._lock:
+            if owner is not None:
+                self.redeem(owner, ticket_id)
+            self._ledger.damaged += 1
+
+    def is_stale(self, version: int) -> bool:
+        """Whether a rollout of this policy version is too old to learn from."""
+        return self._version - version > self._max_staleness
+
+    def take(self, version: int) -> bool:
+        """Hands an accepted rollout to the coming update; False if it has grown too old, and is dropped."""
+        with self._lock:
+            if self.is_stale(version):
+                self._ledger.dropped += 1
+                return False
+            self._ledger.consumed += 1
+            self._in_update += 1
+            return True
+
+    def publish(self, version: int) -> None:
+        """Moves on to a version, which ends the update that led to it."""
+        with self._lock:
+            self._version = version
+            self._in_update = 0
+
+    def ledger(self) -> dict[str, int]:
+        """All counts, with the tickets that run, the rollouts that wait and the capacity now."""
+        with self._lock:
+            self._expire()
+            gauges = {"running": len(self._tickets), "queued": self.queued, "capacity": self.capacity}
+            return dataclasses.asdict(self._ledger) | gauges
+
+    def durable(self) -> dict[str, int]:
+        """What a checkpoint keeps: the counts without what is under way, which dies with the process."""
+        with self._lock:
+            self._expire()
+            counts = dataclasses.asdict(self._ledger)
+            return counts | {
+                "granted": self._ledger.granted - len(self._tickets),
+                "accepted": counts["accepted"] - self.queued,
+            }
+
+    def restore(self, durable: Mapping[str, int], version: int) -> None:
+        """Goes on from a checkpoint: its counts and its version, with nothing under way."""
+        with self._lock:
+            self._ledger = Ledger(**durable)
+            self._tickets.clear()
+            self.publish(version)
 
     def _expire(self) -> None:
         now = self._clock()
-        late = [ticket for ticket, (_, deadline) in self._tickets.items() if deadline < now]
-        for ticket in late:
-            del self._tickets[ticket]
-        self.ledger.expired += len(late)
+        late = [key for key, ticket in self._tickets.items() if ticket.deadline <= now]
+        for key in late:
+            del self._tickets[key]
+        self._ledger.expired += len(late)

@@ -125,15 +125,21 @@ class Evaluator:
         self._physics_name, self._threads, self._batch, self._seed = physics, threads, batch, seed
         self._taskset: TaskSet = build_taskset(self._hand, self.task, objects, seed)
 
-    def row(self, constraint: str, episodes: int, progress: Callable[[int], None] = lambda n: None) -> Row:
+    def row(
+        self,
+        constraint: str,
+        episodes: int,
+        progress: Callable[[int], None] = lambda n: None,
+        seed: int | None = None,
+    ) -> Row:
         """Runs whole batches until `episodes` have ended, and summarises the first `episodes` of them."""
-        collected = [found for found, _ in self._run(constraint, episodes, progress)]
+        collected = [found for found, _ in self._run(constraint, episodes, progress, seed)]
         values = {name: np.concatenate([part[name] for part in collected])[:episodes] for name in collected[0]}
         return summarise(constraint, self.bundle.spec.hand, values)
 
-    def episode(self, constraint: str) -> Message:
+    def episode(self, constraint: str, seed: int | None = None) -> Message:
         """World 0's first episode under a set of constraints, for pictures."""
-        env, rollout = next(iter(self._run(constraint, 1, lambda n: None)))[1]
+        env, rollout = next(iter(self._run(constraint, 1, lambda n: None, seed)))[1]
         metrics = dict(zip(finished_episodes(rollout), np.asarray(rollout.episodes)[0], strict=True))
         plain = {name.removeprefix("episode/"): float(v) for name, v in metrics.items() if "episode/" in name}
         return episode_message(
@@ -146,7 +152,7 @@ class Evaluator:
             {"version": self.bundle.version, "actor": "evaluation", "success": plain["success"] > 0, "metrics": plain},
         )
 
-    def _run(self, constraint: str, episodes: int, progress: Callable[[int], None]) -> Any:
+    def _run(self, constraint: str, episodes: int, progress: Callable[[int], None], seed: int | None) -> Any:
         task = with_constraints(self.task, constraint)
         physics = make_physics(self._physics_name, self._hand, task, self.objects, threads=self._threads)
         layout = self.bundle.spec.layout
@@ -162,7 +168,7 @@ class Evaluator:
                 self._taskset,
                 policy,
                 batch=min(self._batch, episodes),
-                seed=self._seed,
+                seed=self._seed if seed is None else seed,
                 half=False,
             )
             done = 0
@@ -206,3 +212,27 @@ def write_json(rows: Sequence[Row], path: pathlib.Path) -> None:
     path.write_text(json.dumps({"rows": [row.to_json() for row in rows]}, indent=2))
 
 
+
+
+def table_of(rows: Sequence[Row], title: str) -> Any:
+    """Rows as a rich table."""
+    from rich.table import Table
+
+    table = Table(title=title)
+    for column in ("constraint", "episodes", "success", "95 %", "held", "error", "force"):
+        table.add_column(column, justify="left" if column in ("constraint", "error") else "right")
+    for row in rows:
+        parts = [f"{value:.3f} {_UNITS[name]}" for name, value in row.errors.items() if value is not None]
+        table.add_row(
+            row.constraint,
+            str(row.episodes),
+            f"{100 * row.success:.1f} %",
+            f"{100 * row.success_low:.1f}-{100 * row.success_high:.1f}",
+            f"{100 * row.held:.1f} %",
+            ", ".join(parts),
+            f"{row.force_sum:.1f} N",
+        )
+    return table
+
+
+_UNITS = {name: name.rsplit("_", 1)[1] for name in _NAMES.values()}

@@ -28,7 +28,7 @@ _UNITS = {
     "kl": "nats",
     "entropy": "nats",
     "fraction": "share",
-    "length": "control steps",
+    "episode/length": "control steps",
 }
 
 
@@ -172,5 +172,5 @@ def _panels(metrics: Sequence[str], prefix: str, unit: str) -> list[Panel]:
 
 def _panel(metric: str, prefix: str = "", unit: str = "") -> Panel:
     words = metric.removeprefix(prefix)
-    found = next((unit for end, unit in _UNITS.items() if words.endswith(end)), unit)
+    found = next((unit for end, unit in _UNITS.items() if metric.endswith(end)), unit)
     return Panel(words.replace("/", ": ").replace("_", " ").capitalize(), found, (metric,))

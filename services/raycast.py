@@ -32,7 +32,12 @@ _SOLID, _GLASS = 0, 1  # geom groups
 _FAR = 4.0  # distance of the lamps from what they light, m
 _KEY = np.array([-0.45, -0.55, 1.0])  # direction towards the key light, in the camera's turned frame
 _KEY_STRENGTH, _DOME_STRENGTH, _BOUNCE = 0.72, 0.46, 0.05
-_KEY_LAMPS, _DOME_LAMPS = 3, 8  # in each of four sets that neighbouring pixels take turns with
+_KEY_LAMPS, _DOME_LAMPS = 16, 32
+_SETS, _EDGE_SETS = (
+    16,
+    4,
+)  # sets into which the lamps are split; pixels, or samples of edge pixels, take turns with them
+_THREADS = 4
 _SKIN = 4e-4  # how far shadow rays may end before the surface, m
 _TOP, _BOTTOM = np.array([0.93, 0.945, 0.965]), np.array([0.80, 0.82, 0.85])  # background, sRGB
 
@@ -149,7 +154,7 @@ class _Scene:
             spec.worldbody.add_geom(**geom)
         self.model = spec.compile()
         # Ray casts keep scratch memory in their data: one for each thread.
-        self.data = [mujoco.MjData(self.model) for _ in range(4)]
+        self.data = [mujoco.MjData(self.model) for _ in range(_THREADS)]
         for data in self.data:
             mujoco.mj_kinematics(self.model, data)
         self.smooth = {
@@ -179,12 +184,12 @@ class _Scene:
         """(height, width, 3) uint8."""
         pixel = np.arange(width * height)
         row, column = np.divmod(pixel, width)
-        image, seen, normal = self._see(camera, _grid(camera, width, height), column % 2 + 2 * (row % 2), width)
+        image, seen, normal = self._see(camera, _grid(camera, width, height), column % 4 + 4 * (row % 4), width)
         edge = np.flatnonzero(_edges(seen.reshape(height, width), normal.reshape(height, width, 3)))
         step = (np.arange(SAMPLES) + 0.5) / SAMPLES
         x = np.add.outer(column[edge], np.tile(step, SAMPLES)).ravel()
         y = np.add.outer(row[edge], np.repeat(step, SAMPLES)).ravel()
-        fine, _, _ = self._see(camera, camera.rays(x, y, width, height), np.arange(len(x)) % 4, None)
+        fine, _, _ = self._see(camera, camera.rays(x, y, width, height), np.arange(len(x)) % _EDGE_SETS, None)
         image[edge] = fine.reshape(len(edge), SAMPLES**2, 3).mean(1)
         return (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8).reshape(height, width, 3)
 
@@ -196,7 +201,7 @@ class _Scene:
         Args:
           camera: where they begin.
           rays: unit directions.
-          lamp_set: (n,) which of the four sets of lamps lights each point.
+          lamp_set: (n,) which of the sets of lamps lights each point.
           width: pixels in a row where the rays are those of a whole picture, whose light is then smoothed.
 
         Returns:
@@ -247,39 +252,42 @@ class _Scene:
         right = camera.axes()[0]
         key = _KEY @ np.stack([right, np.cross([0.0, 0.0, 1.0], right), [0.0, 0.0, 1.0]])
         key = key / np.linalg.norm(key)
-        light = np.stack(self._light(point + 2 * _SKIN * normal, bent, key, lamp_set), -1)
+        sets = _EDGE_SETS if width is None else _SETS
+        light = np.stack(self._light(point + 2 * _SKIN * normal, bent, key, lamp_set, sets), -1)
         if width is not None:
-            for _ in range(2):
-                light = _blur(light, index, normal, pixel, (pixels, width))
-        seen_key, sky = light.T
+            for stride in (1, 2):
+                light = _blur(light, index, normal, pixel, (pixels, width), stride)
+        seen_key, open_sky = light.T
         half = key - ray
         half = half / np.linalg.norm(half, axis=1, keepdims=True)
         gloss = shine * seen_key * np.clip((bent * half).sum(1), 0, None) ** 60
         total = _KEY_STRENGTH * seen_key * np.clip(bent @ key, 0, None)
-        total += _DOME_STRENGTH * sky + _BOUNCE * (1 - bent[:, 2])
+        sky = 2 * np.clip(_facing(bent, _dome(_DOME_LAMPS)), 0, None).mean(1)
+        total += _DOME_STRENGTH * open_sky * sky + _BOUNCE * (1 - bent[:, 2])
         return np.clip(albedo**2.2 * total[:, None] + 0.35 * gloss[:, None], 0, 1) ** (1 / 2.2)
 
     def _light(
-        self, start: np.ndarray, normal: np.ndarray, key: np.ndarray, lamp_set: np.ndarray
+        self, start: np.ndarray, normal: np.ndarray, key: np.ndarray, lamp_set: np.ndarray, sets: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Share of the key light (n,) and light of the sky (n,) at points (n, 3), each lit by one of four lamp sets."""
-        seen, sky = np.zeros(len(start)), np.zeros(len(start))
-        keys, dome = _disc(key, 4 * _KEY_LAMPS, 0.14), _dome(4 * _DOME_LAMPS)
+        """Shares of the key light and of the sky (n,) that reach points (n, 3), each judged by one set of lamps."""
+        seen, sky, whole = np.zeros(len(start)), np.full(len(start), 1e-9), np.full(len(start), 1e-9)
+        keys, dome = _disc(key, _KEY_LAMPS, 0.14), _dome(_DOME_LAMPS)
 
-        def light(one: int) -> None:
-            mine = np.flatnonzero(lamp_set == one)
-            towards_key = mine[normal[mine] @ key > 0]
-            for lamp in keys[one::4]:
-                seen[towards_key] += self._lit(start[towards_key], lamp, one) / _KEY_LAMPS
-            for lamp in dome[one::4]:
-                # Wrapped Lambert: a lamp of the dome stands for a patch of sky.
-                facing = 0.75 * (normal[mine] @ lamp) + 0.25
-                here, facing = mine[facing > 0], facing[facing > 0]
-                sky[here] += 2 / _DOME_LAMPS * self._lit(start[here], lamp, one) * facing
+        def light(thread: int) -> None:
+            for one in range(thread, sets, _THREADS):
+                mine = np.flatnonzero(lamp_set == one)
+                towards_key = mine[normal[mine] @ key > 0]
+                for lamp in keys[one::sets]:
+                    seen[towards_key] += self._lit(start[towards_key], lamp, thread) * sets / _KEY_LAMPS
+                for lamp in dome[one::sets]:
+                    facing = _facing(normal[mine], lamp)
+                    here, facing = mine[facing > 0], facing[facing > 0]
+                    sky[here] += self._lit(start[here], lamp, thread) * facing
+                    whole[here] += facing
 
-        with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-            list(pool.map(light, range(4)))
-        return seen, sky
+        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+            list(pool.map(light, range(_THREADS)))
+        return seen, sky / whole
 
     def _lit(self, point: np.ndarray, lamp: np.ndarray, thread: int) -> np.ndarray:
         """(n,) whether a lamp in direction (3,) of the unit sphere is seen from points (n, 3)."""
@@ -290,6 +298,11 @@ class _Scene:
         length = np.linalg.norm(rays, axis=1, keepdims=True)
         _, distance, _ = self.cast(origin, rays / length, _SOLID, thread)
         return (distance < 0) | (distance > length[:, 0] - _SKIN)
+
+
+def _facing(normal: np.ndarray, lamps: np.ndarray) -> np.ndarray:
+    """Wrapped Lambert terms of normals (n, 3) towards lamps ([k,] 3): a lamp of the dome is a patch of sky."""
+    return 0.75 * (normal @ lamps.T) + 0.25
 
 
 def _painted(tree: cKDTree, colours: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -318,20 +331,20 @@ def _edges(seen: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def _blur(
-    value: np.ndarray, index: np.ndarray, normal: np.ndarray, pixel: np.ndarray, grid: tuple[int, int]
+    value: np.ndarray, index: np.ndarray, normal: np.ndarray, pixel: np.ndarray, grid: tuple[int, int], stride: int
 ) -> np.ndarray:
-    """Averages value (n, c) over the 3 x 3 pixels around, among points of one shape that face the same way.
+    """Averages value (n, c) over 3 x 3 pixels `stride` apart, among points of one shape that face the same way.
 
-    The binomial filter weighs the four interleaved lamp sets equally. `grid` is the number of pixels and a row's width.
+    Binomial filters with strides of one and two, one after the other, weigh 4 x 4 interleaved lamp sets equally. `grid` is the number of pixels and a row's width.
     """
     pixels, width = grid
     place = np.full(pixels, -1)
     place[pixel] = np.arange(len(pixel))
-    place = np.pad(place.reshape(-1, width), 1, constant_values=-1)
+    place = np.pad(place.reshape(-1, width), stride, constant_values=-1)
     row, column = np.divmod(pixel, width)
     total, weights = np.zeros(value.shape), np.zeros(len(value))
     for y, x in np.ndindex(3, 3):
-        other = place[row + y, column + x]
+        other = place[row + stride * y, column + stride * x]
         alike = (other >= 0) & (index[other] == index) & ((normal[other] * normal).sum(-1) > 0.8)
         weight = alike * float((2 - abs(y - 1)) * (2 - abs(x - 1)))
         total += weight[:, None] * value[other]

@@ -35,7 +35,7 @@ def record_run(
     console = Console(stderr=True)
     end = time.monotonic() + duration if duration is not None else None
     with contextlib.ExitStack() as stack:
-        transport = stack.enter_context(ZenohTransport(connect=connect, bulk=False))
+        transport = stack.enter_context(ZenohTransport(connect=[connect]))
         server = stack.enter_context(LiveServer(live)) if live is not None else None
         if server is not None:
             console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")
@@ -60,6 +60,6 @@ def record_run(
 def _state(recorder: Recorder) -> str:
     size = sum(file.stat().st_size for file in recorder.files if file.exists())
     return (
-        f"{recorder.messages} messages recorded, {size / 1e6:.1f} MB; lost on the way {recorder.gaps}, "
-        f"dropped here {recorder.dropped}, damaged {recorder.damaged}"
+        f"{recorder.messages} messages recorded, {size / 1e6:.1f} MB; "
+        f"lost {recorder.dropped}, damaged {recorder.damaged}"
     )

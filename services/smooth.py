@@ -58,7 +58,7 @@ class SmoothNormals:
         weight = np.clip(weights[rows, best], 0, 1)
         smooth = (weight[:, :, None] * self.corner_normals[face]).sum(1)
         # Meshes that wind inwards are lit from the side that is seen.
-        smooth *= np.sign((smooth * normal).sum(1, keepdims=True))
+        smooth *= np.where((smooth * normal).sum(1, keepdims=True) < 0, -1.0, 1.0)
         found = weights.min(-1).max(1) > -0.05
         smooth = np.where(found[:, None], smooth, normal)
         return smooth / np.linalg.norm(smooth, axis=1, keepdims=True)

@@ -202,7 +202,7 @@ def _roll(
     turn = rng.uniform(0, np.pi, len(direction))[:, None] + np.pi / _ROLLS * np.arange(_ROLLS)
     axes = _spin(side[:, None], other[:, None], turn).astype(np.float32)
     points = points[:_WIDTH_POINTS]
-    along = (axes.reshape(-1, 3) @ points.T).reshape(*turn.shape, -1)
+    along = (axes.reshape(-1, 3) @ points.T).reshape(*turn.shape, len(points))
     along -= (axes * position[:, None]).sum(-1, keepdims=True)
     shallow = direction @ points.T - (direction * position).sum(-1, keepdims=True) < _BEYOND
     # The slab's other axis is the roll a right angle further on: with the rolls spread over a half turn, the one

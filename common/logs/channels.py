@@ -72,13 +72,13 @@ class JsonChannels:
 
     def entry(self, topic: str, time: int, value: Mapping[str, Any]) -> Entry:
         """The object as an entry; fields that are NaN or infinite are left out, because JSON has no such numbers."""
-        finite = _finite(value)
+        plain = finite(value)
         fields = self._fields.setdefault(topic, {})
-        if _merge(fields, finite) or topic not in self._channels:
+        if _merge(fields, plain) or topic not in self._channels:
             # Schemas are known by their name, so every topic has its own.
             schema = json.dumps(_schema(fields)).encode()
             self._channels[topic] = Channel(topic, "json", f"congrasp{topic.replace('/', '.')}", "jsonschema", schema)
-        return Entry(self._channels[topic], time, json.dumps(finite, separators=(",", ":")).encode())
+        return Entry(self._channels[topic], time, json.dumps(plain, separators=(",", ":")).encode())
 
 
 def nest(values: Mapping[str, float]) -> dict[str, Any]:
@@ -109,11 +109,12 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _finite(value: Mapping[str, Any]) -> dict[str, Any]:
+def finite(value: Mapping[str, Any]) -> dict[str, Any]:
+    """A JSON object without its numbers that are NaN or infinite, at any depth."""
     result: dict[str, Any] = {}
     for name, item in value.items():
         if isinstance(item, Mapping):
-            result[name] = _finite(item)
+            result[name] = finite(item)
         elif not isinstance(item, float) or math.isfinite(item):
             result[name] = item
     return result

@@ -4,14 +4,13 @@ Kinds: `metrics` (meta: time, update or version, values), `event` (time, level, 
 `rollout` (opaque) and `episode` (see `common.logs.scene`).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from common.logs.channels import Entry, JsonChannels, nest, opaque_channel, protobuf_channel
+from common.logs.channels import Entry, JsonChannels, finite, nest, opaque_channel, protobuf_channel
 from common.logs.scene import duration, episode_entries
-from common.transport.keys import relative
 from common.wire.codec import Message, encode
 
 ROLLOUT_SCHEMA = "congrasp.Rollout"
@@ -38,10 +37,11 @@ class Converter:
         """Entries of one message that arrived at `now` (ns since 1970).
 
         Raises:
-          CongraspError, KeyError, ValueError, TypeError, AttributeError, IndexError: it is not a whole log message.
+          Exception: of any kind, when it is not a whole log message.
         """
-        _, kind, role, name = relative(key).split("/")
-        return list(self._kinds[kind](role, name, message, now))
+        *_, kind, role, name = key.split("/")
+        plain = Message(message.arrays, finite(message.meta))
+        return list(self._kinds[kind](role, name, plain, now))
 
     def _metrics(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
         values = {key: float(value) for key, value in message.meta["values"].items()}
@@ -67,5 +67,5 @@ class Converter:
         self._ends[name] = start + duration(message)
 
 
-def _scalars(meta: dict[str, Any]) -> dict[str, Any]:
+def _scalars(meta: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in meta.items() if isinstance(value, bool | int | float | str)}

@@ -19,7 +19,7 @@ from common.logs.scene import EPISODE_SCHEMA
 from common.logs.writer import PART
 from common.wire.codec import Message, decode
 
-_CUT = (McapError, struct.error, zstandard.ZstdError, ValueError)
+_CUT = (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError)
 _RECORD_LIMIT = 1 << 30
 
 

@@ -7,17 +7,15 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from common.errors import CongraspError
 from common.logs.channels import Entry
 from common.logs.entries import Converter
 from common.logs.writer import LogWriter
-from common.transport import keys
 from common.transport.base import Transport
+from common.transport.keys import Keys
 from common.wire.codec import Message
 
 FLUSH_SECONDS = 0.5
 """A killed recorder loses at most this much."""
-_BAD_MESSAGE = (CongraspError, KeyError, ValueError, TypeError, AttributeError, IndexError)
 
 
 class Sink(Protocol):
@@ -32,7 +30,6 @@ class Recorder:
 
     Attributes:
       messages: log messages recorded.
-      gaps: messages that never arrived, by the numbers that senders give them (`meta["log_sequence"]`).
       damaged: messages that were not what their key says, and were left out.
       error: why recording stopped, in words; empty while it goes on.
     """
@@ -66,18 +63,17 @@ class Recorder:
         self._writer = (
             LogWriter(directory, name, run=run, max_bytes=max_bytes, max_seconds=max_seconds) if directory else None
         )
-        self._subscription = transport.subscribe(keys.key(run, "log", "**"), depth=depth)
+        self._subscription = transport.subscribe(Keys(run).logs, depth=depth)
         self._sinks, self._complain = tuple(sinks), complain
         self._convert = Converter()
-        self._sequences: dict[tuple[str, str], int] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True, name="recorder")
-        self.messages = self.gaps = self.damaged = 0
+        self.messages = self.damaged = 0
         self.error = ""
 
     @property
     def dropped(self) -> int:
-        """Messages that arrived but were dropped because writing was slower."""
+        """Messages lost: on the way, or because they came faster than they could be written."""
         return self._subscription.dropped
 
     @property
@@ -96,6 +92,7 @@ class Recorder:
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(timeout)
+        self._subscription.close()
 
     def __enter__(self) -> "Recorder":
         """Starts."""
@@ -119,10 +116,9 @@ class Recorder:
         self._on_disk(lambda writer: writer.close())
 
     def _take(self, key: str, message: Message) -> None:
-        self._count_gap(key, message)
         try:
             entries = self._convert(key, message, time.time_ns())
-        except _BAD_MESSAGE as error:
+        except Exception as error:  # whatever a peer sends, this thread goes on
             self.damaged += 1
             if self.damaged == 1:
                 self._complain(f"a log message on '{key}' was left out ({type(error).__name__}: {error})")
@@ -133,25 +129,20 @@ class Recorder:
                 sink.write(entry)
         self._on_disk(lambda writer: writer.write(*entries))
 
-    def _count_gap(self, key: str, message: Message) -> None:
-        sequence = message.meta.get("log_sequence")
-        if not isinstance(sequence, int):
-            return
-        stream = (key, str(message.meta.get("incarnation", "")))
-        expected = self._sequences.get(stream, sequence)
-        self.gaps += max(0, sequence - expected)
-        self._sequences[stream] = sequence + 1
-
     def _on_disk(self, action: Callable[[LogWriter], object]) -> None:
-        """Does something with the writer; when the disk refuses, recording stops and the run goes on."""
+        """Does something with the writer; when that fails, recording stops and the run goes on."""
         if self._writer is None or self.error:
             return
         try:
             action(self._writer)
-        except OSError as error:
+        except Exception as error:
+            reason = (
+                error.strerror if isinstance(error, OSError) and error.strerror else f"{type(error).__name__}: {error}"
+            )
+            where = self._writer.files[-1] if self._writer.files else "the first file"
             self.error = (
-                f"Recording stopped: {self._writer.files[-1] if self._writer.files else 'the file'} could not be "
-                f"written ({error.strerror or error}). What was recorded before is kept; training goes on."
+                f"Recording stopped, {where} could not be written ({reason}); "
+                "what was recorded before is kept and the run goes on."
             )
             self._writer.abandon()
             self._complain(self.error)

@@ -51,7 +51,7 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
       channels: schemas of the JSON signals.
 
     Raises:
-      CongraspError, KeyError, ValueError, IndexError: the message is not a whole episode.
+      Exception: of any kind, when the message is not a whole episode.
     """
     topic = f"/episode/{actor}"
     arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}

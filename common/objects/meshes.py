@@ -121,9 +121,11 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
     whole = _joined(meshes)
     closed = all(mesh.is_volume for mesh in meshes)
     if not closed:
-        notes.append("its mesh is not a closed surface: mass and inertia are those of its convex pieces")
+        stand_in = "convex pieces" if source.pieces else "convex hull"
+        notes.append(f"its mesh is not a closed surface: mass and inertia are those of its {stand_in}")
     hulls, owners = _pieces(source, meshes, factor, closed, options, notes)
-    mass, center, inertia = _weigh(whole, hulls, closed, options)
+    solids = hulls if source.pieces else [np.asarray(whole.vertices)]
+    mass, center, inertia = _weigh(whole if closed else None, solids, options)
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
     whole.apply_translation(-center)
     points, normals, face = sample_mesh(
@@ -239,7 +241,7 @@ def _pieces(
         if source.pieces:
             groups, limits = [[_corners(file) * factor for file in source.pieces]], [options.max_pieces]
         else:
-            volumes = np.array([mesh.convex_hull.volume for mesh in meshes])
+            volumes = np.array([shapes.hull_of(mesh.vertices).volume for mesh in meshes])
             limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
             groups = []
             for mesh, limit in zip(meshes, limits, strict=True):
@@ -276,16 +278,16 @@ def _pieces(
 
 
 def _weigh(
-    whole: trimesh.Trimesh, hulls: Iterable[np.ndarray], closed: bool, options: ImportOptions
+    closed: trimesh.Trimesh | None, solids: Iterable[np.ndarray], options: ImportOptions
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre of mass and inertia: of the mesh if it is closed, of its convex pieces otherwise."""
-    if closed:
-        properties = whole.mass_properties
+    """Mass, centre of mass and inertia: of the mesh if it is closed, of convex solids (V, 3) otherwise."""
+    if closed is not None:
+        properties = closed.mass_properties
         volume, center = float(properties["volume"]), np.asarray(properties["center_mass"])
         per_volume = np.asarray(properties["inertia"]) / volume
     else:
-        solids = tuple(Piece("mesh", (0, 0, 0), vertices=hull) for hull in hulls)
-        volume, center, inertia = mass_properties(solids, np.ones(len(solids)))
+        pieces = tuple(Piece("mesh", (0, 0, 0), vertices=solid) for solid in solids)
+        volume, center, inertia = mass_properties(pieces, np.ones(len(pieces)))
         per_volume = inertia / volume
     mass = float(np.clip(volume * options.density, *MASS_RANGE)) if options.mass is None else options.mass
     return mass, center, per_volume * mass

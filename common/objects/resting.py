@@ -15,7 +15,7 @@ _SAME_KIND = 0.03  # poses whose heights differ by less than this share are turn
 _PER_KIND = 4
 _LEAST_LIKELY = 0.02
 _STILL = 1e-3  # m/s
-_TILT, _DROP = 0.03, 1.5e-6  # rad, m; a pose whose centre of mass sinks by this much when tilted is not stable
+_DROPS = ((0.03, 1.5e-6), (0.06, 5e-6))  # rad, m; a pose whose centre of mass a tilt lowers by more is not stable
 _ROUNDS = 4
 
 
@@ -174,8 +174,8 @@ def _lowest_nearby(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
 
 def _stable(pieces: tuple[Piece, ...], down: np.ndarray) -> bool:
     """Whether no small tilt lowers the centre of mass of an object with a direction (3,) downwards."""
-    tilted = _cone(down[None], _TILT, count=64)[:, 0]
-    return bool(_height(pieces, tilted).min() > _height(pieces, down[None])[0] - _DROP)
+    height = _height(pieces, down[None])[0]
+    return all(_height(pieces, _cone(down[None], tilt, 64)[:, 0]).min() > height - drop for tilt, drop in _DROPS)
 
 
 def _cone(axes: np.ndarray, slope: float, count: int, phase: float = 0.0) -> np.ndarray:

@@ -31,12 +31,7 @@ def save(obj: GraspObject, path: str | os.PathLike[str]) -> None:
     Raises:
       CongraspError: the file cannot be written.
     """
-    path = pathlib.Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CongraspError(f"The folder {path.parent} cannot be made: {error.strerror}.") from None
-    write_atomically(path, encode(_to_message(obj)))
+    write_atomically(pathlib.Path(path), encode(_to_message(obj)))
 
 
 def load(path: str | os.PathLike[str]) -> GraspObject:
@@ -55,7 +50,10 @@ def load(path: str | os.PathLike[str]) -> GraspObject:
         raise CongraspError(f"{path} cannot be read as an object: {error}", remedy) from None
     if message.meta.get("kind") != "object" or message.meta.get("format") != _FORMAT:
         raise CongraspError(f"{path} is not an object of this version of congrasp.", remedy)
-    return _from_message(message)
+    try:
+        return _from_message(message)
+    except (KeyError, IndexError, ValueError) as error:
+        raise CongraspError(f"{path} lacks a part of an object: {error}.", remedy) from None
 
 
 class Catalogue:

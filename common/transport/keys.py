@@ -118,6 +118,11 @@ class Keys:
         return self._key("log", "**")
 
     @property
+    def learner_metrics(self) -> str:
+        """Expression of the learner's metrics."""
+        return self._key("log", "metrics", "learner", "*")
+
+    @property
     def everyone(self) -> str:
         """Expression of all liveliness tokens."""
         return self._key("alive", "*", "*", "*")

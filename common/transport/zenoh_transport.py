@@ -31,7 +31,7 @@ from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 """Where the learner listens unless told otherwise: on this machine only."""
 _ENDPOINT = re.compile(r"(?P<address>[a-z]+/[^/]+):(?P<port>\d{1,5})(?P<rest>[?#].*)?")
-_LEASE_MS: dict[Flow, int] = {"control": 3000, "bulk": 10000, "log": 10000, "policy": 3000}
+_LEASE_MS: dict[Flow, int] = {"control": 2500, "bulk": 10000, "log": 10000, "policy": 2500}
 _BLOCK_US: dict[Flow, int] = {"control": 2_000_000, "bulk": 5_000_000, "log": 1_000_000, "policy": 2_000_000}
 _OVERHEAD = 64 << 10  # bytes that Zenoh may add to a message
 _ATTEMPT = 1.0  # seconds of one attempt to connect; signals are seen between two
@@ -71,19 +71,20 @@ class ZenohTransport:
         """
         if bool(connect) == bool(listen):
             raise CongraspError("A transport needs endpoints either to connect to or to listen on.")
+        endpoints = {name: [_shifted(one, i) for one in (connect or listen)] for i, name in enumerate(flows)}
         self._max_message = max_message
         self._sender = secrets.token_bytes(8)
         self._counts: dict[str, int] = {}
         self._counts_lock = threading.Lock()
         self._declared: list[Any] = []
         self._sessions: dict[Flow, zenoh.Session] = {}
-        self._finalizer = weakref.finalize(self, _close, self._sessions)
+        self._threads: list[threading.Thread] = []
+        self._finalizer = weakref.finalize(self, _close, self._sessions, self._threads)
         deadline = time.monotonic() + wait
         try:
-            for index, name in enumerate(flows):
-                endpoints = [_shifted(endpoint, index) for endpoint in (connect or listen)]
-                config = _config(name, endpoints, bool(listen), max_message, extra or {})
-                self._sessions[name] = _listen(config, endpoints) if listen else _connect(config, endpoints, deadline)
+            for name, where in endpoints.items():
+                config = _config(name, where, bool(listen), max_message, extra or {})
+                self._sessions[name] = _listen(config, where) if listen else _connect(config, where, deadline)
         except BaseException:
             self.close()
             raise
@@ -95,7 +96,7 @@ class ZenohTransport:
         queryable = self._session(key).declare_queryable(key, FifoChannel(depth))
         self._declared.append(queryable)
         for _ in range(workers):
-            _start(_serve, queryable.handler, handler, on_damage or (lambda *_: None), self._max_message)
+            self._start(_serve, queryable.handler, handler, on_damage or (lambda *_: None), self._max_message)
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
@@ -119,12 +120,12 @@ class ZenohTransport:
         raise TransportError(f"Nobody answers {key}.", "The process that serves it may have ended.")
 
     def publish(self, key: str, message: Message) -> None:
-        """See `Transport.publish`."""
+        """See `Transport.publish`; once closed it does nothing."""
         payload = self._encode(message)
         with self._counts_lock:
             count = self._counts.get(key, 0)
             self._counts[key] = count + 1
-        with contextlib.suppress(zenoh.ZError):
+        try:
             self._session(key).put(
                 key,
                 payload,
@@ -132,6 +133,9 @@ class ZenohTransport:
                 express=flow(key) == "control",
                 attachment=_STAMP.pack(self._sender, count),
             )
+        except (zenoh.ZError, TransportError):
+            if self._finalizer.alive:
+                raise
 
     def subscribe(self, key_expression: str, *, depth: int) -> Subscription:
         """See `Transport.subscribe`."""
@@ -143,7 +147,7 @@ class ZenohTransport:
                 subscriber.undeclare()
 
         subscription = Subscription(depth, undeclare)
-        _start(_listen_to, subscriber.handler, subscription, self._max_message)
+        self._start(_listen_to, subscriber.handler, subscription, self._max_message)
         return subscription
 
     def declare_alive(self, key: str) -> None:
@@ -155,7 +159,7 @@ class ZenohTransport:
         liveliness = self._session(key_expression).liveliness()
         subscriber = liveliness.declare_subscriber(key_expression, FifoChannel(_QUEUE), history=True)
         self._declared.append(subscriber)
-        _start(_watch, subscriber.handler, on_change)
+        self._start(_watch, subscriber.handler, on_change)
 
     def close(self) -> None:
         """See `Transport.close`; takes half a second at most."""
@@ -170,9 +174,14 @@ class ZenohTransport:
     def _session(self, key: str) -> zenoh.Session:
         name = flow(key)
         if name not in self._sessions:
-            state = "has no flow for" if self._finalizer.alive else "is closed, which ends"
-            raise TransportError(f"The transport {state} {key}.")
+            raise TransportError(
+                f"The transport has no flow for {key}." if self._finalizer.alive else "The transport is closed."
+            )
         return self._sessions[name]
+
+    def _start(self, function: Callable[..., None], *arguments: Any) -> None:
+        self._threads[:] = [thread for thread in self._threads if thread.is_alive()]
+        self._threads.append(_start(function, *arguments))
 
     def _encode(self, message: Message) -> bytes:
         payload = encode(message)
@@ -223,10 +232,10 @@ def _listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         where = ", ".join(endpoints)
-        if "os error 98" in str(error) or "in use" in str(error):
+        if "in use" in str(error):
             raise CongraspError(
                 f"The port of {where} is in use.",
-                f"Stop what listens there, or choose another ({', '.join(FLOWS)} take one port each, from that one on).",
+                f"Stop what listens there, or choose another ({', '.join(FLOWS)} take a port each, from it on).",
             ) from None
         raise CongraspError(f"Cannot listen on {where}: {_first_line(error)}.") from None
 
@@ -249,8 +258,8 @@ def _first_line(error: Exception) -> str:
     return re.split(r" at /|\n", str(error))[0][:200].rstrip(". ")
 
 
-def _close(sessions: dict[Flow, zenoh.Session]) -> None:
-    threads = []
+def _close(sessions: dict[Flow, zenoh.Session], threads: list[threading.Thread]) -> None:
+    """Closes the sessions and waits for the threads, which would abort the process if they outlived the interpreter."""
     for session in sessions.values():
         try:
             threads.append(_start(session.close))
@@ -259,7 +268,8 @@ def _close(sessions: dict[Flow, zenoh.Session]) -> None:
     sessions.clear()
     deadline = time.monotonic() + _CLOSE
     for thread in threads:
-        thread.join(max(0.0, deadline - time.monotonic()))
+        if thread is not threading.current_thread():
+            thread.join(max(0.0, deadline - time.monotonic()))
 
 
 def _start(function: Callable[..., None], *arguments: Any) -> threading.Thread:

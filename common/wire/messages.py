@@ -150,10 +150,11 @@ def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int
             raise CongraspError(f"The {spec.kind} lacks the array '{name}'.")
     known = dict(sizes)
     for name, array in message.arrays.items():
-        array_spec = spec.arrays.get(name) or spec.arrays.get(name.partition("/")[0] + "/*")  # type: ignore[assignment]
-        if array_spec is None:
+        folder, below, _ = name.partition("/")
+        known_spec = spec.arrays.get(name) or spec.arrays.get(f"{folder}/*" if below else "")
+        if known_spec is None:
             raise CongraspError(f"The {spec.kind} has an unknown array {ascii(name)[:60]}.")
-        _check(f"The {spec.kind}'s array {ascii(name)[:60]}", array, array_spec, known)
+        _check(f"The {spec.kind}'s array {ascii(name)[:60]}", array, known_spec, known)
     return known
 
 

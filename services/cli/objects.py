@@ -107,23 +107,23 @@ class ObjectsList:
     """List the generator's families instead."""
 
     def run(self) -> int:
-        """Runs the command; returns its exit code."""
+        """Runs the command; returns its exit code: 2 if a file is damaged."""
         if self.families:
             _console.print("\n".join(FAMILIES))
             return 0
         catalogue = Catalogue(self.folder)
-        names = catalogue.list()
+        names, failures = catalogue.list(), 0
         table = Table("name", "family", "size (cm)", "mass (g)", "pieces", "O+", "O-", "poses")
         for name in names:
             try:
                 obj = catalogue.get(name)
             except CongraspError as error:
-                _complain(error)
+                failures += _complain(error)
                 continue
             row = (name, obj.family, _size(obj), f"{1000 * obj.mass:.0f}", str(len(obj.pieces)), *_parts(obj))
             table.add_row(*map(escape, row), str(len(obj.rest_poses)))
         _console.print(table if names else f"{escape(self.folder)} holds no object.")
-        return 0
+        return 2 if failures else 0
 
 
 @dataclasses.dataclass(frozen=True)

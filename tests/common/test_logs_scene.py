@@ -18,13 +18,12 @@ from common.logs.channels import Entry
 from common.logs.entries import Converter
 from common.logs.poses import link_poses
 from common.logs.scene import SPACING
-from common.transport.keys import log_key
 from common.wire.codec import Message, decode
 from tests.episodes import CONTROL_DT, FORCE, episode
 
 HAND = get_hand("human")
 START = 1_000_000_000_000
-KEY = log_key("run", "episode", "actor", "a0")
+KEY = "congrasp/run/log/episode/actor/a0"
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +158,7 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
     convert = Converter()
     first, second = convert(KEY, episode(), START), convert(KEY, episode(), START + 1)
     assert min(e.time for e in second) > max(e.time for e in first)
-    other = convert(log_key("run", "episode", "actor", "b"), episode(), START)
+    other = convert("congrasp/run/log/episode/actor/b", episode(), START)
     transforms = [
         FrameTransforms.FromString(next(e for e in es if e.channel.topic.endswith("/tf")).data) for es in (first, other)
     ]

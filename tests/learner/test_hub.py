@@ -1,167 +1,334 @@
-"""The two ends of the link over the in-memory transport."""
+"""The learner's end, over the in-memory transport."""
 
 import threading
+import time
 
+import hypothesis.strategies as st
 import numpy as np
 import pytest
+from hypothesis import given, settings
 
-from actors.link import ActorLink, RunEnded
 from common.errors import CongraspError
-from common.transport.keys import key
-from common.transport.memory import MemoryBroker, MemoryTransport
+from common.transport.base import RefusedError
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
-from learner.hub import LearnerHub, RolloutSizes
+from learner.hub import LearnerHub, _Marks
 from learner.staleness import StalenessManager
-from tests.rollouts import ACTION, OBSERVATION, SCHEMA, bundle, rollout
 
 pytestmark = pytest.mark.timeout(30)
+KEYS = Keys("test")
+T, B, D, A = 3, 2, 5, 4
 
 
-class Ends:
-    """A hub, and links to it."""
+def rollout(sequence=0, version=0, **meta):
+    arrays = {
+        "observation": np.zeros((T, B, D), np.float16),
+        "action": np.zeros((T, B, A), np.float32),
+        "log_probability": np.zeros((T, B), np.float32),
+        "reward": np.full((T, B), sequence, np.float32),
+        "terminal": np.zeros((T, B), bool),
+        "last_observation": np.zeros((B, D), np.float16),
+    }
+    header = {"actor": "a", "incarnation": "01", "sequence": sequence, "version": version, "epoch": "e", "schema": "s"}
+    return Message(arrays, {**header, "steps": T * B, **meta})
 
-    def __init__(self, batch: int = 2):
-        self.broker = MemoryBroker()
-        self.batch = batch
-        self.hub = self.start()
 
-    def start(self, epoch: str = "e") -> LearnerHub:
-        self.transport = MemoryTransport(self.broker)
-        return LearnerHub(
-            self.transport,
-            run="r",
-            config_json="{}",
-            epoch=epoch,
-            sizes=RolloutSizes(OBSERVATION, ACTION, SCHEMA),
-            staleness=StalenessManager(max_staleness=1, batch=self.batch),
-        )
+def bundle(version, epoch="e"):
+    arrays = {f"{kind}/{name}": np.zeros(shape) for kind, shape in (("observation", D), ("value", ()))
+              for name in ("mean", "m2")}  # fmt: skip
+    arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": np.full(3, float(version))}
+    meta = {"version": version, "epoch": epoch, "schema": "s", "hand": "human", "layout": [], "action_size": A}
+    return Message(arrays, {**meta, "format": 1})
 
-    def link(self, name: str = "a", patience: float = 5.0) -> ActorLink:
-        link = ActorLink(MemoryTransport(self.broker), run="r", actor=name, patience=patience)
-        link.config()
-        return link
+
+class Bench:
+    """A hub and a peer of it."""
+
+    def __init__(self, *, max_staleness=1, batch=2, **options):
+        shared = MemoryHub()
+        self.server, self.peer = MemoryTransport(shared), MemoryTransport(shared)
+        self.staleness = StalenessManager(max_staleness, batch)
+        defaults = {"run": "test", "config_json": "{}", "epoch": "e", "schema": "s"}
+        sizes = {"observation_size": D, "action_size": A}
+        self.hub = LearnerHub(self.server, **{**defaults, **sizes, **options}, staleness=self.staleness)
+
+    def ask(self, key, meta=None, arrays=None):
+        return self.peer.query(key, Message(arrays or {}, meta or {}), timeout=5).meta
+
+    def send(self, *args, **options):
+        return self.peer.query(KEYS.rollout, rollout(*args, **options), timeout=5).meta
+
+    def ticket(self, name="t", **meta):
+        return self.ask(KEYS.ticket, {"actor": "a", "incarnation": "01", "ticket": name, **meta})
+
+    def ledger(self):
+        return self.ask(KEYS.status)["ledger"]
 
 
 @pytest.fixture
-def ends() -> Ends:
-    return Ends()
+def bench():
+    benches = []
+
+    def make(**options):
+        benches.append(Bench(**options))
+        return benches[-1]
+
+    yield make
+    for one in benches:
+        one.peer.close()
+        one.server.close()
 
 
-def _send(link: ActorLink, count: int, version: int = 0) -> None:
-    for n in range(count):
-        ticket = link.acquire_ticket(threading.Event())
-        assert ticket is not None
-        link.upload(rollout(sequence=n, version=version), ticket)
-    assert link._idle.wait(5.0)
+def sequences(batch):
+    return [message.meta["sequence"] for message in batch]
 
 
-def test_rollouts_arrive_in_order_and_once(ends):
-    ends.hub.publish_weights(bundle(0), 0)
-    link = ends.link()
-    _send(link, 2)
-    batch = ends.hub.next_batch(2, 5.0)
-    assert [message.meta["sequence"] for message in batch] == [0, 1]
-    assert ends.hub.next_batch(1, 0.05) is None
-    ledger = ends.hub.status()["ledger"]
-    assert (ledger["accepted"], ledger["consumed"], ledger["refused"]) == (2, 2, 0)
-    link.close()
+def test_config(bench):
+    reply = bench(config_json='{"name": "x"}').ask(KEYS.config)
+    assert (reply["config"], reply["epoch"], reply["schema"], reply["version"]) == ('{"name": "x"}', "e", "s", -1)
 
 
-def test_the_same_identity_is_a_duplicate_and_not_queued_again(ends):
-    ends.hub.publish_weights(bundle(0), 0)
-    client = MemoryTransport(ends.broker)
-    replies = [client.query(key("r", "rollout"), rollout(sequence=0), timeout=1.0) for _ in range(3)]
-    assert [reply.meta["outcome"] for reply in replies] == ["accepted", "duplicate", "duplicate"]
-    assert len(ends.hub.next_batch(1, 1.0)) == 1
-    assert ends.hub.next_batch(1, 0.05) is None
+def test_nothing_is_granted_or_taken_before_the_first_weights(bench):
+    b = bench()
+    assert not b.ticket()["granted"]
+    assert b.send()["outcome"] == "retry"
+    assert b.peer.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5).arrays == {}
+    b.hub.publish_weights(bundle(0), 0)
+    assert b.ticket()["granted"]
+    assert b.send()["outcome"] == "accepted"
 
 
-def test_no_ticket_before_there_is_a_policy_and_none_beyond_the_bound(ends):
-    link = ends.link()
-    ask = lambda: MemoryTransport(ends.broker).query(  # noqa: E731
-        key("r", "ticket"), Message({}, {"actor": "a", "incarnation": link.incarnation}), timeout=1.0
-    )
-    assert ask().meta["ticket"] is None
-    ends.hub.publish_weights(bundle(0), 0)
-    assert [ask().meta["ticket"] is not None for _ in range(5)] == [True] * 4 + [False]
-    link.close()
+def test_tickets_run_out_and_return(bench):
+    b = bench(max_staleness=0, batch=1)
+    b.hub.publish_weights(bundle(0), 0)
+    assert b.ticket("t")["granted"] and b.ticket("t")["granted"]
+    assert not b.ticket("u")["granted"]
+    b.ticket("t", give_back=True)
+    assert b.ticket("u")["granted"]
+    with pytest.raises(RefusedError, match="'ticket' is 7, not str"):
+        b.ticket(7)
+    with pytest.raises(RefusedError, match="name of an actor"):
+        b.ask(KEYS.ticket, {"actor": "*", "incarnation": "1", "ticket": "t"})
 
 
-def test_tickets_of_a_dead_actor_return(ends):
-    ends.hub.publish_weights(bundle(0), 0)
-    transport = MemoryTransport(ends.broker)
-    link = ActorLink(transport, run="r", actor="a", patience=5.0)
-    link.config()
-    for _ in range(4):
-        assert link.acquire_ticket(threading.Event()) is not None
-    transport.close()
-    assert ends.hub.status()["running"] == 0
-    assert ends.hub.status()["ledger"]["expired"] == 4
-    link.close()
+def test_death_returns_tickets_and_is_told(bench):
+    b = bench(max_staleness=0, batch=1)
+    b.hub.publish_weights(bundle(0), 0)
+    events = b.peer.subscribe(KEYS.logs, depth=8)
+    actor = MemoryTransport(b.peer._hub)
+    actor.declare_alive(KEYS.alive("actor", "a", "01"))
+    assert b.ticket()["granted"]
+    assert _roles(b) == {("learner", "0"), ("actor", "a")}
+    actor.close()
+    key, event = events.receive(5)
+    assert key == KEYS.log("event", "learner", "0")
+    assert event.meta["text"] == "The actor a left; 1 of its tickets returned."
+    assert b.ledger()["returned"] == 1 and b.ticket("u")["granted"]
+    assert _roles(b) == {("learner", "0")}
 
 
-def test_old_rollouts_are_dropped_and_counted(ends):
-    ends.hub.publish_weights(bundle(5), 5)
-    client = MemoryTransport(ends.broker)
-    for sequence, version in enumerate([3, 4, 5]):
-        client.query(key("r", "rollout"), rollout(sequence=sequence, version=version), timeout=1.0)
-    batch = ends.hub.next_batch(2, 1.0)
-    assert [message.meta["version"] for message in batch] == [4, 5]
-    assert ends.hub.status()["ledger"]["stale"] == 1
+def _roles(b):
+    time.sleep(0.05)
+    return {(role["role"], role["id"]) for role in b.ask(KEYS.status)["roles"]}
 
 
-def test_weights_are_pulled_by_version(ends):
-    ends.hub.publish_weights(bundle(3), 3)
-    link = ends.link()
-    np.testing.assert_array_equal(link.weights(-1).arrays["actor/w"], [3, 3, 3])
-    assert link.weights(3) is None
-    link.close()
+def test_batches_come_in_order_and_wait(bench):
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    assert b.hub.next_batch(2, 0.05) is None
+    assert b.send(0)["outcome"] == b.send(1)["outcome"] == b.send(2)["outcome"] == "accepted"
+    batch = b.hub.next_batch(2, 1)
+    assert sequences(batch) == [0, 1]
+    np.testing.assert_array_equal(batch[1].arrays["reward"], np.ones((T, B), np.float32))
+    assert b.hub.next_batch(2, 0.05) is None
+    threading.Timer(0.1, b.send, [3]).start()
+    assert sequences(b.hub.next_batch(2, 10)) == [2, 3]
+    assert b.ledger() | {"capacity": 0} == {
+        "granted": 0, "redeemed": 0, "returned": 0, "expired": 0, "accepted": 4, "consumed": 4, "dropped": 0,
+        "stale": 0, "duplicate": 0, "damaged": 0, "running": 0, "queued": 0, "capacity": 0, "rolled_back": 0,
+    }  # fmt: skip
 
 
-def test_refusals_end_the_actor_in_words(ends):
-    ends.hub.publish_weights(bundle(0), 0)
-    link = ends.link()
-    bad = rollout()
-    bad.arrays["reward"] = np.full((4, 2), np.nan, np.float32)
-    with pytest.raises(CongraspError, match="refused 3 rollouts: .*'reward'.*not finite"):
-        for _ in range(5):
-            link.upload(bad, link.acquire_ticket(threading.Event()))
-            link._idle.wait(5.0)
-    assert ends.hub.status()["running"] == 0
-    link.close()
+def test_duplicates_are_success_and_change_nothing(bench):
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    assert [b.send(0)["outcome"] for _ in range(3)] == ["accepted", "duplicate", "duplicate"]
+    assert b.send(0, incarnation="02")["outcome"] == "accepted"
+    assert b.send(0, actor="b")["outcome"] == "accepted"
+    assert len(b.hub.next_batch(3, 1)) == 3
+    b.hub.publish_weights(bundle(5), 5)
+    assert b.send(0)["outcome"] == "duplicate"  # not `stale`: it was accepted
+    assert b.ledger()["duplicate"] == 3 and b.ledger()["queued"] == 0
 
 
-def test_the_end_and_a_new_training_reach_the_actor(ends):
-    ends.hub.publish_weights(bundle(0), 0)
-    link = ends.link()
-    ends.transport.close()
-    ends.start(epoch="other").publish_weights(bundle(0), 0)
-    with pytest.raises(RunEnded, match="new training"):
-        link.acquire_ticket(threading.Event())
-    link.close()
-    ends.transport.close()
-    hub = ends.start()
-    link = ends.link("b")
-    hub.finish()
-    with pytest.raises(RunEnded, match="ended"):
-        link.acquire_ticket(threading.Event())
-    link.close()
+def test_full_learner_says_when_to_come_again(bench):
+    b = bench(batch=1)
+    b.hub.publish_weights(bundle(0), 0)
+    assert [b.send(i)["outcome"] for i in range(2)] == ["accepted"] * 2
+    reply = b.send(2)
+    assert reply["outcome"] == "retry" and reply["retry_after"] > 0
+    assert b.hub.next_batch(1, 1)
+    b.hub.publish_weights(bundle(1), 1)
+    assert b.send(2)["outcome"] == "accepted"
+    limited = bench(batch=10, queue_limit=1)
+    limited.hub.publish_weights(bundle(0), 0)
+    assert [limited.send(i)["outcome"] for i in range(2)] == ["accepted", "retry"]
 
 
-def test_a_restart_forgets_queued_rollouts_so_that_they_may_be_sent_again(ends):
-    client = MemoryTransport(ends.broker)
-    ends.hub.publish_weights(bundle(0), 0)
-    for sequence in range(3):
-        client.query(key("r", "rollout"), rollout(sequence=sequence), timeout=1.0)
-    ends.hub.next_batch(1, 1.0)
-    state = ends.hub.state()
-    ends.transport.close()
-    hub = ends.start()
-    hub.restore(state)
-    outcomes = [
-        client.query(key("r", "rollout"), rollout(sequence=sequence), timeout=1.0).meta["outcome"]
-        for sequence in range(3)
-    ]
-    assert outcomes == ["duplicate", "accepted", "accepted"]
-    ledger = hub.status()["ledger"]
-    assert ledger["accepted"] == 3 and ledger["consumed"] == 1
+def test_too_old_is_refused_on_arrival_and_dropped_in_the_queue(bench):
+    b = bench()
+    events = b.peer.subscribe(KEYS.logs, depth=8)
+    b.hub.publish_weights(bundle(0), 0)
+    b.send(0, version=0)
+    b.hub.publish_weights(bundle(1), 1)
+    b.send(1, version=1)
+    b.hub.publish_weights(bundle(2), 2)
+    reply = b.send(2, version=0)
+    assert reply["outcome"] == "stale" and "version 0" in reply["why"] and "at 2" in reply["why"]
+    assert b.send(3, version=3)["outcome"] == "stale"
+    assert b.send(4, epoch="other")["outcome"] == "stale"
+    b.send(5, version=2)
+    assert sequences(b.hub.next_batch(2, 1)) == [1, 5]
+    texts = [events.receive(1)[1].meta["text"] for _ in range(2)]
+    assert "refused" in texts[0] and texts[1] == "Dropped as too old at version 2: 1 of a."
+    ledger = b.ledger()
+    assert (ledger["stale"], ledger["dropped"], ledger["consumed"], ledger["accepted"]) == (3, 1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"arrays": {"reward": np.full((T, B), np.nan, np.float32)}}, "'reward' has values that are not finite"),
+        ({"arrays": {"action": np.zeros((T, B, 9), np.float32)}}, "'action' has shape"),
+        ({"arrays": {"evil": np.zeros(1, np.float32)}}, "unknown array 'evil'"),
+        ({"meta": {"schema": "other"}}, "schema"),
+        ({"meta": {"sequence": -5}}, "counts"),
+        ({"meta": {"actor": ["x"]}}, "'actor'"),
+        ({"meta": {"ticket": {"x": 1}, "steps": 1}}, "'steps' is 1"),
+    ],
+)
+def test_hostile_rollouts_are_refused_alone(bench, change, why):
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    good = rollout()
+    bad = Message({**good.arrays, **change.get("arrays", {})}, {**good.meta, **change.get("meta", {})})
+    reply = b.peer.query(KEYS.rollout, bad, timeout=5).meta
+    assert reply["outcome"] == "refused" and why in reply["why"]
+    assert b.ledger()["damaged"] == 1 and b.ledger()["queued"] == 0
+    assert b.send(0)["outcome"] == "accepted"
+
+
+def test_refusal_ends_the_ticket(bench):
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    assert b.ticket("t")["granted"]
+    assert b.send(0, ticket="t", steps=1)["outcome"] == "refused"
+    assert b.ledger()["running"] == 0 and b.ledger()["redeemed"] == 1
+
+
+def test_weights_are_pulled_by_version(bench):
+    b = bench()
+    notices = b.peer.subscribe(KEYS.announcement, depth=4)
+    b.hub.publish_weights(bundle(0), 0)
+    assert notices.receive(5)[1].meta == {"version": 0, "epoch": "e", "life": b.hub.life, "finished": False}
+    pulled = b.peer.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5)
+    assert pulled.meta == bundle(0).meta and pulled.arrays["actor/w"][0] == 0
+    assert b.ask(KEYS.weights, {"newer_than": 0})["version"] == 0
+    assert not b.peer.query(KEYS.weights, Message(meta={"newer_than": 0}), timeout=5).arrays
+    b.hub.publish_weights(bundle(1), 1)
+    assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 0}), timeout=5).meta["version"] == 1
+    # A learner that resumed from a checkpoint has an older version, or another one of the same number.
+    assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 7}), timeout=5).meta["version"] == 1
+    assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 1, "life": "before"}), timeout=5).arrays
+
+
+def test_only_weights_of_this_run_are_published(bench):
+    b = bench()
+    with pytest.raises(CongraspError, match="not version 1 of epoch e"):
+        b.hub.publish_weights(bundle(0), 1)
+    with pytest.raises(CongraspError, match="epoch"):
+        b.hub.publish_weights(bundle(0, epoch="other"), 0)
+    bad = bundle(0)
+    with pytest.raises(CongraspError, match="not finite"):
+        b.hub.publish_weights(Message({**bad.arrays, "actor/w": np.full(3, np.nan)}, bad.meta), 0)
+    assert b.ask(KEYS.config)["version"] == -1
+
+
+def test_status_names_everything(bench):
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    b.peer.declare_alive(KEYS.alive("actor", "a", "01"))
+    b.send(0)
+    time.sleep(0.05)
+    status = b.ask(KEYS.status)
+    assert status["run"] == "test" and status["version"] == 0 and status["queue"] == {"length": 1, "limit": 64}
+    assert {"role": "actor", "id": "a", "incarnation": "01", "rollouts": 1, "version": 0} in status["roles"]
+    assert status["rates"] == {"rollouts_per_second": 1.0, "steps_per_second": T * B}
+
+
+def test_finished_run_says_so(bench):
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    notices = b.peer.subscribe(KEYS.announcement, depth=4)
+    b.hub.finish()
+    assert notices.receive(5)[1].meta["finished"]
+    reply = b.ticket()
+    assert reply["finished"] and not reply["granted"]
+    assert b.send(0)["outcome"] == "stale" and b.ledger()["queued"] == 0
+
+
+def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
+    b = bench(batch=3)
+    b.hub.publish_weights(bundle(3), 3)
+    for i in range(5):
+        assert b.send(i, version=3)["outcome"] == "accepted"
+    assert sequences(b.hub.next_batch(3, 1)) == [0, 1, 2]  # 3 and 4 wait
+    b.hub.publish_weights(bundle(4), 4)
+    durable = b.hub.durable()
+    assert b.send(5, version=4)["outcome"] == "accepted"  # and then the learner is killed
+
+    resumed = bench(batch=3, durable=durable)
+    assert resumed.send(2, version=4)["outcome"] == "retry"  # its weights are not there yet
+    resumed.hub.publish_weights(bundle(4), 4)
+    assert resumed.hub.life != b.hub.life
+    assert resumed.ledger()["accepted"] == resumed.ledger()["consumed"] == 3
+    assert resumed.send(2, version=3)["outcome"] == "duplicate"
+    # The actor goes on where it was: 3, 4 and 5 were acknowledged, and are gone with the killed learner.
+    assert resumed.send(7, version=4)["outcome"] == "accepted"
+    assert resumed.send(6, version=4)["outcome"] == "accepted"
+    assert resumed.send(6, version=4)["outcome"] == "duplicate"
+    ledger = resumed.ledger()
+    assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["rolled_back"]) == (5, 3, 2, 3)
+    again = bench(batch=3, durable=resumed.hub.durable())
+    again.hub.publish_weights(bundle(5), 5)
+    assert again.ledger()["rolled_back"] == 3 and again.ledger()["accepted"] == 3
+    assert again.send(7, version=5)["outcome"] == "accepted"
+    with pytest.raises(CongraspError, match="epoch e, not f"):
+        bench(epoch="f", durable=durable)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.integers(0, 40), max_size=120))
+def test_marks_are_exact_within_their_window(arrivals):
+    marks, accepted = _Marks(), set()
+    for sequence in arrivals:
+        assert (sequence in marks) == (sequence in accepted)
+        if sequence not in accepted:
+            accepted.add(sequence)
+            marks.add(_header(sequence))
+    assert marks.end == max(accepted, default=-1) + 1
+
+
+def test_marks_stay_small_whatever_is_missing():
+    marks = _Marks()
+    for sequence in range(1, 20_000, 2):
+        marks.add(_header(sequence))
+        assert len(marks.ahead) <= 64
+    assert 19_999 in marks and 20_000 not in marks
+
+
+def _header(sequence):
+    from common.wire.messages import RolloutHeader
+
+    return RolloutHeader("a", "01", sequence, 0, "e", "s", 1)

@@ -14,13 +14,13 @@ import jax
 import numpy as np
 import pytest
 
-from actors.link import ActorLink, RunEnded
+from actors.link import ActorLink, RunFinished
 from common.config import NetworkConfig, PPOConfig, RunConfig
 from common.errors import CongraspError, PhysicsError, TransportError
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
-from common.transport import keys
-from common.transport.memory import MemoryBroker, MemoryTransport
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 from learner import update as updates
@@ -50,19 +50,21 @@ class MadeUpActor(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        link = ActorLink(self._transport, run=CONFIG.name, actor=self._actor, patience=30.0)
-        try:
-            link.config()
-            self._act(link)
-        except (RunEnded, TransportError) as error:
-            self.ended = str(error)
-        link.close(drain=0.5)
+        with ActorLink(self._transport, CONFIG.name, self._actor, patience=30.0) as link:
+            try:
+                link.config(30.0)
+                self._act(link)
+            except (RunFinished, TransportError) as error:
+                self.ended = str(error)
 
     def _act(self, link: ActorLink) -> None:
         rng, bundle = np.random.default_rng(0), None
-        while (ticket := link.acquire_ticket(self.stop)) is not None:
-            if bundle is None or ticket.version > bundle.version:
-                bundle = PolicyBundle.from_message(link.weights(-1 if bundle is None else bundle.version))
+        while not self.stop.is_set():
+            ticket = link.acquire_ticket(0.5)
+            newer = link.weights(-1 if bundle is None else bundle.version)
+            bundle = bundle if newer is None else PolicyBundle.from_message(newer)
+            if ticket is None or bundle is None:
+                continue
             observation = rng.normal(size=(5, 2, sum(size for _, size in bundle.spec.layout))).astype(np.float16)
             action, log_probability = bundles.sample_action(
                 bundle.spec.layout, bundle.acting, observation[:-1], jax.random.PRNGKey(len(self.versions))
@@ -82,20 +84,20 @@ class MadeUpActor(threading.Thread):
 
 
 @pytest.fixture
-def broker() -> MemoryBroker:
-    return MemoryBroker()
+def hub() -> MemoryHub:
+    return MemoryHub()
 
 
-def learn(run_dir, broker, config=CONFIG, stop_event=None, **options) -> PolicyBundle:
-    with MemoryTransport(broker) as transport:
+def learn(run_dir, hub, config=CONFIG, stop_event=None, **options) -> PolicyBundle:
+    with MemoryTransport(hub) as transport:
         return run_learner(run_dir, config, transport, stop_event=stop_event or threading.Event(), **options)
 
 
 @pytest.mark.timeout(120)
-def test_a_run_from_beginning_to_end(tmp_path, broker):
+def test_a_run_from_beginning_to_end(tmp_path, hub):
     create_run(tmp_path, CONFIG)
-    logs = MemoryTransport(broker).subscribe(keys.key("t", "log", "*", "learner", "*"), depth=1000)
-    actors = [MadeUpActor(MemoryTransport(broker), name) for name in "ab"]
+    logs = MemoryTransport(hub).subscribe(Keys("t").logs, depth=1000)
+    actors = [MadeUpActor(MemoryTransport(hub), name) for name in "ab"]
     entered = []
 
     @contextlib.contextmanager
@@ -104,10 +106,10 @@ def test_a_run_from_beginning_to_end(tmp_path, broker):
         yield
         entered.append("out")
 
-    last = learn(tmp_path, broker, recorder=recorder())
+    last = learn(tmp_path, hub, recorder=recorder())
     for actor in actors:
         actor.join(10.0)
-        assert actor.ended == "The run has ended."
+        assert actor.ended == "The run is finished."
     assert entered == ["in", "out"]
 
     assert (last.version, last.transitions) == (3, 3 * 2 * 8)
@@ -117,7 +119,7 @@ def test_a_run_from_beginning_to_end(tmp_path, broker):
     assert open_run(tmp_path) == CONFIG
     assert (tmp_path / "checkpoints" / "latest").resolve().name == "checkpoint_000000003.safetensors"
 
-    received = [logs.receive(0.0) for _ in range(len(logs._ring))]
+    received = list(iter(lambda: logs.receive(0.0), None))
     kinds = {kind: [m.meta for k, m in received if k.split("/")[3] == kind] for kind in ("metrics", "version", "event")}
     assert [meta["update"] for meta in kinds["metrics"]] == [1, 2, 3]
     assert [meta["version"] for meta in kinds["version"]] == [0, 1, 2, 3]
@@ -129,34 +131,34 @@ def test_a_run_from_beginning_to_end(tmp_path, broker):
 
 
 @pytest.mark.timeout(120)
-def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, broker):
+def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
     create_run(tmp_path, CONFIG)
-    actor = MadeUpActor(MemoryTransport(broker))
+    actor = MadeUpActor(MemoryTransport(hub))
     stop = threading.Event()
     forever = dataclasses.replace(CONFIG, updates=10**6)
-    first = learn(tmp_path, broker, forever, stop, on_update=lambda values: values["update"] == 3 and stop.set())
+    first = learn(tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 3 and stop.set())
     assert first.version == 3
     assert actor.is_alive()
     compiled = updates._optimise._cache_size()
-    last = learn(tmp_path, broker, dataclasses.replace(CONFIG, updates=6), resume=True)
+    last = learn(tmp_path, hub, dataclasses.replace(CONFIG, updates=6), resume=True)
     assert updates._optimise._cache_size() == compiled
     actor.join(10.0)
-    assert actor.ended == "The run has ended."
+    assert actor.ended == "The run is finished."
     assert (last.version, last.transitions, last.epoch) == (6, 6 * 2 * 8, first.epoch)
     assert open_run(tmp_path).updates == 6
     assert actor.versions == sorted(actor.versions)
 
 
 LEARNER = """
-import pathlib, sys, threading
+import dataclasses, pathlib, sys, threading
 from common.transport.zenoh_transport import ZenohTransport
-from learner import update as updates
 from learner.process import open_run, run_learner
 
-run_dir = pathlib.Path(sys.argv[1])
-with ZenohTransport(listen=sys.argv[2]) as transport:
-    last = run_learner(
-        run_dir, open_run(run_dir), transport, stop_event=threading.Event(), resume=sys.argv[3] == "resume",
+run_dir, endpoint, goal, resume = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), sys.argv[4] == "resume"
+with ZenohTransport(listen=[endpoint]) as transport:
+    run_learner(
+        run_dir, dataclasses.replace(open_run(run_dir), updates=goal), transport,
+        stop_event=threading.Event(), resume=resume,
         on_update=lambda values: print(int(values["update"]), int(values["version"]), flush=True),
     )
 """
@@ -164,12 +166,12 @@ with ZenohTransport(listen=sys.argv[2]) as transport:
 
 @pytest.mark.timeout(150)
 def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path, free_port):
-    """Killed after update five, checkpointed at four; the second life redoes the fifth under another version."""
-    create_run(tmp_path, dataclasses.replace(CONFIG, updates=8, checkpoint_every=4))
+    """Killed between two checkpoints; its second life redoes the lost updates under versions of their own."""
+    create_run(tmp_path, dataclasses.replace(CONFIG, checkpoint_every=4))
     endpoint = f"tcp/127.0.0.1:{free_port()}"
 
-    def start(mode: str) -> subprocess.Popen:
-        command = [sys.executable, "-c", LEARNER, str(tmp_path), endpoint, mode]
+    def start(goal: int, mode: str) -> subprocess.Popen:
+        command = [sys.executable, "-c", LEARNER, str(tmp_path), endpoint, str(goal), mode]
         cache = str(tmp_path / "compiled")  # as on a machine where the learner has run before
         environment = {
             **os.environ,
@@ -179,36 +181,41 @@ def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path, free_
         }
         return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
-    lives = [start("fresh")]
+    def figures(lines: list[str]) -> list[tuple[int, ...]]:
+        return [tuple(map(int, line.split())) for line in lines]
+
+    lives = [start(10**6, "fresh")]
     try:
-        with ZenohTransport(connect=endpoint, patience=60.0) as transport:
+        with ZenohTransport(connect=[endpoint], wait=60.0) as transport:
             actor = MadeUpActor(transport)
-            seen = [lives[0].stdout.readline().split() for _ in range(5)]
+            lines = [lives[0].stdout.readline() for _ in range(5)]
             lives[0].send_signal(signal.SIGKILL)
-            lives[0].wait(10.0)
-            assert seen[-1] == ["5", "5"]
-            lives.append(start("resume"))
+            first = figures([*lines, *lives[0].stdout.readlines()])
+            kept = int((tmp_path / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
+            lives.append(start(kept + 4, "resume"))
             text, _ = lives[1].communicate(timeout=90.0)
             actor.join(10.0)
-            assert actor.ended == "The run has ended."
+            assert actor.ended == "The run is finished."
     finally:
         for life in lives:
             life.kill()
             life.wait(10.0)
             life.stdout.close()
     assert lives[1].returncode == 0
-    second = [tuple(map(int, line.split())) for line in text.splitlines()]
-    assert [update for update, _ in second] == [5, 6, 7, 8]
-    assert second[0][1] > 5 and [version for _, version in second] == sorted({version for _, version in second})
-    assert actor.versions == sorted(actor.versions) and actor.versions[-1] > 5
+    second = figures(text.splitlines())
+    assert kept >= 4 and kept % 4 == 0
+    assert [update for update, _ in second] == [kept + 1, kept + 2, kept + 3, kept + 4]
+    versions = [version for _, version in first + second]
+    assert versions == sorted(set(versions))
+    assert actor.versions == sorted(actor.versions) and actor.versions[-1] > first[-1][1]
 
 
 @pytest.mark.timeout(120)
-def test_values_that_are_not_finite_stop_the_run_and_are_kept(tmp_path, broker):
+def test_values_that_are_not_finite_stop_the_run_and_are_kept(tmp_path, hub):
     create_run(tmp_path, CONFIG)
-    actor = MadeUpActor(MemoryTransport(broker), reward=1e38)
+    actor = MadeUpActor(MemoryTransport(hub), reward=1e38)
     with pytest.raises(PhysicsError, match=r"update 1: .*failure") as caught:
-        learn(tmp_path, broker)
+        learn(tmp_path, hub)
     actor.stop.set()
     actor.join(10.0)
     assert "\n" not in str(caught.value)
@@ -217,7 +224,7 @@ def test_values_that_are_not_finite_stop_the_run_and_are_kept(tmp_path, broker):
 
 @pytest.mark.timeout(120)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_dead_thread_ends_the_run_and_leaves_a_checkpoint(tmp_path, broker):
+def test_a_dead_thread_ends_the_run_and_leaves_a_checkpoint(tmp_path, hub):
     create_run(tmp_path, CONFIG)
 
     def die() -> None:
@@ -226,7 +233,7 @@ def test_a_dead_thread_ends_the_run_and_leaves_a_checkpoint(tmp_path, broker):
 
     thread = threading.Thread(target=die, name="ingest")
     with pytest.raises(CongraspError, match="'ingest' died of ZeroDivisionError: for a test"):
-        learn(tmp_path, broker, on_event=lambda level, text: None, recorder=_started(thread))
+        learn(tmp_path, hub, on_event=lambda level, text: None, recorder=_started(thread))
     thread.join(5.0)
     assert (tmp_path / "checkpoints" / "latest").exists()
 
@@ -238,35 +245,35 @@ def _started(thread: threading.Thread):
 
 
 @pytest.mark.timeout(120)
-def test_training_goes_on_from_a_given_policy(tmp_path, broker):
+def test_training_goes_on_from_a_given_policy(tmp_path, hub):
     create_run(tmp_path / "one", CONFIG)
     create_run(tmp_path / "two", CONFIG)
     stopped = threading.Event()
     stopped.set()
-    given = learn(tmp_path / "one", broker, dataclasses.replace(CONFIG, seed=7), stopped)
-    begun = learn(tmp_path / "two", broker, CONFIG, stopped, initial=given)
+    given = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
+    begun = learn(tmp_path / "two", hub, CONFIG, stopped, initial=given)
     assert begun.version == 0 and begun.epoch != given.epoch
     jax.tree.map(np.testing.assert_array_equal, begun.params, given.params)
     other = dataclasses.replace(given, spec=dataclasses.replace(given.spec, hand="claw"))
     create_run(tmp_path / "three", CONFIG)
     with pytest.raises(CongraspError, match=r"'claw'.*'human'"):
-        learn(tmp_path / "three", broker, CONFIG, stopped, initial=other)
+        learn(tmp_path / "three", hub, CONFIG, stopped, initial=other)
 
 
-def test_directories_that_are_no_runs_or_runs_already(tmp_path, broker):
+def test_directories_that_are_no_runs_or_runs_already(tmp_path, hub):
     with pytest.raises(CongraspError, match="not a run directory"):
-        learn(tmp_path, broker)
+        learn(tmp_path, hub)
     create_run(tmp_path, CONFIG)
     with pytest.raises(CongraspError, match="holds a run already"):
         create_run(tmp_path, CONFIG)
     with pytest.raises(CongraspError, match="no checkpoint"):
-        learn(tmp_path, broker, resume=True)
+        learn(tmp_path, hub, resume=True)
 
 
-def test_resuming_with_other_networks_is_refused(tmp_path, broker):
+def test_resuming_with_other_networks_is_refused(tmp_path, hub):
     create_run(tmp_path, CONFIG)
     stopped = threading.Event()
     stopped.set()
-    learn(tmp_path, broker, CONFIG, stopped)
+    learn(tmp_path, hub, CONFIG, stopped)
     with pytest.raises(CongraspError, match="does not fit this run: 'params/actor"):
-        learn(tmp_path, broker, dataclasses.replace(CONFIG, network=NetworkConfig(hidden=(9,), encoder=2)), resume=True)
+        learn(tmp_path, hub, dataclasses.replace(CONFIG, network=NetworkConfig(hidden=(9,), encoder=2)), resume=True)

@@ -1,74 +1,249 @@
-"""Admission never lets too much on its way, and its capacity never leaks."""
+"""Admission: the bound holds, capacity returns, and every rollout is accounted for."""
 
+import threading
+
+import hypothesis.strategies as st
+import pytest
 from hypothesis import settings
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from learner.staleness import StalenessManager
 
-ETA, BATCH, SECONDS = 1, 3, 10.0
+A, B = ("a", "1"), ("b", "1")
+
+
+def manager(max_staleness=1, batch=2, **options):
+    return StalenessManager(max_staleness, batch, **options)
+
+
+def test_tickets_worked_out_by_hand():
+    """Batch 2, eta 1: (1 + 0 + 1) * 2 = 4 may be under way at version 0, and 2 more with every version."""
+    staleness = manager()
+    assert staleness.capacity == 4
+    assert all(staleness.grant(owner, i) for owner in (A, B) for i in "xy")
+    assert staleness.grant(("c", "1"), "z") is None
+    for owner in (A, B):
+        assert staleness.arrive(owner, "x", 0) == "accepted"
+    assert staleness.capacity == 0  # what arrived still counts
+    assert staleness.take(0) and staleness.take(0)
+    assert staleness.capacity == 0  # and what is being learnt from
+    staleness.publish(1)
+    assert staleness.capacity == 2
+    assert staleness.ledger() == {
+        "granted": 4, "redeemed": 2, "returned": 0, "expired": 0, "accepted": 2, "consumed": 2, "dropped": 0,
+        "stale": 0, "duplicate": 0, "damaged": 0, "running": 2, "queued": 0, "capacity": 2,
+    }  # fmt: skip
+
+
+def test_without_staleness_nothing_starts_during_an_update():
+    staleness = manager(max_staleness=0, batch=1)
+    assert staleness.grant(A, "x").version == 0
+    assert staleness.grant(A, "y") is None
+    assert staleness.arrive(A, "x", 0) == "accepted" and staleness.take(0)
+    assert staleness.grant(A, "y") is None
+    staleness.publish(1)
+    assert staleness.grant(A, "y").version == 1
+
+
+def test_asking_twice_is_asking_once():
+    staleness = manager()
+    assert staleness.grant(A, "x") is staleness.grant(A, "x")
+    assert staleness.running == 1
+    assert staleness.grant(B, "x").owner == B
+    assert staleness.running == 2
+
+
+def test_nobody_takes_all_tickets():
+    staleness = manager(batch=10, tickets_per_owner=3)
+    assert [bool(staleness.grant(A, str(i))) for i in range(5)] == [True, True, True, False, False]
+    assert staleness.grant(B, "0")
+
+
+def test_tickets_return():
+    now = [0.0]
+    staleness = manager(ticket_seconds=10, clock=lambda: now[0])
+    for owner in (A, B):
+        for i in "xy":
+            staleness.grant(owner, i)
+    assert staleness.forget(A) == 2 and staleness.capacity == 2
+    staleness.give_back(B, "x")
+    staleness.give_back(B, "x")
+    staleness.give_back(B, "unknown")
+    assert staleness.capacity == 3
+    now[0] = 9.9
+    assert staleness.capacity == 3
+    now[0] = 10.0
+    assert staleness.capacity == 4 and staleness.running == 0
+    ledger = staleness.ledger()
+    assert (ledger["granted"], ledger["returned"], ledger["expired"]) == (4, 3, 1)
+
+
+def test_rollout_without_a_ticket_comes_in_only_where_there_is_room():
+    staleness = manager(batch=1)  # room for 2
+    assert staleness.arrive(A, "lost", 0) == "accepted"
+    assert staleness.grant(B, "x")
+    assert staleness.arrive(A, "lost too", 0) == "full"
+    assert staleness.arrive(B, "x", 0) == "accepted"
+    assert staleness.arrive(A, "lost too", 0) == "full"
+    assert staleness.take(0)
+    staleness.publish(1)
+    assert staleness.arrive(A, "lost too", 0) == "accepted"
+
+
+def test_old_rollouts_are_refused_or_dropped_and_counted():
+    staleness = manager()
+    staleness.grant(A, "x")
+    staleness.grant(A, "y")
+    assert staleness.arrive(A, "x", 0) == "accepted"
+    staleness.publish(2)
+    assert staleness.arrive(A, "y", 0) == "stale"
+    assert staleness.arrive(A, "z", 1) == "accepted"
+    assert staleness.arrive(A, "z", 3) == "stale"  # made by a version that this learner never had
+    assert not staleness.take(0)
+    assert staleness.take(1)
+    ledger = staleness.ledger()
+    assert (ledger["accepted"], ledger["dropped"], ledger["consumed"], ledger["stale"]) == (2, 1, 1, 2)
+    assert ledger["running"] == 0
+
+
+def test_checkpoint_keeps_what_is_settled():
+    staleness = manager()
+    staleness.grant(A, "x")
+    staleness.grant(A, "y")
+    staleness.grant(A, "z")
+    for i in "xy":
+        staleness.arrive(A, i, 0)
+    assert staleness.take(0)
+    staleness.refuse_duplicate(A, "x")
+    staleness.refuse_damaged(A, "none")
+    staleness.refuse_damaged()
+    durable = staleness.durable()
+    resumed = manager()
+    resumed.restore(durable, 7)
+    assert resumed.version == 7 and resumed.capacity == 4  # (1 + 7 + 1) * 2 - 7 * 2
+    ledger = resumed.ledger()
+    assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["running"]) == (1, 1, 0, 0)
+    assert (ledger["granted"], ledger["redeemed"], ledger["duplicate"], ledger["damaged"]) == (2, 2, 1, 2)
 
 
 class Admission(RuleBasedStateMachine):
-    """Any order of grants, acceptances, deaths, expiries and consumption."""
+    """Actors, a learner and a clock in any order, checked against a model that keeps every rollout by name."""
 
     def __init__(self):
         super().__init__()
         self.now = 0.0
-        self.manager = StalenessManager(max_staleness=ETA, batch=BATCH, ticket_seconds=SECONDS, clock=lambda: self.now)
-        self.out: dict[str, tuple[tuple[str, str], float]] = {}
-        self.queued = 0
+        self.eta, self.batch = 1, 3
+        self.staleness = StalenessManager(
+            self.eta, self.batch, ticket_seconds=10, tickets_per_owner=4, clock=lambda: self.now
+        )
+        self.tickets = {}  # (owner, id) -> version
+        self.deadlines = {}
+        self.queue = []  # versions of accepted rollouts
+        self.in_update = 0
+        self.fates = {"accepted": 0, "consumed": 0, "dropped": 0, "stale": 0}
+        self.next_id = 0
 
-    @rule(actor=st.sampled_from("abc"))
-    def grant(self, actor):
-        room = (ETA + 1) * BATCH - self.queued - sum(deadline >= self.now for _, deadline in self.out.values())
-        ticket = self.manager.grant((actor, "1"))
-        assert (ticket is not None) == (room > 0)
-        if ticket is not None:
-            self.out[ticket] = ((actor, "1"), self.now + SECONDS)
+    owners = st.sampled_from([A, B, ("c", "2")])
 
+    @rule(owner=owners)
+    def ask(self, owner):
+        self.next_id += 1
+        had = self.staleness.capacity
+        held = sum(key[0] == owner for key in self.tickets)
+        ticket = self.staleness.grant(owner, str(self.next_id))
+        assert (ticket is not None) == (had > 0 and held < 4)
+        if ticket:
+            assert ticket.version == self.staleness.version
+            self.tickets[owner, ticket.id] = ticket.version
+            self.deadlines[owner, ticket.id] = self.now + 10
+
+    @precondition(lambda self: self.tickets)
+    @rule(data=st.data())
+    def upload(self, data):
+        key = data.draw(st.sampled_from(sorted(self.tickets)))
+        version = self.tickets.pop(key)
+        self._arrive(key, version, must_fit=True)
+
+    @rule(owner=owners, age=st.integers(-1, 3))
+    def upload_without_a_ticket(self, owner, age):
+        self._arrive((owner, "none"), max(0, self.staleness.version - age), must_fit=False)
+
+    def _arrive(self, key, version, *, must_fit):
+        capacity = self.staleness.capacity
+        verdict = self.staleness.arrive(*key, version)
+        if not 0 <= self.staleness.version - version <= self.eta:
+            assert verdict == "stale"
+            self.fates["stale"] += 1
+        elif must_fit or capacity > 0:
+            assert verdict == "accepted"
+            self.fates["accepted"] += 1
+            self.queue.append(version)
+        else:
+            assert verdict == "full"
+
+    @precondition(lambda self: len(self.queue) + self.in_update >= self.batch)
     @rule()
-    def accept(self):
-        if self.out:
-            ticket = next(iter(self.out))
-            del self.out[ticket]
-            self.manager.accept(ticket)
-            self.queued += 1
+    def update(self):
+        while self.queue and self.in_update < self.batch:
+            version = self.queue.pop(0)
+            fresh = self.staleness.take(version)
+            assert fresh == (self.staleness.version - version <= self.eta)
+            self.fates["consumed" if fresh else "dropped"] += 1
+            self.in_update += fresh
+        if self.in_update == self.batch:
+            self.staleness.publish(self.staleness.version + 1)
+            self.in_update = 0
 
-    @rule(actor=st.sampled_from("abc"))
-    def die(self, actor):
-        mine = [t for t, (owner, deadline) in self.out.items() if owner[0] == actor and deadline >= self.now]
-        assert self.manager.running >= 0  # expires what is late first
-        assert self.manager.forget((actor, "1")) == len(mine)
-        self.out = {t: v for t, v in self.out.items() if v[0][0] != actor}
+    @rule(owner=owners)
+    def die(self, owner):
+        mine = [key for key in self.tickets if key[0] == owner]
+        assert self.staleness.forget(owner) == len(mine)
+        for key in mine:
+            del self.tickets[key]
 
-    @rule(seconds=st.floats(0.5, 8.0))
+    @rule(seconds=st.floats(0, 6))
     def wait(self, seconds):
         self.now += seconds
+        self.tickets = {key: version for key, version in self.tickets.items() if self.deadlines[key] > self.now}
 
-    @rule(stale=st.booleans())
-    def consume(self, stale):
-        if self.queued:
-            self.manager.leave_queue(stale=stale)
-            self.queued -= 1
+    @rule()
+    def restart(self):
+        durable, version = self.staleness.durable(), self.staleness.version
+        self.staleness.restore(durable, version)
+        self.fates["accepted"] -= len(self.queue)
+        self.tickets, self.queue, self.in_update = {}, [], 0
 
     @invariant()
-    def accounts_balance(self):
-        ledger = self.manager.ledger
-        assert ledger.accepted == ledger.consumed + ledger.stale + self.manager.queued
-        assert self.manager.queued == self.queued
-        assert self.manager.running == sum(deadline >= self.now for _, deadline in self.out.values())
+    def bound_and_books(self):
+        ledger = self.staleness.ledger()
+        version = self.staleness.version
+        assert (
+            version * self.batch + self.in_update + len(self.queue) + len(self.tickets)
+            <= (self.eta + version + 1) * self.batch
+        )
+        assert ledger["running"] == len(self.tickets) and ledger["queued"] == len(self.queue)
+        assert ledger["capacity"] == (self.eta + 1) * self.batch - self.in_update - len(self.queue) - len(self.tickets)
+        assert ledger["granted"] == ledger["running"] + ledger["redeemed"] + ledger["returned"] + ledger["expired"]
+        assert {name: ledger[name] for name in self.fates} == self.fates
 
 
 TestAdmission = Admission.TestCase
-TestAdmission.settings = settings(max_examples=60, deadline=None)
+TestAdmission.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
 
 
-def test_bound_by_hand():
-    manager = StalenessManager(max_staleness=1, batch=2)
-    tickets = [manager.grant(("a", "1")) for _ in range(5)]
-    assert [ticket is not None for ticket in tickets] == [True, True, True, True, False]  # (1 + 1) * 2
-    manager.accept(tickets[0])
-    assert manager.grant(("a", "1")) is None  # accepted, not yet consumed
-    manager.leave_queue(stale=False)
-    assert manager.grant(("a", "1")) is not None
+@pytest.mark.timeout(30)
+def test_threads_cannot_overdraw():
+    staleness = manager(batch=25, tickets_per_owner=1000)  # 50 tickets
+    granted = []
+
+    def ask(name):
+        for i in range(40):
+            if staleness.grant((name, "1"), str(i)):
+                granted.append(i)
+
+    threads = [threading.Thread(target=ask, args=(str(i),), daemon=True) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    assert len(granted) == 50 == staleness.running

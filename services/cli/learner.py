@@ -1,0 +1,63 @@
+"""`congrasp learner`: the learner alone."""
+
+import dataclasses
+import pathlib
+from collections.abc import Callable
+from typing import Annotated
+
+import tyro
+
+from common.config import RunConfig
+from services.cli.train import preset_of
+from services.presets import get_preset
+
+
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """The learner alone; actors on this machine or on others connect to it with `congrasp actor --connect`.
+
+    A new run takes its configuration from the preset and the command line; a directory that holds a run keeps its own.
+    """
+
+    config: Annotated[RunConfig, tyro.conf.arg(name="")]
+    run_dir: pathlib.Path
+    """Where the run is kept."""
+    preset: str = "quickstart"
+    """Named configuration to start from."""
+    listen: str = "tcp/127.0.0.1:7447"
+    """Endpoint for the actors; bulk messages use the next port. Other machines need tcp/0.0.0.0:PORT."""
+    resume: bool = False
+    """Go on with the run in --run-dir, from its latest checkpoint if it has one."""
+
+    def run(self) -> int:
+        """Runs the command."""
+        from common.logs.recorder import Recorder
+        from common.transport.zenoh_transport import ZenohTransport
+        from learner.process import LOGS, create_run, open_run, run_learner
+        from services.shutdown import on_signal
+
+        has_checkpoint = (self.run_dir / "checkpoints" / "latest").exists()
+        if self.resume:
+            config = open_run(self.run_dir)
+        else:
+            config = self.config
+            create_run(self.run_dir, config)
+        with on_signal() as stop, ZenohTransport(listen=[self.listen]) as transport:
+            run_learner(
+                self.run_dir,
+                config,
+                transport,
+                stop_event=stop,
+                resume=self.resume and has_checkpoint,
+                recorder=Recorder(transport, config.name, self.run_dir / LOGS),
+                on_event=lambda level, text: print(f"{level}: {text}", flush=True),
+            )
+            return stop.exit_code
+
+
+def parse(arguments: list[str]) -> Callable[[], int]:
+    """The call that these arguments ask for."""
+    name = preset_of(arguments)
+    missing = tyro.MISSING
+    default = Learner(config=get_preset(name), run_dir=missing, preset=name)
+    return tyro.cli(Learner, prog="congrasp learner", args=arguments, default=default).run

@@ -1,0 +1,67 @@
+"""`congrasp train`: a learner and its actors on this machine."""
+
+import dataclasses
+import pathlib
+import time
+from collections.abc import Callable
+from typing import Annotated
+
+import tyro
+
+from common.config import RunConfig
+from services.presets import get_preset
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Trains a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
+
+    Starts from a preset (`--preset quickstart` or `human`); every field of the run can be set on the command line.
+    """
+
+    config: Annotated[RunConfig, tyro.conf.arg(name="")]
+    preset: str = "quickstart"
+    """Named configuration to start from."""
+    run_dir: pathlib.Path | None = None
+    """Where the run is kept; runs/NAME-DATE by default."""
+    actors: int = 2
+    """Actor processes."""
+    resume: bool = False
+    """Go on from the latest checkpoint in --run-dir."""
+    in_process: bool = False
+    """One process without a network: the learner and one actor over the in-memory transport."""
+    evaluation: int = 64
+    """Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out."""
+
+    def run(self) -> int:
+        """Runs the command."""
+        from services.quickstart import run_training
+
+        run_dir = self.run_dir or pathlib.Path("runs") / f"{self.config.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+        return run_training(
+            self.config,
+            run_dir,
+            actors=self.actors,
+            resume=self.resume,
+            in_process=self.in_process,
+            evaluation=self.evaluation,
+        )
+
+
+def preset_of(arguments: list[str]) -> str:
+    """The value of `--preset` in a command line, which decides on the defaults of everything else."""
+    for i, word in enumerate(arguments):
+        if word == "--preset" and i + 1 < len(arguments):
+            return arguments[i + 1]
+        if word.startswith("--preset="):
+            return word.split("=", 1)[1]
+    return "quickstart"
+
+
+def parse(arguments: list[str]) -> Callable[[], int]:
+    """The call that these arguments ask for."""
+    name = preset_of(arguments)
+    default = Train(config=get_preset(name), preset=name)
+    return tyro.cli(Train, prog="congrasp train", args=arguments, default=default).run
+
+

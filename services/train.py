@@ -1,0 +1,223 @@
+"""A learner and its actors on this machine: starts them, keeps them alive, shows how it goes, and ends them together."""
+
+import contextlib
+import dataclasses
+import os
+import pathlib
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from common.config import PhysicsName, RunConfig
+from common.errors import CongraspError, TransportError
+from common.transport.keys import FLOWS, Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.transport.zenoh_transport import ZenohTransport
+from services.shutdown import GRACE, PARENT_VARIABLE
+
+MAX_RESTARTS = 5
+_BAD_INPUT = 2
+Report = Callable[[dict[str, Any]], None]
+"""Given the learner's newest metrics, where there are any, and the number of actors alive, about once a second."""
+
+
+@dataclasses.dataclass
+class Child:
+    """A process of the run."""
+
+    name: str
+    arguments: list[str]
+    log: pathlib.Path
+    process: subprocess.Popen[bytes] | None = None
+    restarts: int = 0
+    again_at: float = 0.0
+
+    def start(self) -> None:
+        """Starts it in a session of its own, so that Ctrl-C reaches the orchestrator alone; it dies with its parent."""
+        environment = {**os.environ, PARENT_VARIABLE: str(os.getpid())}
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "services.cli.main", *self.arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env=environment,
+                start_new_session=True,
+            )
+
+    def last_words(self) -> str:
+        """The last line of its log."""
+        lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
+        return lines[-1].removeprefix("congrasp: error: ") if lines else "it said nothing"
+
+
+def train(
+    run_dir: pathlib.Path,
+    config: RunConfig,
+    *,
+    actors: int,
+    physics: PhysicsName,
+    stop: threading.Event,
+    endpoint: str | None = None,
+    report: Report = lambda status: None,
+    notify: Callable[[str], None] = lambda text: None,
+) -> None:
+    """Runs a prepared run directory to its end with one learner and `actors` actor processes.
+
+    A process that dies is started again (the learner from its last checkpoint), up to `MAX_RESTARTS` times each.
+
+    Args:
+      run_dir: made by `learner.process.create_run`; with checkpoints, the run goes on from the latest.
+      config: the run's configuration.
+      actors: number of actor processes.
+      physics: engine of the actors.
+      stop: drains everything within a few seconds when set.
+      endpoint: where the learner listens; a free port of the loopback interface by default.
+      report: shows progress.
+      notify: told in words when something is restarted.
+
+    Raises:
+      CongraspError: a process failed for good; its last words are in the message.
+    """
+    endpoint = endpoint or f"tcp/127.0.0.1:{free_port()}"
+    logs = run_dir / "logs"
+    logs.mkdir(exist_ok=True)
+    threads = max(1, (os.cpu_count() or 1) // max(1, actors))
+    learner = Child(
+        "learner", ["learner", "--run-dir", str(run_dir), "--listen", endpoint, "--resume"], logs / "learner.log"
+    )
+    children = [learner]
+    for number in range(actors):
+        name = f"actor-{number}"
+        arguments = ["actor", "--connect", endpoint, "--run", config.name, "--id", name, "--physics", physics]
+        children.append(Child(name, [*arguments, "--threads", str(threads)], logs / f"{name}.log"))
+    try:
+        for child in children:
+            child.start()
+        with _connected(endpoint, learner, stop) as transport:
+            _supervise(children, transport, config.name, stop, report, notify)
+    finally:
+        end_all(children)
+
+
+def _connected(endpoint: str, learner: Child, stop: threading.Event) -> ZenohTransport:
+    deadline = time.monotonic() + 120.0
+    while time.monotonic() < deadline and not stop.is_set():
+        try:
+            return ZenohTransport(connect=[endpoint], wait=1.0)
+        except TransportError:
+            assert learner.process is not None
+            if learner.process.poll() not in (None, 0):
+                break
+    raise CongraspError(f"The learner did not start: {learner.last_words()}")
+
+
+def _supervise(
+    children: Sequence[Child],
+    transport: ZenohTransport,
+    run: str,
+    stop: threading.Event,
+    report: Report,
+    notify: Callable[[str], None],
+) -> None:
+    learner = children[0]
+    metrics = transport.subscribe(Keys(run).learner_metrics, depth=16)
+    while not stop.is_set():
+        for child in children:
+            assert child.process is not None
+            code = child.process.poll()
+            if code is None or (child is not learner and code == 0):
+                continue
+            if child is learner and code == 0:
+                return
+            if code == _BAD_INPUT or child.restarts >= MAX_RESTARTS:
+                raise CongraspError(f"The {child.name} failed: {child.last_words()}", f"Its log is {child.log}.")
+            if child.again_at == 0.0:
+                notify(f"The {child.name} died (exit code {code}); starting it again.")
+                child.again_at = time.monotonic() + min(2.0**child.restarts, 15.0) - 1.0
+            if time.monotonic() >= child.again_at:
+                child.restarts += 1
+                child.again_at = 0.0
+                child.start()
+        received = metrics.receive(1.0)
+        alive = sum(child is not learner and child.process.poll() is None for child in children if child.process)
+        report({**(received[1].meta if received else {}), "actors": alive})
+
+
+def end_all(children: Sequence[Child]) -> None:
+    """SIGTERM to all, and SIGKILL to those that have not drained within `GRACE` seconds."""
+    running = [child.process for child in children if child.process is not None and child.process.poll() is None]
+    for process in running:
+        process.terminate()
+    deadline = time.monotonic() + GRACE
+    for process in running:
+        try:
+            process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def train_in_process(
+    run_dir: pathlib.Path,
+    config: RunConfig,
+    *,
+    physics: PhysicsName,
+    stop: threading.Event,
+    resume: bool,
+    on_update: Callable[[dict[str, float]], None] = lambda values: None,
+) -> None:
+    """The same learner and one actor in this process, over the in-memory transport."""
+    from actors.process import run_actor
+    from common.logs.recorder import Recorder
+    from learner.process import LOGS, run_learner
+
+    broker = MemoryHub()
+    failures: list[BaseException] = []
+    ended = threading.Event()
+
+    def act() -> None:
+        try:
+            with MemoryTransport(broker) as transport:
+                run_actor(
+                    transport, run=config.name, actor="actor-0", stop=ended, physics=physics, threads=os.cpu_count() or 1
+                )
+        except BaseException as error:
+            failures.append(error)
+            stop.set()
+
+    actor = threading.Thread(target=act, name="actor", daemon=True)
+    with MemoryTransport(broker) as transport:
+        recorder = Recorder(transport, config.name, run_dir / LOGS)
+        actor_started = threading.Timer(0.5, actor.start)
+        actor_started.start()
+        try:
+            run_learner(
+                run_dir, config, transport, stop_event=stop, resume=resume, recorder=recorder, on_update=on_update
+            )
+        finally:
+            ended.set()
+            actor_started.cancel()
+            if actor.ident is not None:
+                actor.join(GRACE)
+    if failures:
+        raise failures[0]
+
+
+def free_port() -> int:
+    """A port of the loopback interface that is free together with those after it that a transport uses."""
+    while True:
+        with contextlib.ExitStack() as stack:
+            probes = [stack.enter_context(socket.socket()) for _ in FLOWS]
+            probes[0].bind(("127.0.0.1", 0))
+            port = probes[0].getsockname()[1]
+            try:
+                for i, probe in enumerate(probes[1:], 1):
+                    probe.bind(("127.0.0.1", port + i))
+            except (OSError, OverflowError):
+                continue
+            return port

@@ -1,0 +1,307 @@
+"""The actor's end, against a learner that a test scripts."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
+from common.errors import CongraspError, TransportError
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.wire.codec import Message
+
+pytestmark = pytest.mark.timeout(30)
+KEYS = Keys("test")
+TICKET = Ticket("t", 0)
+
+
+class Learner:
+    """Answers as told, and remembers what it was asked."""
+
+    def __init__(self, hub, *, epoch="e", life="1"):
+        self.transport = MemoryTransport(hub)
+        self.state = {"version": 0, "epoch": epoch, "life": life, "finished": False}
+        self.granted = True
+        self.outcomes = []  # what rollouts are told, the last one for ever
+        self.received = []
+        self.tickets = []
+        self.pulls = 0
+        self.transport.serve(KEYS.config, lambda key, m: self.reply(config="{}", schema="s"))
+        self.transport.serve(KEYS.ticket, self.on_ticket)
+        self.transport.serve(KEYS.weights, self.on_weights)
+        self.transport.serve(KEYS.rollout, self.on_rollout, workers=4)
+
+    def reply(self, **meta):
+        return Message(meta={**self.state, "retry_after": 0.05, "why": "because", **meta})
+
+    def on_ticket(self, key, message):
+        self.tickets.append(message.meta)
+        return self.reply(granted=self.granted)
+
+    def on_weights(self, key, message):
+        self.pulls += 1
+        if (message.meta["newer_than"], message.meta["life"]) == (self.state["version"], self.state["life"]):
+            return self.reply()
+        return Message({"w": np.ones(2)}, {"version": self.state["version"], "epoch": self.state["epoch"]})
+
+    def on_rollout(self, key, message):
+        self.received.append(message)
+        outcome = self.outcomes.pop(0) if len(self.outcomes) > 1 else self.outcomes[0] if self.outcomes else "accepted"
+        if isinstance(outcome, Exception):
+            raise outcome
+        if callable(outcome):
+            outcome = outcome()
+        return self.reply(outcome=outcome)
+
+    def announce(self, **state):
+        self.state |= state
+        self.transport.publish(KEYS.announcement, Message(meta=self.state))
+
+
+@pytest.fixture
+def ends():
+    """(in-memory hub, function that makes a link)."""
+    hub = MemoryHub()
+    made = []
+
+    def make(**options):
+        transport = MemoryTransport(hub)
+        link = ActorLink(transport, "test", "a", **{"request_timeout": 2.0, **options})
+        made.append((transport, link))
+        return link
+
+    yield hub, make
+    for transport, link in made:
+        link.close()
+        transport.close()
+
+
+def rollout(value=0.0):
+    return Message({"reward": np.full(3, value)}, {"version": 0, "schema": "s", "steps": 3})
+
+
+def test_config_waits_for_a_learner(ends):
+    hub, make = ends
+    link = make()
+    with pytest.raises(TransportError):
+        link.config(0.2)
+    threading.Timer(0.2, Learner, [hub]).start()
+    assert link.config(10) == ("{}", "e", "s")
+
+
+def test_identity_is_added_and_counts(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    with pytest.raises(CongraspError, match="no configuration"):
+        link.upload(rollout(), TICKET)
+    link.config(5)
+    for n in range(3):
+        assert link.upload(rollout(n), Ticket(f"t{n}", 0)).result(5) == "accepted"
+    other = make()
+    assert other.incarnation != link.incarnation
+    for n, message in enumerate(learner.received):
+        assert message.arrays["reward"][0] == n
+        expected = {"actor": "a", "incarnation": link.incarnation, "sequence": n, "epoch": "e", "ticket": f"t{n}"}
+        assert message.meta == {"version": 0, "schema": "s", "steps": 3, **expected}
+
+
+def test_tickets_are_waited_for_and_asked_for_under_one_id(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    learner.granted = False
+    link.config(5)
+    assert link.acquire_ticket(0.2) is None
+    assert len(learner.tickets) >= 2
+    learner.granted = True
+    learner.state["version"] = 7
+    first, second = link.acquire_ticket(5), link.acquire_ticket(5)
+    assert first.version == 7 and first.id != second.id
+    assert {meta["ticket"] for meta in learner.tickets} == {first.id, second.id}
+    link.give_back(second)
+    assert learner.tickets[-1] == {
+        "actor": "a", "incarnation": link.incarnation, "ticket": second.id, "give_back": True,
+    }  # fmt: skip
+
+
+def test_an_announcement_ends_the_wait_for_a_ticket(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    learner.reply = lambda **meta: Message(meta={**learner.state, "retry_after": 20.0, **meta})
+    link.config(5)
+    learner.granted = False
+
+    def move_on():
+        learner.granted = True
+        learner.announce(version=1)
+
+    threading.Timer(0.2, move_on).start()
+    assert link.acquire_ticket(15).version == 1
+
+
+def test_weights_are_pulled_only_when_there_are_others(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    link.config(5)
+    assert link.weights(-1).meta["version"] == 0
+    for _ in range(5):
+        assert link.weights(0) is None
+    assert learner.pulls == 1
+    learner.announce(version=1)
+    assert link.weights(0).meta["version"] == 1
+    assert link.weights(1) is None and learner.pulls == 2
+    learner.state["version"] = 2  # its announcement is lost; a ticket tells as well
+    assert link.weights(1) is None
+    link.acquire_ticket(5)
+    assert link.weights(1).meta["version"] == 2
+    learner.announce(version=1, life="2")  # it resumed from a checkpoint
+    assert link.weights(2).meta["version"] == 1
+    learner.announce(version=1, life="3")
+    assert link.weights(1).meta["version"] == 1
+    assert link.weights(1) is None
+
+
+def test_rollout_is_sent_under_one_identity_until_it_is_answered(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    link.config(5)
+    learner.outcomes = ["retry", RuntimeError("bug"), "retry", "duplicate"]
+    assert link.upload(rollout(), TICKET).result(10) == "duplicate"
+    assert len({id(message) for message in learner.received}) == 1 and len(learner.received) == 4
+
+
+def test_rollout_survives_a_restart_of_the_learner(ends):
+    hub, make = ends
+    first, link = Learner(hub), make()
+    link.config(5)
+    first.transport.close()
+    outcome = link.upload(rollout(5), TICKET)
+    assert link.acquire_ticket(0.2) is None and link.weights(-1) is None
+    time.sleep(0.3)
+    assert not outcome.done()
+    second = Learner(hub, life="2")
+    assert outcome.result(10) == "accepted"
+    assert second.received[0].meta["sequence"] == 0
+    assert link.weights(0).meta["version"] == 0  # the number is the same, the learner is not
+
+
+def test_another_training_is_told_to_the_caller_who_starts_over(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    link.config(5)
+    learner.state["epoch"] = "f"
+    outcome = link.upload(rollout(), TICKET)
+    with pytest.raises(RunRestarted, match="epoch f after e"):
+        outcome.result(5)
+    for use in (lambda: link.upload(rollout(), TICKET), lambda: link.acquire_ticket(1), lambda: link.weights(0)):
+        with pytest.raises(RunRestarted):
+            use()
+    assert link.config(5).epoch == "f"
+    assert link.upload(rollout(), TICKET).result(5) == "accepted"
+    assert [message.meta["sequence"] for message in learner.received] == [0, 1]
+
+
+@pytest.mark.parametrize("by", ["ticket", "weights", "announcement"])
+def test_another_training_is_noticed_by_every_way(ends, by):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    link.config(5)
+    if by == "announcement":
+        learner.announce(epoch="f")
+    learner.state["epoch"] = "f"
+    with pytest.raises(RunRestarted):
+        link.acquire_ticket(1) if by == "ticket" else link.weights(-1)
+
+
+def test_finished_run_is_told_to_the_caller(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    link.config(5)
+    learner.state["finished"] = True
+    with pytest.raises(RunFinished):
+        link.acquire_ticket(5)
+
+
+def test_uploads_overlap_with_the_caller_up_to_the_window(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make(window=2)
+    link.config(5)
+    gate = threading.Event()
+    learner.outcomes = [lambda: gate.wait(10) and "accepted"]
+    outcomes = [link.upload(rollout(n), TICKET) for n in range(2)]  # both return at once
+    third = threading.Thread(target=lambda: outcomes.append(link.upload(rollout(2), TICKET)), daemon=True)
+    third.start()
+    third.join(0.3)
+    assert third.is_alive() and len(learner.received) == 2
+    assert link.flush(0.05) is False
+    gate.set()
+    third.join(5)
+    assert link.flush(5) is True
+    assert [outcome.result(0) for outcome in outcomes] == ["accepted"] * 3
+
+
+def test_refusals_in_a_row_stop_the_actor_with_a_reason(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make(max_refusals=3)
+    link.config(5)
+    learner.outcomes = ["refused", "refused", "stale", "refused", "refused", "refused"]
+    assert [link.upload(rollout(), TICKET).result(5) for _ in range(6)][2:4] == ["stale", "refused"]
+    for use in (lambda: link.upload(rollout(), TICKET), lambda: link.acquire_ticket(1), lambda: link.weights(0)):
+        with pytest.raises(CongraspError, match="refused 3 rollouts in a row: because"):
+            use()
+    assert len(learner.received) == 6
+
+
+def test_message_that_always_arrives_damaged_is_not_sent_for_ever(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make(max_refusals=2)
+    link.config(5)
+    learner.outcomes = [CongraspError("The message's data do not match their checksum.")]
+    assert link.upload(rollout(), TICKET).result(10) == "refused"
+    assert len(learner.received) == 2
+    assert link.upload(rollout(), TICKET).result(10) == "refused"
+    with pytest.raises(CongraspError, match=r"refused 2 rollouts in a row: .*checksum"):
+        link.upload(rollout(), TICKET)
+
+
+def test_silent_learner_is_given_up(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make(patience=0.3)
+    link.config(5)
+    learner.transport.close()
+    with pytest.raises(TransportError, match=r"not answered for 0\.3 s"):
+        link.upload(rollout(), TICKET).result(10)
+    with pytest.raises(TransportError, match=r"not answered for 0\.3 s"):
+        link.acquire_ticket(5)
+
+
+def test_learner_that_talks_nonsense_ends_the_link(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    link.config(5)
+    learner.reply = lambda **meta: Message(meta={"hello": 1})
+    with pytest.raises(CongraspError, match="cannot be understood"):
+        link.upload(rollout(), TICKET).result(5)
+    with pytest.raises(CongraspError, match="cannot be understood"):
+        link.acquire_ticket(1)
+
+
+def test_closing_gives_up_what_is_on_its_way(ends):
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    link.config(5)
+    learner.outcomes = ["retry"]
+    outcome = link.upload(rollout(), TICKET)
+    link.close()
+    with pytest.raises(TransportError, match="closed before"):
+        outcome.result(5)
+    assert link.flush(1)
+    with pytest.raises(CongraspError, match="closed"):
+        link.upload(rollout(), TICKET)
+
+
+def test_liveliness(ends):
+    hub, make = ends
+    link = make()
+    assert hub.tokens == [KEYS.alive("actor", "a", link.incarnation)]

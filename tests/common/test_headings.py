@@ -1,0 +1,177 @@
+"""Heading sets against the paper's rules, checked from their definitions, and table geometry worked out by hand."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.constraints.headings import (
+    INWARD,
+    MAX_WIDTH,
+    Headings,
+    above,
+    clear_table,
+    feasible,
+    sample_headings,
+)
+from common.objects.procedural import FAMILIES, generate
+
+DOWN, LEVEL, UP = [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
+FLAT = np.array([0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0])
+
+
+def made(*rows):
+    """Headings from (position, direction) rows."""
+    position, direction = (np.array(part, np.float32) for part in zip(*rows, strict=True))
+    cross = np.cross(direction, [0.3, 0.5, 0.8])
+    return Headings(position, direction, cross / np.linalg.norm(cross, axis=-1, keepdims=True))
+
+
+def local_width(points, position, direction, cross):
+    """The definition, one heading at a time."""
+    offset = points - position
+    breadth = np.cross(direction, cross)
+    slab = (np.abs(offset @ breadth) < 0.03) & (offset @ direction < 0.01)
+    return np.ptp(offset[slab] @ cross)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from(FAMILIES), st.booleans(), st.integers(0, 99))
+def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
+    obj = generate(seed, family)
+    headings = sample_headings(obj, np.random.default_rng(draw), use_affordance=affordance)
+    position, direction, cross = (part.astype(float) for part in headings)
+    assert position.shape == direction.shape == cross.shape == (256, 3)
+    assert all(part.dtype == np.float32 for part in headings)
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(cross, axis=-1), 1, atol=1e-5)
+    np.testing.assert_allclose((direction * cross).sum(-1), 0, atol=1e-5)
+    # Two centimetres back lies a surface point, and the direction is within 30 degrees of its inward normal.
+    back = position - INWARD * direction
+    distance = np.linalg.norm(back[:, None] - obj.points, axis=-1)
+    source = distance.argmin(-1)
+    assert distance.min(-1).max() < 1e-5
+    assert -(direction * obj.normals[source]).sum(-1).min() > np.cos(np.radians(30)) - 1e-5
+    widths = [local_width(obj.points[:256], *heading) for heading in zip(position, direction, cross, strict=True)]
+    assert max(widths) <= MAX_WIDTH + 1e-5
+    minus = obj.non_graspable_points
+    if affordance:
+        assert not minus[source].any()
+        # No point of O- within 1 cm of the approach, and the end nearer to O+.
+        along = np.linspace(0, 0.15, 60)
+        for p, v in zip(position[::16], direction[::16], strict=True):
+            way = p - along[:, None] * v
+            assert np.linalg.norm(way[:, None] - obj.points[minus], axis=-1).min() > 0.0099
+            to = np.linalg.norm(obj.points - p, axis=-1)
+            assert to[~minus].min() <= to[minus].min() + 1e-6
+    else:
+        assert 0.5 * minus.mean() < minus[source].mean() or minus.mean() < 0.2
+
+
+def test_headings_repeat_with_the_random_state_and_differ_without():
+    obj = generate(0, "mug")
+    first, again, other = (
+        sample_headings(obj, np.random.default_rng(seed), use_affordance=True).position for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert len(np.unique(np.concatenate([first, other]), axis=0)) > 400
+
+
+def test_directions_fill_the_cone_evenly():
+    obj = generate(0, "box")
+    headings = sample_headings(obj, np.random.default_rng(0), use_affordance=False, count=4000, attempts=20)
+    back = headings.position - INWARD * headings.direction
+    source = np.linalg.norm(back[:, None] - obj.points, axis=-1).argmin(-1)
+    cosine = -(headings.direction * obj.normals[source]).sum(-1)
+    # Uniform in solid angle: half of the cone lies within acos((1 + cos 30) / 2) = 21.1 degrees.
+    assert np.isclose((cosine > (1 + np.cos(np.radians(30))) / 2).mean(), 0.5, atol=0.06)
+
+
+def test_narrow_rolls_are_preferred():
+    obj = generate(5, "screwdriver")
+    headings = sample_headings(obj, np.random.default_rng(0), use_affordance=True)
+    assert np.median([local_width(obj.points, *heading) for heading in zip(*headings, strict=True)]) < 0.05
+
+
+def test_the_first_surface_that_the_hand_meets_is_the_headings():
+    obj = generate(1, "ring")
+    headings = sample_headings(obj, np.random.default_rng(0), use_affordance=False)
+    for p, v in zip(headings.position, headings.direction, strict=True):
+        offset = obj.points - p
+        depth = offset @ v
+        aside = np.linalg.norm(offset - depth[:, None] * v, axis=-1)
+        assert not ((aside < 0.0099) & (depth < -INWARD - 0.0151) & (depth > -0.169)).any()
+
+
+def test_few_headings_are_repeated_and_none_falls_back_to_the_narrowest():
+    obj = generate(0, "ball")
+    fallback = sample_headings(obj, np.random.default_rng(0), use_affordance=True, max_width=1e-3, attempts=1)
+    assert fallback.position.shape == (256, 3)
+    assert len(np.unique(fallback.position, axis=0)) == 20
+    np.testing.assert_allclose((fallback.direction * fallback.cross).sum(-1), 0, atol=1e-5)
+    tight = sample_headings(obj, np.random.default_rng(0), use_affordance=False, max_width=0.055, attempts=1)
+    different = len(np.unique(tight.position, axis=0))
+    assert 0 < different < 256
+    np.testing.assert_array_equal(tight.position[different : 2 * different][:10], tight.position[:10])
+
+
+def test_an_object_without_o_plus_still_gets_headings():
+    obj = generate(0, "box")
+    barren = dataclasses.replace(obj, graspable=np.zeros(2, bool))
+    assert np.isfinite(sample_headings(barren, np.random.default_rng(0), use_affordance=True).position).all()
+
+
+def test_feasible_keeps_what_stays_above_the_table():
+    steep = [0.0, np.sin(0.1), np.cos(0.1)]
+    headings = made(
+        ([0, 0, 0.0], DOWN),  # 5 cm high, starts at 20 cm
+        ([0, 0, -0.045], DOWN),  # 5 mm high
+        ([0, 0, 0.0], LEVEL),
+        ([0, 0, 0.0], UP),  # comes from inside the table
+        ([0, 0, 0.0], [np.cos(0.05), 0, np.sin(0.05)]),  # rises a little: starts at 5 - 0.75 cm
+        ([0, 0, -0.035], [np.cos(0.05), 0, np.sin(0.05)]),  # starts at 1.5 - 0.75 cm
+        ([0, 0, 0.3], steep),
+    )
+    np.testing.assert_array_equal(feasible(headings, FLAT), [1, 0, 1, 0, 1, 0, 0])
+    np.testing.assert_array_equal(feasible(headings, FLAT, clearance=0.004), [1, 1, 1, 0, 1, 1, 0])
+    np.testing.assert_array_equal(feasible(headings, FLAT, steepest_up=1.0, back_off=0.03), [1, 0, 1, 1, 1, 1, 1])
+    upside_down = np.array([0, 0, 0.05, 0, 1.0, 0, 0])
+    np.testing.assert_array_equal(feasible(headings, upside_down)[[0, 3]], [0, 1])
+
+
+def test_above_is_a_cone_around_straight_down():
+    tilted = [[np.sin(a), 0.0, -np.cos(a)] for a in np.radians([0, 29, 31, 90])]
+    headings = made(*(([0, 0, 0], direction) for direction in tilted))
+    np.testing.assert_array_equal(above(headings, FLAT), [1, 1, 0, 0])
+    np.testing.assert_array_equal(above(headings, FLAT, cone=np.radians(25)), [1, 0, 0, 0])
+    # A quarter turn about y takes the object's x axis to the world's -z axis.
+    on_side = np.array([0, 0, 0.05, np.sqrt(0.5), 0, np.sqrt(0.5), 0])
+    np.testing.assert_array_equal(above(headings, on_side), [0, 0, 0, 1])
+
+
+def test_clearing_the_table_backs_out_along_the_direction():
+    half = np.radians(60)
+    headings = made(
+        ([0, 0, -0.045], DOWN),  # 5 mm high: 5 mm back
+        ([0, 0, -0.045], [np.sin(half), 0, -np.cos(half)]),  # the same height takes twice the way
+        ([0, 0, -0.045], LEVEL),  # no way helps
+        ([0, 0, -0.065], DOWN),  # 2.5 cm back is too far
+        ([0, 0, 0.0], DOWN),
+    )
+    cleared = clear_table(headings, FLAT)
+    moved = np.linalg.norm(cleared.position - headings.position, axis=-1)
+    np.testing.assert_allclose(moved, [0.005, 0.01, 0, 0, 0], atol=2e-6)
+    np.testing.assert_array_equal(feasible(cleared, FLAT), [1, 1, 0, 0, 1])
+    np.testing.assert_array_equal(cleared.direction, headings.direction)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_family_can_be_reached_in_its_likeliest_pose(family):
+    for seed in range(3):
+        obj = generate(seed, family)
+        for affordance in (False, True):
+            headings = sample_headings(obj, np.random.default_rng(0), use_affordance=affordance)
+            cleared = clear_table(headings, obj.rest_poses[0])
+            assert feasible(cleared, obj.rest_poses[0]).mean() > 0.1

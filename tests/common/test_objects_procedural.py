@@ -1,0 +1,128 @@
+"""Invariants of procedural objects, for any family and seed."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.errors import CongraspError
+from common.objects import shapes
+from common.objects.families import BUILDERS
+from common.objects.procedural import FAMILIES, MASS_RANGE, generate, generate_many
+from common.objects.resting import TableScene
+from common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES, PRIMITIVE_SLOTS, SURFACE_POINTS
+from common.objects.store import digest
+from tests.solids import mujoco_mass_properties
+
+objects = st.builds(generate, st.integers(0, 2_000_000), st.sampled_from(FAMILIES))
+
+
+def test_there_are_enough_families_and_most_are_primitive():
+    assert len(FAMILIES) >= 12
+    made = [generate(0, family) for family in FAMILIES]
+    assert {obj.family for obj in made} == set(FAMILIES)
+    assert sum(obj.primitive for obj in made) >= 12
+    assert {obj.family for obj in made if not obj.primitive} == {"ring", "bowl", "cup"}
+
+
+@settings(max_examples=60, deadline=None)
+@given(objects)
+def test_geometry_is_sound(obj):
+    points, normals = obj.points.astype(float), obj.normals.astype(float)
+    assert points.shape == normals.shape == (SURFACE_POINTS, 3)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
+    # On the surface of the union, with the normal pointing out of it.
+    outside = [shapes.contains(piece, points + 2e-4 * normals) for piece in obj.pieces]
+    inside = [shapes.contains(piece, points - 2e-6 * normals) for piece in obj.pieces]
+    assert not np.any(outside, axis=0).any()
+    # (A point may lie on an edge so sharp that even this small step inwards leaves the object.)
+    assert np.any(inside, axis=0).mean() > 0.99
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    reach = np.max([shapes.support(piece, axes) for piece in obj.pieces], axis=0)
+    assert 0.03 <= (reach[:3] + reach[3:]).max() <= 0.25
+    assert np.abs(obj.visual_vertices).max() <= reach.max() + 1e-6
+    assert obj.visual_faces.max() < len(obj.visual_vertices)
+
+
+@settings(max_examples=60, deadline=None)
+@given(objects)
+def test_parts_and_slots_are_usable(obj):
+    assert obj.graspable.shape == (len(obj.part_names),)
+    assert obj.labels.min() >= 0
+    assert obj.labels.max() < len(obj.part_names)
+    share = obj.non_graspable_points.mean()
+    assert 0.1 <= share <= 0.9
+    # The first half of the points, which a policy may be given alone, shows the same regions.
+    assert abs(obj.non_graspable_points[:256].mean() - share) < 0.1
+    if obj.primitive:
+        kinds = [piece.kind for piece in obj.pieces]
+        assert all(kinds.count(kind) <= slots for kind, slots in PRIMITIVE_SLOTS.items())
+    else:
+        assert len(obj.pieces) <= MAX_MESH_PIECES
+        assert all(len(piece.vertices) <= MAX_MESH_VERTICES for piece in obj.pieces)
+
+
+@settings(max_examples=60, deadline=None)
+@given(objects)
+def test_mass_and_inertia_are_those_of_a_body(obj):
+    assert MASS_RANGE[0] <= obj.mass <= MASS_RANGE[1]
+    np.testing.assert_allclose(obj.inertia, obj.inertia.T, rtol=1e-9, atol=1e-15)
+    a, b, c = np.linalg.eigvalsh(obj.inertia)
+    assert a > 0
+    assert a + b > c
+
+
+@pytest.mark.parametrize("family", [name for name in FAMILIES if not BUILDERS[name](np.random.default_rng(0)).weight])
+def test_inertia_of_evenly_dense_objects_equals_mujocos(family):
+    obj = generate(3, family)
+    density = obj.mass / sum(shapes.volume(piece) for piece in obj.pieces)
+    _, center, inertia = mujoco_mass_properties(obj.pieces, [density] * len(obj.pieces))
+    np.testing.assert_allclose(center, 0, atol=1e-6)
+    np.testing.assert_allclose(obj.inertia, inertia, atol=1e-4 * np.abs(inertia).max())
+
+
+@settings(max_examples=30, deadline=None)
+@given(objects)
+def test_resting_poses_touch_the_table_and_rest(obj):
+    poses = obj.rest_poses
+    assert 1 <= len(poses) <= 8
+    np.testing.assert_array_equal(poses[:, :2], 0)
+    np.testing.assert_allclose(np.linalg.norm(poses[:, 3:], axis=-1), 1, atol=1e-9)
+    downs = np.array([-shapes.matrix(pose[3:])[2] for pose in poses])
+    depth = np.max([shapes.support(piece, downs) for piece in obj.pieces], axis=0)
+    np.testing.assert_allclose(poses[:, 2], depth, atol=1e-3)
+    scene = TableScene(obj)
+    for pose in poses:
+        settled = scene.settle(pose, 2.0)
+        assert settled.speed < 0.01
+        assert settled.moved < 0.01
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2_000_000), st.sampled_from(FAMILIES))
+def test_seed_and_family_decide_the_object(seed, family):
+    assert digest(generate(seed, family)) == digest(generate(seed, family))
+    assert digest(generate(seed, family)) != digest(generate(seed + 1, family))
+
+
+def test_no_two_of_many_are_alike():
+    many = generate_many(48, 10)
+    volumes = [sum(shapes.volume(piece) for piece in obj.pieces) for obj in many]
+    assert len(np.unique(np.round(volumes, 12))) == 48
+    assert len({obj.name for obj in many}) == 48
+    assert {obj.family for obj in many} == set(FAMILIES)
+
+
+def test_an_object_does_not_depend_on_how_many_are_made_with_it():
+    families = ("mug", "knife", "ball")
+    assert digest(generate_many(3, 5, families)[2]) == digest(generate_many(1, 7, families)[0])
+    assert digest(generate(11)) == digest(generate(11))
+
+
+def test_unknown_families_and_negative_seeds_are_named():
+    with pytest.raises(CongraspError, match=r"no object family 'cat'.*box, cylinder"):
+        generate(0, "cat")
+    with pytest.raises(CongraspError, match="no object family 'cat'"):
+        generate_many(2, 0, ("box", "cat"))
+    with pytest.raises(CongraspError, match="seed -1 is negative"):
+        generate(-1)

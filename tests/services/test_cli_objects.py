@@ -1,0 +1,78 @@
+"""`congrasp objects …` as a user meets it."""
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from common.errors import CongraspError
+from common.objects.store import Catalogue, digest
+from services.cli.objects import find_object, parse
+
+
+def test_generate_list_and_show(tmp_path, capsys):
+    folder = str(tmp_path / "things")
+    assert parse(["generate", "--out", folder, "--count", "4", "--seed", "3", "--families", "mug", "knife"])() == 0
+    assert Catalogue(folder).list() == ["knife_3", "knife_5", "mug_4", "mug_6"]
+    assert parse(["list", folder])() == 0
+    output = capsys.readouterr().out
+    assert "4 objects are in" in output
+    assert all(word in output for word in ("mug_6", "knife_3", "handle", "blade"))
+    (tmp_path / "things" / "bad.safetensors").write_bytes(b"no object")
+    assert parse(["list", folder])() == 2
+    captured = capsys.readouterr()
+    assert "bad.safetensors cannot be read" in captured.err
+    assert "mug_6" in captured.out
+    picture = tmp_path / "knife.png"
+    assert parse(["show", "knife_3", "--folder", folder, "--png", str(picture)])() == 0
+    output = capsys.readouterr().out
+    assert "handle" in output
+    assert "resting pose 1" in output
+    image = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3).astype(int)
+    green = (image[:, 1] - image[:, 0] > 60) & (image[:, 1] - image[:, 2] > 60)
+    red = (image[:, 0] - image[:, 1] > 80) & (image[:, 0] - image[:, 2] > 60)
+    assert green.sum() > 100
+    assert red.sum() > 100
+
+
+def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, capsys):
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "good.stl")
+    trimesh.creation.box((40, 50, 60)).export(tmp_path / "big.stl")
+    (tmp_path / "text.ply").write_text("no mesh")
+    paths = [str(tmp_path / name) for name in ("big.stl", "text.ply", "missing", "good.stl")]
+    common = ["--out", str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache")]
+    assert parse(["import", *paths, *common])() == 2
+    captured = capsys.readouterr()
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith("congrasp: error: ") for line in lines)
+    assert "1 of 4 imported" in captured.out
+    assert Catalogue(tmp_path / "out").list() == ["good"]
+    assert parse(["import", paths[0], "--unit", "mm", *common])() == 0
+    assert Catalogue(tmp_path / "out").list() == ["big", "good"]
+    assert parse(["import", str(tmp_path / "good.stl"), "--mass", "0.25", *common])() == 0
+    assert Catalogue(tmp_path / "out").get("good").mass == 0.25
+
+
+def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    obj = find_object("mug:7")
+    path = Catalogue(tmp_path).add(obj)
+    assert digest(find_object(str(path))) == digest(find_object("mug_7", str(tmp_path))) == digest(obj)
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "block.stl")
+    assert find_object(str(tmp_path / "block.stl")).name == "block"
+    with pytest.raises(CongraspError, match="no object 'mug_8'"):
+        find_object("mug_8", str(tmp_path))
+    with pytest.raises(CongraspError, match="no object family 'cat'"):
+        find_object("cat:1")
+
+
+def test_bad_arguments_are_named(tmp_path):
+    with pytest.raises(CongraspError, match="--count is 0"):
+        parse(["generate", "--out", str(tmp_path), "--count", "0"])()
+    with pytest.raises(CongraspError, match="nothing to import"):
+        parse(["import"])()
+    with pytest.raises(CongraspError, match="no folder"):
+        parse(["list", str(tmp_path / "none")])()
+    with pytest.raises(CongraspError, match="picture cannot be written"):
+        parse(["show", "box:1", "--png", str(tmp_path / "none" / "x.png")])()
