@@ -244,9 +244,7 @@ def initial_wrist(
     return rotations.compose_pose(object_position, object_quaternion, position, quaternion)
 
 
-def moment(
-    hand: Hand, task: TaskConfig, env: EnvironmentState, readout: Readout
-) -> tuple[SceneState, Features]:
+def moment(hand: Hand, task: TaskConfig, env: EnvironmentState, readout: Readout) -> tuple[SceneState, Features]:
     """Scene state and features of the present moment."""
     scene = scene_state(env, readout, task)
     return scene, features(hand, task, scene, env.surface, env.goal)

@@ -22,7 +22,7 @@ from common.wire.codec import Message, SharedMessage
 
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 """What became of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""
-_BACKOFF = (0.1, 1.0)  # first and longest pause between two attempts, s
+_BACKOFF = (0.1, 0.5)  # first and longest pause between two attempts, s
 _POLL = 0.2
 
 

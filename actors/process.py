@@ -66,9 +66,7 @@ def run_actor(
 class _Actor:
     """Worlds, policy and counters of one actor."""
 
-    def __init__(
-        self, config: RunConfig, link: ActorLink, transport: Transport, physics: PhysicsName, threads: int
-    ):
+    def __init__(self, config: RunConfig, link: ActorLink, transport: Transport, physics: PhysicsName, threads: int):
         self._config, self._link, self._transport = config, link, transport
         self._hand = get_hand(config.task.hand)
         number = zlib.crc32(link.actor.encode())

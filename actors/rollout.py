@@ -21,7 +21,6 @@ from common.hands.spec import Hand
 from common.task.control import decode
 from common.task.features import Features
 from common.task.observation import observe
-from common.task.reward import TERMS
 from common.task.types import Action, Array, Goal, SceneState
 
 Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
@@ -151,7 +150,7 @@ class RolloutWorker:
         columns = [np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)]
         trace = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *(_trace(*t) for t in traces))
         last = self._observe_jit(scene, seen, self.env.goal)
-        return Rollout(*columns, last, self.env.finished, self.env.has_finished, trace)
+        return Rollout(*(*columns, last, self.env.finished, self.env.has_finished, trace))
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         carry = (self.env, self._state, self._moment)
@@ -187,7 +186,7 @@ class RolloutWorker:
         carry, (*columns, trace) = jax.lax.scan(body, carry, jax.random.split(key, steps))
         env, _, (scene, seen) = carry
         last = observe(self._task, scene, seen, env.goal).astype(self._dtype)
-        return carry, Rollout(*columns, last, env.finished, env.has_finished, trace)
+        return carry, Rollout(*(*columns, last, env.finished, env.has_finished, trace))
 
 
 def _trace(scene: SceneState, seen: Features, action: Array, score: environment.Score) -> Trace:
@@ -219,6 +218,3 @@ def finished_episodes(rollout: Rollout) -> dict[str, np.ndarray]:
     """Metrics (E,) of the E episodes that ended, by the names in `EPISODE_FIELDS`."""
     rows = np.asarray(rollout.episodes)[np.asarray(rollout.has_episode)]
     return dict(zip(EPISODE_FIELDS, rows.T, strict=True))
-
-
-__all__ = ["TERMS", "Policy", "Rollout", "RolloutWorker", "Trace", "finished_episodes", "goal_of_world"]

@@ -234,7 +234,9 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
     try:
         return dacite.from_dict(RunConfig, json.loads(text), dacite.Config(strict=True, cast=[tuple, float]))
     except json.JSONDecodeError as error:
-        raise CongraspError(f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'.") from None
+        raise CongraspError(
+            f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."
+        ) from None
     except dacite.DaciteError as error:
         raise CongraspError(f"The configuration does not fit this version: {error}.") from None
 

@@ -124,8 +124,9 @@ def frame_from_axes(primary: Array, secondary: Array) -> Array:
 
 def transform(position: Array, quaternion: Array, points: Array) -> Array:
     """Points (..., N, 3) of a body's frame into the frame in which the body's pose (..., 3), (..., 4) is given."""
-    return jnp.matmul(points, jnp.swapaxes(to_matrix(quaternion), -1, -2), precision=jax.lax.Precision.HIGHEST) + (
-        position[..., None, :]
+    return (
+        jnp.matmul(points, jnp.swapaxes(to_matrix(quaternion), -1, -2), precision=jax.lax.Precision.HIGHEST)
+        + (position[..., None, :])
     )
 
 

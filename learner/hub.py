@@ -30,42 +30,50 @@ _EVENT_SECONDS = 1.0  # between two events of one kind
 
 @dataclasses.dataclass
 class _Marks:
-    """Which rollouts of an incarnation were accepted: all below `next`, and those in `ahead`."""
+    """Which rollouts of an incarnation were decided on: all below `next`, and those in `ahead`."""
 
     next: int = 0
     ahead: set[int] = dataclasses.field(default_factory=set)
-    resumed_at: int | None = None
-    """First sequence number that a checkpoint did not know; None if it did not know the incarnation."""
+    refused: set[int] = dataclasses.field(default_factory=set)
+    """Those among them that were refused, as far as they are recent; the others were accepted."""
+    resumed: tuple[int, frozenset[int]] | None = None
+    """`next` and `ahead` as a checkpoint had them."""
     first: int | None = None
-    """Lowest sequence number from there on that arrived since."""
+    """Lowest undecided sequence number that arrived since."""
     rollouts: int = 0
     version: int = -1
 
-    def __contains__(self, sequence: int) -> bool:
-        return sequence < self.next or sequence in self.ahead
+    def accepted(self, sequence: int) -> bool:
+        return (sequence < self.next or sequence in self.ahead) and sequence not in self.refused
 
     def arrive(self, sequence: int) -> None:
-        if self.resumed_at is not None and sequence >= self.resumed_at:
+        if self.resumed and sequence >= self.resumed[0] and sequence not in self.resumed[1]:
             self.first = sequence if self.first is None else min(self.first, sequence)
 
-    def add(self, header: RolloutHeader) -> None:
-        self.rollouts += 1
-        self.version = header.version
-        self.ahead.add(header.sequence)
+    def decide(self, header: RolloutHeader, accept: bool) -> None:
+        if accept:
+            self.rollouts += 1
+            self.version = header.version
+            self.refused.discard(header.sequence)
+        else:
+            self.refused.add(header.sequence)
+        if header.sequence >= self.next:
+            self.ahead.add(header.sequence)
         if len(self.ahead) > _WINDOW:
             self.next = min(self.ahead)
         while self.next in self.ahead:
             self.ahead.remove(self.next)
             self.next += 1
-
-    @property
-    def end(self) -> int:
-        """One above the highest accepted."""
-        return max(self.ahead, default=self.next - 1) + 1
+        if len(self.refused) > _WINDOW:
+            self.refused.remove(min(self.refused))
 
     @property
     def rolled_back(self) -> int:
-        return 0 if self.resumed_at is None or self.first is None else self.first - self.resumed_at
+        """Sequence numbers that neither the checkpoint nor the process that resumed from it has seen."""
+        if self.resumed is None or self.first is None:
+            return 0
+        start, decided = self.resumed
+        return self.first - start - sum(sequence < self.first for sequence in decided)
 
 
 class LearnerHub:
@@ -201,8 +209,8 @@ class LearnerHub:
             for owner, mark in self._marks.items():
                 queued = {sequence for of, sequence in waiting if of == owner}
                 start = min(queued | {mark.next})
-                settled = set(range(start, mark.next)) | mark.ahead
-                marks.append([*owner, start, sorted(settled - queued)])
+                decided = set(range(start, mark.next)) | mark.ahead
+                marks.append([*owner, start, sorted(decided - queued), sorted(mark.refused)])
             return {
                 "epoch": self.epoch,
                 "version": self._staleness.version,
@@ -216,9 +224,9 @@ class LearnerHub:
             raise CongraspError(f"The checkpoint is of epoch {durable['epoch']}, not {self.epoch}.")
         self._staleness.restore(durable["ledger"], durable["version"])
         self._rolled_back = durable["rolled_back"]
-        for actor, incarnation, start, ahead in durable["marks"]:
-            marks = self._marks[actor, incarnation] = _Marks(start, set(ahead))
-            marks.resumed_at = marks.end
+        for actor, incarnation, start, ahead, refused in durable["marks"]:
+            resumed = start, frozenset(ahead)
+            self._marks[actor, incarnation] = _Marks(start, set(ahead), set(refused), resumed)
 
     def _total_rolled_back(self) -> int:
         return self._rolled_back + sum(marks.rolled_back for marks in self._marks.values())
@@ -274,22 +282,23 @@ class LearnerHub:
             return self._answer("retry", why="The learner is starting.")
         marks = self._marks_of(header.owner)
         marks.arrive(header.sequence)
-        if header.sequence in marks:
+        if marks.accepted(header.sequence):
             self._staleness.refuse_duplicate(header.owner, ticket)
             return self._answer("duplicate")
         if len(self._queue) >= self._limit:
             return self._answer("retry", why=f"{self._limit} rollouts wait already.")
         if self._finished:
             self._staleness.refuse_stale(header.owner, ticket)
+            marks.decide(header, False)
             return self._answer("stale", why="The run is finished.")
         verdict = self._staleness.arrive(header.owner, ticket, header.version)
         if verdict == "full":
             return self._answer("retry", why="No more rollouts are needed at this version.")
+        marks.decide(header, verdict == "accepted")
         if verdict == "stale":
             why = f"It was made by version {header.version}, and the learner is at {self._staleness.version}."
             self._event("info", f"A rollout of {header.actor} was refused. {why}", kind="stale")
             return self._answer("stale", why=why)
-        marks.add(header)
         self._queue.append((header, message))
         now = time.monotonic()
         self._arrivals.append((now, header.steps))

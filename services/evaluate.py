@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from actors.environment import EPISODE_FIELDS, EnvironmentState
 from actors.episode import episode_message
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes, goal_of_world
@@ -125,23 +126,42 @@ class Evaluator:
         self._physics_name, self._threads, self._batch, self._seed = physics, threads, batch, seed
         self._taskset: TaskSet = build_taskset(self._hand, self.task, objects, seed)
 
-    def row(
-        self,
-        constraint: str,
-        episodes: int,
-        progress: Callable[[int], None] = lambda n: None,
-        seed: int | None = None,
-    ) -> Row:
+    def row(self, constraint: str, episodes: int, progress: Callable[[int], None] = lambda n: None) -> Row:
         """Runs whole batches until `episodes` have ended, and summarises the first `episodes` of them."""
-        collected = [found for found, _ in self._run(constraint, episodes, progress, seed)]
+        collected = [found for found, _ in self._run(constraint, episodes, progress)]
         values = {name: np.concatenate([part[name] for part in collected])[:episodes] for name in collected[0]}
         return summarise(constraint, self.bundle.spec.hand, values)
 
-    def episode(self, constraint: str, seed: int | None = None) -> Message:
-        """World 0's first episode under a set of constraints, for pictures."""
-        env, rollout = next(iter(self._run(constraint, 1, lambda n: None, seed)))[1]
-        metrics = dict(zip(finished_episodes(rollout), np.asarray(rollout.episodes)[0], strict=True))
-        plain = {name.removeprefix("episode/"): float(v) for name, v in metrics.items() if "episode/" in name}
+    def rows(self, constraint: str, episodes: int, count: int) -> list[Row]:
+        """`count` rows of `episodes` each from independent draws, to see how much chance there is in one."""
+        collected = [found for found, _ in self._run(constraint, episodes * count, lambda n: None)]
+        values = {name: np.concatenate([part[name] for part in collected]) for name in collected[0]}
+        return [
+            summarise(
+                constraint,
+                self.bundle.spec.hand,
+                {name: column[i * episodes : (i + 1) * episodes] for name, column in values.items()},
+            )
+            for i in range(count)
+        ]
+
+    def episode(self, constraint: str, tries: int = 1) -> Message:
+        """An episode of world 0 under a set of constraints: the first that succeeds, or the last of `tries`."""
+        message: Message | None = None
+        for _, (env, rollout) in self._run(constraint, tries * min(self._batch, tries), lambda n: None):
+            message = self._message(env, rollout)
+            if message.meta["success"]:
+                break
+        assert message is not None
+        return message
+
+    def _message(self, env: EnvironmentState, rollout: Rollout) -> Message:
+        values = np.asarray(rollout.episodes)[0]
+        metrics = {
+            name.removeprefix("episode/"): float(value)
+            for name, value in zip(EPISODE_FIELDS, values, strict=True)
+            if name.startswith("episode/")
+        }
         return episode_message(
             self._hand,
             self.task,
@@ -149,10 +169,15 @@ class Evaluator:
             goal_of_world(env.goal),
             Surface(*(np.asarray(field)[0] for field in env.surface)),
             self.objects[int(np.asarray(env.world.object_index)[0])],
-            {"version": self.bundle.version, "actor": "evaluation", "success": plain["success"] > 0, "metrics": plain},
+            {
+                "version": self.bundle.version,
+                "actor": "evaluation",
+                "success": metrics["success"] > 0,
+                "metrics": metrics,
+            },
         )
 
-    def _run(self, constraint: str, episodes: int, progress: Callable[[int], None], seed: int | None) -> Any:
+    def _run(self, constraint: str, episodes: int, progress: Callable[[int], None]) -> Any:
         task = with_constraints(self.task, constraint)
         physics = make_physics(self._physics_name, self._hand, task, self.objects, threads=self._threads)
         layout = self.bundle.spec.layout
@@ -168,7 +193,7 @@ class Evaluator:
                 self._taskset,
                 policy,
                 batch=min(self._batch, episodes),
-                seed=self._seed if seed is None else seed,
+                seed=self._seed,
                 half=False,
             )
             done = 0
@@ -210,8 +235,6 @@ def summarise(constraint: str, hand: str, values: dict[str, np.ndarray]) -> Row:
 def write_json(rows: Sequence[Row], path: pathlib.Path) -> None:
     """Writes `{"rows": [...]}`."""
     path.write_text(json.dumps({"rows": [row.to_json() for row in rows]}, indent=2))
-
-
 
 
 def table_of(rows: Sequence[Row], title: str) -> Any:

@@ -17,7 +17,8 @@ from common.logs.poses import link_poses
 from common.logs.reader import read_episodes
 from common.task.types import MASKS
 from common.wire.codec import Message
-from services.raycast import Camera, Shape, between, render_scene, visible
+from services.raycast import Camera, Shape, between
+from services.shade import render_scene, visible
 from services.sheets import contact_sheet, save_video
 
 SKIN = (0.70, 0.73, 0.79)

@@ -30,7 +30,7 @@ SURFACE_LIMIT = 4096
 """Most surface points in one query; the policy looks at `TaskConfig.surface_points` of them."""
 _UNIT_TOLERANCE = 0.02
 _OPTIONAL_STATE = (
-    "q_velocity u_velocity object_velocity object_angular_velocity contact_force contact_position contact_found".split()
+    ["q_velocity", "u_velocity", "object_velocity", "object_angular_velocity", "contact_force", "contact_position", "contact_found"]
 )
 
 

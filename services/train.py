@@ -184,7 +184,12 @@ def train_in_process(
         try:
             with MemoryTransport(broker) as transport:
                 run_actor(
-                    transport, run=config.name, actor="actor-0", stop=ended, physics=physics, threads=os.cpu_count() or 1
+                    transport,
+                    run=config.name,
+                    actor="actor-0",
+                    stop=ended,
+                    physics=physics,
+                    threads=os.cpu_count() or 1,
                 )
         except BaseException as error:
             failures.append(error)

@@ -20,7 +20,9 @@ def resolve_physics(name: PhysicsName) -> PhysicsName:
     """
     backend = jax.default_backend()
     if name == "auto":
-        return {"cpu": "native", "gpu": "warp", "cuda": "warp"}.get(backend, "jax")  # type: ignore[return-value]
+        if backend == "cpu":
+            return "native"
+        return "warp" if backend in ("gpu", "cuda") else "jax"
     if name == "warp" and backend not in ("gpu", "cuda"):
         raise CongraspError(
             "The 'warp' engine needs an NVIDIA GPU, and JAX sees none.",
@@ -42,4 +44,4 @@ def make_physics(
         return NativePhysics(hand, task, objects, threads)
     from actors.physics.mjx import MjxPhysics
 
-    return MjxPhysics(hand, task, objects, chosen)  # type: ignore[arg-type]
+    return MjxPhysics(hand, task, objects, "warp" if chosen == "warp" else "jax")

@@ -47,7 +47,7 @@ class Readout(NamedTuple):
     contact_position: Array
     contact_found: Array
     bad: Array
-    """(B,) bool: the world diverged in this step and was put back to its start (see `common.physics guard`)."""
+    """(B,) bool: the world diverged in this step (`readout.diverged`) and was put back to its start."""
 
 
 class Physics(Protocol):

@@ -52,7 +52,7 @@ class MjxPhysics:
           objects: the pool that `World.object_index` points into.
           implementation: `warp` or `jax`.
         """
-        self.name = implementation
+        self.name: str = implementation
         self._task = task
         pool = build_pool(hand, task, objects)
         self._where = addresses(pool.model, hand)
@@ -85,10 +85,8 @@ class MjxPhysics:
     def start(self, world: World) -> MjxState:
         """Fresh worlds; see `Physics.start`."""
         batch = world.object_index.shape[0]
-        if self.name == "warp":
-            sizes = {"naconmax": CONTACTS_PER_WORLD * batch, "njmax": CONSTRAINTS_PER_WORLD}
-        else:
-            sizes = {}
+        warp = {"naconmax": CONTACTS_PER_WORLD * batch, "njmax": CONSTRAINTS_PER_WORLD}
+        sizes = warp if self.name == "warp" else {}
         data = mjx.make_data(self._host_model, impl=self.name, **sizes)
         data = jax.vmap(lambda q: data.replace(qpos=q))(jnp.zeros((batch, self._nq)))
         return self._place(data, world)
@@ -109,14 +107,10 @@ class MjxPhysics:
         """One control step; see `Physics.step`."""
         where = self._where
         height = jnp.where(table, 0.0, TABLE_AWAY[2])
-        data = state.data.replace(
-            ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height)
-        )
+        data = state.data.replace(ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height))
         model = self._model.replace(**state.leaves)
         step = jax.vmap(mjx.step, in_axes=(self._axes, 0))
-        data, _ = jax.lax.scan(
-            lambda carry, _: (step(model, carry), None), data, None, length=self._task.substeps
-        )
+        data, _ = jax.lax.scan(lambda carry, _: (step(model, carry), None), data, None, length=self._task.substeps)
         bad = diverged(jnp, data.qpos, data.qvel)[:, None]
         data = data.replace(
             qpos=jnp.where(bad, state.qpos_start, data.qpos),
@@ -150,9 +144,7 @@ class MjxPhysics:
         leaves["geom_friction"] = tiled["geom_friction"].at[:, self._geoms, 0].set(world.friction[:, None])
         qpos = jnp.zeros((batch, self._nq))
         qpos = qpos.at[:, where.finger_qpos].set(world.q)
-        qpos = qpos.at[:, where.object_qpos].set(
-            jnp.concatenate([world.object_position, world.object_quaternion], -1)
-        )
+        qpos = qpos.at[:, where.object_qpos].set(jnp.concatenate([world.object_position, world.object_quaternion], -1))
         data = data.replace(
             qpos=qpos,
             qvel=jnp.zeros((batch, self._nv)),
@@ -171,7 +163,9 @@ class MjxPhysics:
         """(B, L * C * 13) in the layout of the contact sensors."""
         if self.name == "warp":
             return data.sensordata
-        return jax.vmap(functools.partial(_strongest_contacts, self._body_of_geom, self._links, self._object_body))(data)
+        return jax.vmap(functools.partial(_strongest_contacts, self._body_of_geom, self._links, self._object_body))(
+            data
+        )
 
 
 def _strongest_contacts(body_of_geom: np.ndarray, links: np.ndarray, object_body: int, data: Any) -> Array:

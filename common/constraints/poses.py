@@ -83,9 +83,7 @@ def closed_poses(
             offset = here - points[nearest]
             inside = jnp.sum(offset * normals[nearest], -1) < 0
             gap = jnp.where(inside, -1.0, jnp.linalg.norm(offset, axis=-1)) - radii
-            return jnp.stack(
-                [jnp.all(jnp.where(point_finger == k, gap, 1.0) > 0, -1) for k in range(fingers)], -1
-            )
+            return jnp.stack([jnp.all(jnp.where(point_finger == k, gap, 1.0) > 0, -1) for k in range(fingers)], -1)
 
         fractions = jnp.linspace(0.0, 1.0, _STEPS)
         free = jax.lax.map(clear, fractions)

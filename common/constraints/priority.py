@@ -98,9 +98,8 @@ def resolve(hand: Hand, surface: Surface, request: Request) -> Resolution:
     heading_cross = heading_cross - jnp.sum(heading_cross * heading_direction, -1, keepdims=True) * heading_direction
     heading_cross = heading_cross / jnp.linalg.norm(heading_cross, axis=-1, keepdims=True)
 
-    aligned = (
-        ~(trajectory & affordance)
-        | (_least(surface.points, ~surface.minus, last_position) < _least(surface.points, surface.minus, last_position))
+    aligned = ~(trajectory & affordance) | (
+        _least(surface.points, ~surface.minus, last_position) < _least(surface.points, surface.minus, last_position)
     )
     goal = asked._replace(
         heading_position=heading_position,

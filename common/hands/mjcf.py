@@ -21,7 +21,9 @@ def add_hand(spec: mujoco.MjSpec, hand: Hand) -> mujoco.MjsBody:
     bodies: dict[str, mujoco.MjsBody] = {}
     for link in hand.links:
         parent = bodies[link.parent] if link.parent else base
-        parent_origin = np.array(link_origin(next(x for x in hand.links if x.name == link.parent)) if link.parent else 0)
+        parent_origin = np.array(
+            link_origin(next(x for x in hand.links if x.name == link.parent)) if link.parent else 0
+        )
         origin = np.array(link_origin(link))
         body = parent.add_body(name=link.name, pos=origin - parent_origin, gravcomp=1.0)
         bodies[link.name] = body

@@ -27,7 +27,9 @@ def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:
         catalogue = Catalogue(pathlib.Path(config.folder))
         objects = [catalogue.get(name) for name in catalogue.list()]
         if not objects:
-            raise CongraspError(f"The folder {config.folder} holds no object.", "Fill it with 'congrasp objects import'.")
+            raise CongraspError(
+                f"The folder {config.folder} holds no object.", "Fill it with 'congrasp objects import'."
+            )
         return objects
     if config.count < 1:
         raise CongraspError(f"A pool of {config.count} objects is empty.", "Set --objects.count to at least 1.")

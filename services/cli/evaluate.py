@@ -1,7 +1,7 @@
 """`congrasp evaluate`: a policy by the paper's protocol."""
 
 import pathlib
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -26,7 +26,7 @@ def evaluate(
 
     Args:
       policy: A policy file (policy.safetensors of a run).
-      objects: Folder of objects ('congrasp objects import|generate'); procedural ones that training never uses if not given.
+      objects: Folder of objects (see 'congrasp objects'); by default procedural ones that training never uses.
       table: single: one constraint a row; composed: two.
       episodes: Episodes in each row.
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
@@ -36,6 +36,7 @@ def evaluate(
       seed: Seed of constraints and episodes.
       json: Also write the rows to this file.
     """
+    import functools
     import os
 
     from rich.console import Console
@@ -62,11 +63,15 @@ def evaluate(
     with Progress(transient=True) as progress:
         for constraint in TABLES[table]:
             task = progress.add_task(constraint, total=episodes)
-            rows.append(evaluator.row(constraint, episodes, lambda n, t=task: progress.update(t, completed=n)))
+            rows.append(evaluator.row(constraint, episodes, functools.partial(_advance, progress, task)))
     Console().print(table_of(rows, f"{policy.name}, {table}, {len(evaluator.objects)} objects"))
     if json is not None:
         write_json(rows, json)
     return 0
+
+
+def _advance(progress: Any, task: Any, done: int) -> None:
+    progress.update(task, completed=done)
 
 
 COMMAND = evaluate

@@ -48,7 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         package = (error.name or "").partition(".")[0]
         extra = EXTRAS.get(package, "train")
-        code = _complain(f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug)
+        code = _complain(
+            f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug
+        )
     sys.stdout.flush()
     sys.exit(code)
 

@@ -63,5 +63,3 @@ def parse(arguments: list[str]) -> Callable[[], int]:
     name = preset_of(arguments)
     default = Train(config=get_preset(name), preset=name)
     return tyro.cli(Train, prog="congrasp train", args=arguments, default=default).run
-
-

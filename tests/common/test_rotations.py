@@ -68,6 +68,4 @@ def test_poses_compose_and_invert():
     np.testing.assert_allclose(back[0], p2, atol=1e-5)
     np.testing.assert_allclose(np.abs(np.sum(back[1] * q2, -1)), 1.0, atol=1e-5)
     points = rng.normal(size=(8, 5, 3)).astype(np.float32)
-    np.testing.assert_allclose(
-        rotations.inverse_transform(p, q, rotations.transform(p, q, points)), points, atol=1e-5
-    )
+    np.testing.assert_allclose(rotations.inverse_transform(p, q, rotations.transform(p, q, points)), points, atol=1e-5)

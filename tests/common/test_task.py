@@ -163,9 +163,7 @@ def test_reward_terms_against_numpy():
     turn = _rotation(state.object_quaternion[b]).inv() * _rotation(state.object_quaternion_initial[b])
     np.testing.assert_allclose(terms["object_rotation"][b], -min(turn.magnitude() ** 2, 4.0), rtol=1e-3)
     np.testing.assert_allclose(terms["wrist_velocity"][b], -(state.u_velocity[b] ** 2).sum(), rtol=1e-4)
-    np.testing.assert_allclose(
-        terms["finger_deviation"][b], -((state.q[b] - state.q_initial[b]) ** 2).sum(), rtol=1e-4
-    )
+    np.testing.assert_allclose(terms["finger_deviation"][b], -((state.q[b] - state.q_initial[b]) ** 2).sum(), rtol=1e-4)
     frame = grasp_frame(HAND)
     wrist_position, wrist_quaternion = (np.asarray(x)[b] for x in wrist_pose(state))
     wrist = _rotation(wrist_quaternion)
@@ -184,9 +182,7 @@ def test_reward_terms_against_numpy():
     pose_turn = body * _rotation(goal.pose_quaternion[b])
     reference = np.asarray(keypoints(HAND, link_transforms(HAND, goal.pose_q[b])))
     reference = wrist.inv().apply(pose_turn.apply(reference) + pose_position - wrist_position)
-    np.testing.assert_allclose(
-        terms["pose_link"][b], -gate * ((reference - points) ** 2).sum(), rtol=1e-3, atol=1e-5
-    )
+    np.testing.assert_allclose(terms["pose_link"][b], -gate * ((reference - points) ** 2).sum(), rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(
         terms["pose_wrist_position"][b], -min(((wrist_position - pose_position) ** 2).sum(), 1.0), rtol=1e-3
     )
@@ -213,9 +209,7 @@ def test_without_affordance_every_contact_is_rewarded():
     off = goal._replace(mask=np.zeros_like(goal.mask))
     seen = FEATURES(state, surface, off)
     terms = REWARD(UNIT, state, seen, off)
-    np.testing.assert_allclose(
-        terms["contact"], (HAND.contact_weights * np.asarray(seen.touching)).sum(-1), rtol=1e-5
-    )
+    np.testing.assert_allclose(terms["contact"], (HAND.contact_weights * np.asarray(seen.touching)).sum(-1), rtol=1e-5)
 
 
 def test_pose_gate_by_hand():

@@ -309,23 +309,39 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.integers(0, 40), max_size=120))
+@given(st.lists(st.tuples(st.integers(0, 40), st.booleans()), max_size=120))
 def test_marks_are_exact_within_their_window(arrivals):
     marks, accepted = _Marks(), set()
-    for sequence in arrivals:
-        assert (sequence in marks) == (sequence in accepted)
+    for sequence, accept in arrivals:
+        assert marks.accepted(sequence) == (sequence in accepted)
         if sequence not in accepted:
-            accepted.add(sequence)
-            marks.add(_header(sequence))
-    assert marks.end == max(accepted, default=-1) + 1
+            marks.decide(_header(sequence), accept)
+            accepted |= {sequence} if accept else set()
+    assert marks.rollouts == len(accepted)
 
 
 def test_marks_stay_small_whatever_is_missing():
     marks = _Marks()
     for sequence in range(1, 20_000, 2):
-        marks.add(_header(sequence))
-        assert len(marks.ahead) <= 64
-    assert 19_999 in marks and 20_000 not in marks
+        marks.decide(_header(sequence), sequence % 3 > 0)
+        assert len(marks.ahead) <= 64 and len(marks.refused) <= 64
+    assert marks.accepted(19_999) and not marks.accepted(19_995) and not marks.accepted(20_001)
+
+
+def test_hole_that_was_filled_after_the_checkpoint_is_counted_and_a_refused_one_is_not(bench):
+    b = bench(batch=2)
+    b.hub.publish_weights(bundle(5), 5)
+    assert b.send(0, version=0)["outcome"] == "stale"
+    assert b.send(2, version=5)["outcome"] == b.send(3, version=5)["outcome"] == "accepted"
+    assert sequences(b.hub.next_batch(2, 1)) == [2, 3]
+    b.hub.publish_weights(bundle(6), 6)
+    durable = b.hub.durable()
+    assert b.send(1, version=6)["outcome"] == "accepted"  # overtaken by 2 and 3, and lost with this learner
+    resumed = bench(batch=2, durable=durable)
+    resumed.hub.publish_weights(bundle(6), 6)
+    assert resumed.send(0, version=0)["outcome"] == "stale"
+    assert resumed.send(4, version=6)["outcome"] == "accepted"
+    assert resumed.ledger()["rolled_back"] == 1
 
 
 def _header(sequence):

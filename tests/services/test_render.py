@@ -14,7 +14,7 @@ from common.logs.channels import Entry, opaque_channel
 from common.logs.writer import LogWriter
 from common.wire.codec import encode
 from services.cli import render as command
-from services.raycast import Camera, Shape, between, render_scene, visible
+from services.raycast import Camera, Shape, between
 from services.render import (
     OBJECT,
     OBJECT_MINUS,
@@ -31,6 +31,7 @@ from services.render import (
     pick_episode,
     render_episode_frames,
 )
+from services.shade import render_scene, visible
 from services.sheets import contact_sheet, save_png, save_video
 from services.smooth import SmoothNormals
 from tests.episodes import CONTROL_DT, episode

@@ -1,0 +1,74 @@
+"""A plausible query, and a latency test of a policy server."""
+
+import concurrent.futures
+import time
+from typing import Any
+
+import numpy as np
+
+from common.errors import TransportError
+from services.client import PolicyClient
+
+
+def example_episode(seed: int) -> dict[str, Any]:
+    """The start of an episode with a procedural object and one of its headings: arguments of `reset` and of `act`."""
+    import jax
+
+    from actors import environment
+    from actors.taskset import build_taskset
+    from common.config import TaskConfig
+    from common.hands import get_hand
+    from common.objects import procedural
+
+    task = TaskConfig(p_affordance=0.0, p_pose=0.0, p_trajectory=0.0)
+    hand, obj = get_hand(task.hand), procedural.generate(seed)
+    env = environment.start(hand, task, build_taskset(hand, task, [obj], seed), jax.random.key(seed), 1)
+    world = {name: np.asarray(value)[0] for name, value in env.world._asdict().items()}
+    pose = world["object_position"], world["object_quaternion"]
+    return {
+        "object": obj.name,
+        "reset": {
+            "q": world["q"],
+            "wrist": (world["base_position"], world["base_quaternion"]),
+            "obj": pose,
+            "surface": np.asarray(env.surface.points)[0],
+            "constraints": ["heading"],
+            "heading_position": np.asarray(env.goal.heading_position)[0],
+            "heading_direction": np.asarray(env.goal.heading_direction)[0],
+            "heading_cross": np.asarray(env.goal.heading_cross)[0],
+        },
+        "state": {"q": world["q"], "u": np.zeros(6), "object_position": pose[0], "object_quaternion": pose[1]},
+    }
+
+
+def measure(
+    connect: str, name: str, episode: dict[str, Any], repeat: int, concurrency: int, timeout: float
+) -> dict[str, float]:
+    """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is not counted."""
+    share = max(1, repeat // concurrency)
+
+    def ask(_: int) -> tuple[list[float], int, int]:
+        times, failed, overloaded = [], 0, 0
+        with PolicyClient(connect, name, timeout=timeout) as client:
+            client.reset(**episode["reset"])
+            client.act(episode["state"])
+            for _ in range(share):
+                try:
+                    times.append(client.act(episode["state"]).round_trip_ms)
+                except TransportError as error:
+                    overloaded += "verloaded" in str(error)
+                    failed += "verloaded" not in str(error)
+        return times, failed, overloaded
+
+    began = time.perf_counter()
+    with concurrent.futures.ThreadPoolExecutor(concurrency) as pool:
+        results = list(pool.map(ask, range(concurrency)))
+    spent = time.perf_counter() - began
+    times = np.concatenate([np.array(part) for part, _, _ in results])
+    return {
+        "p50_ms": float(np.percentile(times, 50)) if len(times) else float("nan"),
+        "p99_ms": float(np.percentile(times, 99)) if len(times) else float("nan"),
+        "answers_per_s": len(times) / spent,
+        "failed": sum(failed for _, failed, _ in results),
+        "overloaded": sum(overloaded for _, _, overloaded in results),
+    }

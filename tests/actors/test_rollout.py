@@ -1,0 +1,148 @@
+"""Episodes: sampling, protocol, success, and rollouts that continue."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from actors import environment
+from actors.environment import EPISODE_FIELDS, METRICS
+from actors.physics.native import NativePhysics
+from actors.rollout import RolloutWorker, finished_episodes
+from actors.taskset import build_taskset
+from common import rotations
+from common.config import TaskConfig
+from common.hands import get_hand
+from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
+from common.objects import procedural
+from common.task.observation import layout
+from common.task.types import MASKS
+
+HAND = get_hand("human")
+TASK = TaskConfig()
+OBJECTS = procedural.generate_many(4, 0, ("box", "cylinder", "mug", "hammer"))
+BATCH = 8
+SIZE = sum(size for _, size in layout(HAND, TASK))
+
+
+@pytest.fixture(scope="module")
+def taskset():
+    return build_taskset(HAND, TASK, OBJECTS, 0)
+
+
+def _noise(parameters, observation, key):
+    action = 0.3 * jax.random.normal(key, (observation.shape[0], len(HAND.joints) + 6))
+    return action, -jnp.sum(action**2, -1)
+
+
+def _worker(taskset, task=TASK, seed=0, batch=BATCH):
+    physics = NativePhysics(HAND, task, OBJECTS, 2)
+    return RolloutWorker(HAND, task, physics, taskset, _noise, batch=batch, seed=seed, half=True)
+
+
+def test_masks_are_drawn_as_in_the_paper(taskset):
+    _, goal, _, hold = environment.sample_episodes(HAND, TASK, taskset, jax.random.key(0), 4000)
+    mask = np.asarray(goal.mask)
+    named = dict(zip(MASKS, mask.T, strict=True))
+    assert abs(named["trajectory"].mean() - 0.5) < 0.08
+    assert abs(named["pose_finger"].mean() - 0.5) < 0.08
+    assert np.all(named["pose_wrist"] == named["pose_finger"] * (1 - named["trajectory"]))
+    assert not np.any(named["affordance"] * named["pose_finger"])  # the pose overrides it
+    assert np.all(np.asarray(hold) == TASK.hold_steps)
+
+
+def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(taskset):
+    world, goal, _, _ = environment.sample_episodes(HAND, TASK, taskset, jax.random.key(1), 256)
+    trajectory = np.asarray(goal.mask)[:, 3] > 0
+    first = rotations.compose_pose(
+        world.object_position,
+        world.object_quaternion,
+        goal.trajectory_position[:, 0],
+        goal.trajectory_quaternion[:, 0],
+    )
+    np.testing.assert_allclose(np.asarray(world.base_position)[trajectory], np.asarray(first[0])[trajectory], atol=1e-5)
+    # Otherwise v points along v-bar, and the hand centre lies 15 cm before p-bar.
+    direction = np.asarray(rotations.rotate(world.object_quaternion, goal.heading_direction))
+    v = np.asarray(rotations.rotate(world.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, (256, 3))))
+    np.testing.assert_allclose(v[~trajectory], direction[~trajectory], atol=1e-4)
+    center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, world.q)))
+    center = np.asarray(rotations.rotate(world.base_quaternion, center) + world.base_position)
+    target = np.asarray(rotations.rotate(world.object_quaternion, goal.heading_position) + world.object_position)
+    np.testing.assert_allclose(
+        (center + TASK.back_off * direction)[~trajectory], target[~trajectory], atol=1e-4
+    )
+    pose = np.asarray(goal.mask)[:, 1] > 0
+    np.testing.assert_allclose(np.asarray(world.q)[pose], np.asarray(goal.pose_q)[pose], atol=1e-6)
+    np.testing.assert_allclose(np.asarray(world.q)[~pose], np.tile(HAND.q_open, (256 - pose.sum(), 1)), atol=1e-6)
+
+
+def test_rollouts_go_through_whole_episodes_and_on(taskset):
+    worker = _worker(taskset)
+    first = worker.collect(None, 75)
+    assert first.observation.shape == (75, BATCH, SIZE) and first.observation.dtype == np.float16
+    assert np.isfinite(np.asarray(first.observation, np.float32)).all()
+    terminal = np.asarray(first.terminal)
+    assert terminal[-1].all() and not terminal[:-1].any()
+    episodes = finished_episodes(first)
+    assert set(episodes) == set(EPISODE_FIELDS) and len(episodes["episode/return"]) == BATCH
+    np.testing.assert_allclose(episodes["episode/return"], np.asarray(first.reward).sum(0), rtol=1e-3)
+    terms = sum(values for name, values in episodes.items() if name.startswith("term/"))
+    np.testing.assert_allclose(terms, episodes["episode/return"], rtol=1e-3, atol=1e-2)
+    assert np.all(episodes["episode/length"] == 75)
+    second = worker.collect(None, 30)
+    assert not np.asarray(second.terminal).any() and not len(finished_episodes(second)["episode/return"])
+    # The first observation of a rollout is the last one of the rollout before.
+    np.testing.assert_array_equal(second.observation[0], first.last_observation)
+    worker._physics.close()
+
+
+def test_the_table_goes_after_fifty_steps(taskset):
+    worker = _worker(taskset, batch=2)
+    trace = worker.collect(None, 75).trace
+    np.testing.assert_array_equal(trace.table, np.arange(1, 76) < TASK.approach_steps)
+
+
+def test_success_needs_the_object_to_stay_up(taskset):
+    """With idle hands far away every object falls, and nobody is credited."""
+    task = dataclasses.replace(TASK, back_off=0.5, p_pose=0.0, p_trajectory=0.0)
+    away = build_taskset(HAND, task, OBJECTS, 0)
+    physics = NativePhysics(HAND, task, OBJECTS, 2)
+    still = lambda p, o, k: (jnp.zeros((o.shape[0], 26)).at[:, 20:23].set(-20.0), jnp.zeros(o.shape[0]))  # noqa: E731
+    worker = RolloutWorker(HAND, task, physics, away, still, batch=BATCH, seed=0, half=False)
+    episodes = finished_episodes(worker.collect(None, 75))
+    untouched = episodes["episode/links_at_removal"] == 0
+    assert untouched.any()
+    assert not episodes["episode/success"][untouched].any()
+    assert (episodes["term/drop"][untouched] < 0).all()
+    physics.close()
+
+
+def test_a_lifted_object_that_stays_is_a_success(taskset):
+    """The protocol's bookkeeping on invented readouts: held up, against dropped by more than 5 cm."""
+    env = environment.start(HAND, TASK, taskset, jax.random.key(2), 2)
+    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+    readout = physics.read(physics.start(env.world))
+    found = np.zeros(readout.contact_found.shape, bool)
+    found[:, 0, 0] = True
+    readout = readout._replace(contact_found=found)
+    from common.task.types import Action
+
+    targets = Action(env.q_target, env.u_target)
+    score = jax.jit(lambda e, r: environment.score(HAND, TASK, TASK.reward, e, r, targets)[0])
+    for step in range(75):
+        position = np.array(readout.object_position)
+        if step >= 55:
+            position[1, 2] = env.world.object_position[1, 2] - 0.06
+        env = score(env, readout._replace(object_position=position))
+    finished = dict(zip(EPISODE_FIELDS, np.asarray(env.finished).T, strict=True))
+    np.testing.assert_array_equal(finished["episode/success"], [1.0, 0.0])
+    assert set(METRICS) <= {name.removeprefix("episode/") for name in EPISODE_FIELDS}
+    physics.close()
+
+
+def test_workers_with_the_same_seed_agree_bit_for_bit(taskset):
+    a, b = (_worker(taskset, seed=5, batch=3).collect(None, 20) for _ in range(2))
+    np.testing.assert_array_equal(a.reward, b.reward)
+    np.testing.assert_array_equal(a.observation, b.observation)
