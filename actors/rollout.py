@@ -96,27 +96,28 @@ class RolloutWorker:
           seed: seed of episodes and actions.
           half: observations are rounded to float16, for the policy as well as for the learner.
         """
-        self._hand, self._task, self._physics, self._taskset, self._policy = hand, task, physics, taskset, policy
+        self.physics = physics
+        self._hand, self._task, self._taskset, self._policy = hand, task, taskset, policy
         self._dtype = jnp.float16 if half else jnp.float32
         self._weights, self._control = task.reward, task.control
         episode_key, self._key = jax.random.split(jax.random.key(seed))
         self.env: EnvironmentState = jax.jit(
             functools.partial(environment.start, hand, task, batch=batch), static_argnames=()
         )(taskset, episode_key)
-        self._state = physics.start(self.env.world)
+        self.state = physics.start(self.env.world)
         self._act_jit = jax.jit(self._act)
         self._score_jit = jax.jit(functools.partial(environment.score, hand, task))
         self._restart_jit = jax.jit(functools.partial(environment.restart, hand, task))
         self._moment_jit = jax.jit(functools.partial(environment.moment, hand, task))
         self._observe_jit = jax.jit(lambda scene, seen, goal: observe(task, scene, seen, goal).astype(self._dtype))
         self._scan_jit = jax.jit(self._scan, static_argnames="steps")
-        self._moment: tuple[SceneState, Features] = self._moment_jit(self.env, physics.read(self._state))
+        self._moment: tuple[SceneState, Features] = self._moment_jit(self.env, physics.read(self.state))
 
     def collect(self, parameters: Any, steps: int) -> Rollout:
         """The next `steps` control steps under these policy parameters."""
         self._key, key = jax.random.split(self._key)
         self.env = self.env._replace(has_finished=jnp.zeros_like(self.env.has_finished))
-        run = self._collect_compiled if self._physics.compiled else self._collect_stepwise
+        run = self._collect_compiled if self.physics.compiled else self._collect_stepwise
         return run(parameters, key, steps)
 
     def _act(
@@ -136,16 +137,16 @@ class RolloutWorker:
             observation, action, log_probability, target, joints = self._act_jit(
                 parameters, self._control, env, scene, seen, step_key
             )
-            self._state, readout = self._physics.step(
-                self._state, np.asarray(joints), np.asarray(environment.table_present(env, self._task))
+            self.state, readout = self.physics.step(
+                self.state, np.asarray(joints), np.asarray(environment.table_present(env, self._task))
             )
             self.env, score, scene, seen = self._score_jit(self._weights, env, readout, target)
             rows.append((observation, action, log_probability, score.reward, score.terminal))
             traces.append((scene, seen, action, score))
             if bool(np.any(score.terminal)):
                 self.env = self._restart_jit(self._taskset, self.env, score.terminal)
-                self._state = self._physics.reset(self._state, score.terminal, self.env.world)
-                scene, seen = self._moment_jit(self.env, self._physics.read(self._state))
+                self.state = self.physics.reset(self.state, score.terminal, self.env.world)
+                scene, seen = self._moment_jit(self.env, self.physics.read(self.state))
         self._moment = scene, seen
         columns = [np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)]
         trace = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *(_trace(*t) for t in traces))
@@ -153,17 +154,17 @@ class RolloutWorker:
         return Rollout(*(*columns, last, self.env.finished, self.env.has_finished, trace))
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
-        carry = (self.env, self._state, self._moment)
+        carry = (self.env, self.state, self._moment)
         carry, rollout = self._scan_jit(
             parameters, self._weights, self._control, self._taskset, carry, key, steps=steps
         )
-        self.env, self._state, self._moment = carry
+        self.env, self.state, self._moment = carry
         return rollout
 
     def _scan(
         self, parameters: Any, weights: Any, control: Any, taskset: TaskSet, carry: Any, key: Array, steps: int
     ) -> tuple[Any, Rollout]:
-        physics = self._physics
+        physics = self.physics
 
         def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
             env, state, (scene, seen) = carry

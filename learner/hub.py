@@ -1,9 +1,12 @@
 """The learner's end of the link: it takes rollouts in, hands out tickets and weights, and says how things stand.
 
 A rollout is identified by (actor, incarnation, sequence). It is acknowledged when it is in the queue, and an
-acknowledged one is never taken twice, however often its actor sends it. What a checkpoint keeps of the hub
-(`durable`) fits the weights beside it: rollouts acknowledged after the checkpoint are undone with the updates that used
-them when training resumes from it, and are counted as `rolled_back` from the gap that they leave in the sequences.
+acknowledged one is never taken twice, however often its actor sends it.
+
+What a checkpoint keeps of the hub (`durable`) fits the weights beside it: when training resumes from it, what was
+decided after it is undone with the updates that used it. Such rollouts show as gaps in their actors' sequences, which
+the ledger counts as `missing`; so do rollouts that later ones have overtaken, until they arrive. All others are in the
+ledger once: as consumed, dropped, queued or stale.
 """
 
 import collections
@@ -30,36 +33,29 @@ _EVENT_SECONDS = 1.0  # between two events of one kind
 
 @dataclasses.dataclass
 class _Marks:
-    """Which rollouts of an incarnation were decided on: all below `next`, and those in `ahead`."""
+    """Which rollouts of an incarnation were decided on: all below `next` but those skipped, and those in `ahead`."""
 
     next: int = 0
     ahead: set[int] = dataclasses.field(default_factory=set)
     refused: set[int] = dataclasses.field(default_factory=set)
     """Those among them that were refused, as far as they are recent; the others were accepted."""
-    resumed: tuple[int, frozenset[int]] | None = None
-    """`next` and `ahead` as a checkpoint had them."""
-    first: int | None = None
-    """Lowest undecided sequence number that arrived since."""
+    skipped: int = 0
+    """Sequence numbers below `next` that never came."""
     rollouts: int = 0
     version: int = -1
 
-    def accepted(self, sequence: int) -> bool:
-        return (sequence < self.next or sequence in self.ahead) and sequence not in self.refused
+    def __contains__(self, sequence: int) -> bool:
+        return sequence < self.next or sequence in self.ahead
 
-    def arrive(self, sequence: int) -> None:
-        if self.resumed and sequence >= self.resumed[0] and sequence not in self.resumed[1]:
-            self.first = sequence if self.first is None else min(self.first, sequence)
-
-    def decide(self, header: RolloutHeader, accept: bool) -> None:
-        if accept:
+    def add(self, header: RolloutHeader, accepted: bool) -> None:
+        if accepted:
             self.rollouts += 1
             self.version = header.version
-            self.refused.discard(header.sequence)
         else:
             self.refused.add(header.sequence)
-        if header.sequence >= self.next:
-            self.ahead.add(header.sequence)
+        self.ahead.add(header.sequence)
         if len(self.ahead) > _WINDOW:
+            self.skipped += min(self.ahead) - self.next
             self.next = min(self.ahead)
         while self.next in self.ahead:
             self.ahead.remove(self.next)
@@ -68,12 +64,9 @@ class _Marks:
             self.refused.remove(min(self.refused))
 
     @property
-    def rolled_back(self) -> int:
-        """Sequence numbers that neither the checkpoint nor the process that resumed from it has seen."""
-        if self.resumed is None or self.first is None:
-            return 0
-        start, decided = self.resumed
-        return self.first - start - sum(sequence < self.first for sequence in decided)
+    def missing(self) -> int:
+        """Sequence numbers below the highest that are not decided on."""
+        return self.skipped + max(self.ahead, default=self.next - 1) + 1 - self.next - len(self.ahead)
 
 
 class LearnerHub:
@@ -125,7 +118,7 @@ class LearnerHub:
         self._changed = threading.Condition()
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
         self._marks: collections.OrderedDict[Owner, _Marks] = collections.OrderedDict()
-        self._rolled_back = 0
+        self._forgotten_missing = 0
         self._bundle: SharedMessage | None = None
         self._alive: set[Alive] = set()
         self._arrivals: collections.deque[tuple[float, int]] = collections.deque()
@@ -183,6 +176,7 @@ class LearnerHub:
             now = time.monotonic()
             self._forget_arrivals(now)
             span = min(_RATE_SECONDS, max(1.0, now - self._arrivals[0][0])) if self._arrivals else _RATE_SECONDS
+            missing = self._forgotten_missing + sum(marks.missing for marks in self._marks.values())
             roles: list[dict[str, Any]] = []
             for alive in sorted(self._alive):
                 marks = self._marks.get((alive.id, alive.incarnation)) if alive.role == "actor" else None
@@ -198,7 +192,7 @@ class LearnerHub:
                     "steps_per_second": sum(steps for _, steps in self._arrivals) / span,
                 },
                 "queue": {"length": len(self._queue), "limit": self._limit},
-                "ledger": self._staleness.ledger() | {"rolled_back": self._total_rolled_back()},
+                "ledger": self._staleness.ledger() | {"missing": missing},
             }
 
     def durable(self) -> dict[str, Any]:
@@ -210,12 +204,12 @@ class LearnerHub:
                 queued = {sequence for of, sequence in waiting if of == owner}
                 start = min(queued | {mark.next})
                 decided = set(range(start, mark.next)) | mark.ahead
-                marks.append([*owner, start, sorted(decided - queued), sorted(mark.refused)])
+                marks.append([*owner, start, sorted(decided - queued), sorted(mark.refused), mark.skipped])
             return {
                 "epoch": self.epoch,
                 "version": self._staleness.version,
                 "ledger": self._staleness.durable(),
-                "rolled_back": self._total_rolled_back(),
+                "forgotten_missing": self._forgotten_missing,
                 "marks": marks,
             }
 
@@ -223,13 +217,9 @@ class LearnerHub:
         if durable["epoch"] != self.epoch:
             raise CongraspError(f"The checkpoint is of epoch {durable['epoch']}, not {self.epoch}.")
         self._staleness.restore(durable["ledger"], durable["version"])
-        self._rolled_back = durable["rolled_back"]
-        for actor, incarnation, start, ahead, refused in durable["marks"]:
-            resumed = start, frozenset(ahead)
-            self._marks[actor, incarnation] = _Marks(start, set(ahead), set(refused), resumed)
-
-    def _total_rolled_back(self) -> int:
-        return self._rolled_back + sum(marks.rolled_back for marks in self._marks.values())
+        self._forgotten_missing = durable["forgotten_missing"]
+        for actor, incarnation, start, ahead, refused, skipped in durable["marks"]:
+            self._marks[actor, incarnation] = _Marks(start, set(ahead), set(refused), skipped)
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1
@@ -281,20 +271,22 @@ class LearnerHub:
         if self._bundle is None:
             return self._answer("retry", why="The learner is starting.")
         marks = self._marks_of(header.owner)
-        marks.arrive(header.sequence)
-        if marks.accepted(header.sequence):
+        if header.sequence in marks.refused:
+            self._staleness.redeem(header.owner, ticket)
+            return self._answer("stale", why="It was refused before.")
+        if header.sequence in marks:
             self._staleness.refuse_duplicate(header.owner, ticket)
             return self._answer("duplicate")
         if len(self._queue) >= self._limit:
             return self._answer("retry", why=f"{self._limit} rollouts wait already.")
         if self._finished:
             self._staleness.refuse_stale(header.owner, ticket)
-            marks.decide(header, False)
+            marks.add(header, accepted=False)
             return self._answer("stale", why="The run is finished.")
         verdict = self._staleness.arrive(header.owner, ticket, header.version)
         if verdict == "full":
             return self._answer("retry", why="No more rollouts are needed at this version.")
-        marks.decide(header, verdict == "accepted")
+        marks.add(header, accepted=verdict == "accepted")
         if verdict == "stale":
             why = f"It was made by version {header.version}, and the learner is at {self._staleness.version}."
             self._event("info", f"A rollout of {header.actor} was refused. {why}", kind="stale")
@@ -314,7 +306,7 @@ class LearnerHub:
         self._marks.move_to_end(owner)
         if len(self._marks) > _INCARNATIONS:
             _, oldest = self._marks.popitem(last=False)
-            self._rolled_back += oldest.rolled_back
+            self._forgotten_missing += oldest.missing
         return marks
 
     def _forget_arrivals(self, now: float) -> None:

@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar, cast
 
 from common.errors import CongraspError
 
@@ -104,7 +104,9 @@ class Batcher(Generic[T, R]):
 
     def _answer(self, batch: list[_Waiting], now: float) -> None:
         try:
-            results = self._run([waiting.item for waiting in batch], [now - waiting.arrival for waiting in batch])
+            results = self._run(
+                [cast(T, waiting.item) for waiting in batch], [now - waiting.arrival for waiting in batch]
+            )
         except Exception as error:
             results = [error] * len(batch)
         for waiting, result in zip(batch, results, strict=True):

@@ -1,4 +1,4 @@
-"""What `congrasp train` does around training: evaluation before and after, progress, a picture, what to look at next."""
+"""What `congrasp train` does around training: evaluations, progress, a picture, what to look at next."""
 
 import os
 import pathlib

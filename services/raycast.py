@@ -75,19 +75,17 @@ class Camera:
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-def between(start: np.ndarray, end: np.ndarray, radius: float, colour: tuple, **options: object) -> Shape:
-    """A capsule from `start` to `end` (3,), as a `Shape`."""
+def between(
+    start: np.ndarray, end: np.ndarray, radius: float, colour: tuple[float, float, float], *, alpha: float = 1.0
+) -> Shape:
+    """A capsule from `start` to `end` (3,), or a ball where they coincide."""
     along = np.subtract(end, start)
     length = float(np.linalg.norm(along))
-    turn = Rotation.align_vectors([along / length], [[0.0, 0.0, 1.0]])[0] if length > 0 else Rotation.identity()
-    return Shape(
-        "capsule",
-        (radius, length / 2, 0.0),
-        colour,
-        np.add(start, end) / 2,
-        turn.as_quat(scalar_first=True),
-        **options,  # type: ignore[arg-type]
-    )
+    middle = np.add(start, end) / 2
+    if length < 1e-9:
+        return Shape("sphere", (radius, 0.0, 0.0), colour, middle, alpha=alpha)
+    turn = Rotation.align_vectors([along / length], [[0.0, 0.0, 1.0]])[0].as_quat(scalar_first=True)
+    return Shape("capsule", (radius, length / 2, 0.0), colour, middle, turn, alpha)
 
 
 class Hits(NamedTuple):

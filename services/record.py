@@ -11,7 +11,7 @@ from common.logs.recorder import Recorder
 from common.transport.zenoh_transport import ZenohTransport
 from services.live import LiveServer
 
-_REFRESH = 0.5  # seconds
+_REFRESH, _CLOSE = 0.5, 2.5  # seconds
 
 
 def record_run(
@@ -46,7 +46,7 @@ def record_run(
                     time.sleep(_REFRESH if end is None else max(0.0, min(_REFRESH, end - time.monotonic())))
                     status.update(_state(recorder))
         finally:
-            recorder.close()
+            recorder.close(_CLOSE)
             for file in recorder.files:
                 print(file)
             console.print(_state(recorder))

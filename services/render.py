@@ -34,6 +34,7 @@ _FIELD_OF_VIEW, _ELEVATION = 26.0, 24.0  # degrees
 _ARROW_SEARCH, _ARROW_GAP = 0.012, 0.004  # radius in which the approach looks for the object, space before it, m
 _SPACE = 1.06  # free space at the picture's edges
 _LINK_SPACE = 0.03  # how far a link reaches around its origin, m
+_FALL = 0.1  # how far the camera follows a falling object, m
 
 
 def hand_shapes(
@@ -182,15 +183,20 @@ def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -
 
 
 def _extent(episode: Message, step: int) -> np.ndarray:
-    """(N, 3) points that a picture of a step must hold: the links, the corners of the object's box and a trajectory."""
+    """(N, 3) points that a picture of a step must hold: the links, the corners of the object's box and a trajectory.
+
+    An object that has fallen far may leave the picture.
+    """
     arrays = episode.arrays
+    links = np.asarray(arrays["link_position"][step], float)
+    around = (links[:, None] + _LINK_SPACE * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
+    if arrays["object_position"][step, 2] < arrays["object_position"][0, 2] - _FALL:
+        return around
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
     low, high = arrays["visual_vertices"].min(0), arrays["visual_vertices"].max(0)
     points = [np.where(np.indices((2, 2, 2)).reshape(3, -1).T, high, low)]
     if arrays["goal/mask"][MASKS.index("trajectory")] > 0:
         points.append(arrays["goal/trajectory_position"])
-    links = np.asarray(arrays["link_position"][step], float)
-    around = (links[:, None] + _LINK_SPACE * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
     return np.concatenate([around, turn.apply(np.concatenate(points)) + arrays["object_position"][step]])
 
 

@@ -30,7 +30,13 @@ SURFACE_LIMIT = 4096
 """Most surface points in one query; the policy looks at `TaskConfig.surface_points` of them."""
 _UNIT_TOLERANCE = 0.02
 _OPTIONAL_STATE = (
-    ["q_velocity", "u_velocity", "object_velocity", "object_angular_velocity", "contact_force", "contact_position", "contact_found"]
+    "q_velocity",
+    "u_velocity",
+    "object_velocity",
+    "object_angular_velocity",
+    "contact_force",
+    "contact_position",
+    "contact_found",
 )
 
 
@@ -119,7 +125,7 @@ class Layout:
         points = np.asarray(arrays["surface_points"])
         if points.ndim != 2 or points.shape[1] != 3 or not 1 <= len(points) <= SURFACE_LIMIT:
             raise CongraspError(
-                f"The field 'surface_points' has shape {points.shape}; it must be (N, 3) with 1 <= N <= {SURFACE_LIMIT}."
+                f"The field 'surface_points' has shape {points.shape}; it must be (N, 3), N at most {SURFACE_LIMIT}."
             )
         minus = np.asarray(arrays.get("surface_minus", np.zeros(len(points), bool)))
         if minus.shape != (len(points),):

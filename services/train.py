@@ -1,4 +1,4 @@
-"""A learner and its actors on this machine: starts them, keeps them alive, shows how it goes, and ends them together."""
+"""A learner and its actors on this machine: starts them, keeps them alive, and ends them together."""
 
 import contextlib
 import dataclasses

@@ -16,10 +16,11 @@ from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 
 
-class _Cell:
+class Cell:
     """One world: its own model (base pose, mass and friction differ) and data, with views that stay valid."""
 
     def __init__(self, scene: mujoco.MjModel):
+        """A copy of the scene."""
         self.model = copy.copy(scene)
         self.data = mujoco.MjData(self.model)
 
@@ -43,8 +44,13 @@ class NativePhysics:
         self._threads = max(1, threads)
         self._pool = concurrent.futures.ThreadPoolExecutor(self._threads, thread_name_prefix="physics")
         self._scenes: dict[int, mujoco.MjModel] = {}
-        self._cells: list[_Cell | None] = []
+        self._cells: list[Cell | None] = []
         self._where = addresses(self._scene(0), hand)
+
+    @property
+    def cells(self) -> list[Cell]:
+        """The worlds, for those who look under the hood."""
+        return [cell for cell in self._cells if cell is not None]
 
     def start(self, world: World) -> "NativePhysics":
         """Fresh worlds; see `Physics.start`."""
@@ -95,7 +101,7 @@ class NativePhysics:
 
     def _start_world(self, i: int, world: World) -> None:
         where, scene = self._where, self._scene(int(world.object_index[i]))
-        cell = self._cells[i] = _Cell(scene)
+        cell = self._cells[i] = Cell(scene)
         model, data = cell.model, cell.data
         model.body_pos[where.base_body] = world.base_position[i]
         model.body_quat[where.base_body] = world.base_quaternion[i]

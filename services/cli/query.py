@@ -36,10 +36,11 @@ def query(
     if json:
         print(json_module.dumps(result))
     else:
-        print(
-            f"{repeat} queries from {concurrency} client(s): p50 {result['p50_ms']:.2f} ms, p99 {result['p99_ms']:.2f} ms, "
-            f"{result['answers_per_s']:.0f} answers/s, {result['failed']} failed, {result['overloaded']} overloaded"
+        latency = (
+            f"p50 {result['p50_ms']:.2f} ms, p99 {result['p99_ms']:.2f} ms, {result['answers_per_s']:.0f} answers/s"
         )
+        lost = f"{result['failed']:.0f} failed, {result['overloaded']:.0f} overloaded"
+        print(f"{repeat} queries from {concurrency} client(s): {latency}, {lost}")
     return 0 if result["failed"] == 0 else 1
 
 

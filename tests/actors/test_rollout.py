@@ -70,9 +70,7 @@ def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(t
     center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, world.q)))
     center = np.asarray(rotations.rotate(world.base_quaternion, center) + world.base_position)
     target = np.asarray(rotations.rotate(world.object_quaternion, goal.heading_position) + world.object_position)
-    np.testing.assert_allclose(
-        (center + TASK.back_off * direction)[~trajectory], target[~trajectory], atol=1e-4
-    )
+    np.testing.assert_allclose((center + TASK.back_off * direction)[~trajectory], target[~trajectory], atol=1e-4)
     pose = np.asarray(goal.mask)[:, 1] > 0
     np.testing.assert_allclose(np.asarray(world.q)[pose], np.asarray(goal.pose_q)[pose], atol=1e-6)
     np.testing.assert_allclose(np.asarray(world.q)[~pose], np.tile(HAND.q_open, (256 - pose.sum(), 1)), atol=1e-6)
@@ -95,7 +93,7 @@ def test_rollouts_go_through_whole_episodes_and_on(taskset):
     assert not np.asarray(second.terminal).any() and not len(finished_episodes(second)["episode/return"])
     # The first observation of a rollout is the last one of the rollout before.
     np.testing.assert_array_equal(second.observation[0], first.last_observation)
-    worker._physics.close()
+    worker.physics.close()
 
 
 def test_the_table_goes_after_fifty_steps(taskset):

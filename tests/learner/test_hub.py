@@ -146,7 +146,7 @@ def test_batches_come_in_order_and_wait(bench):
     assert sequences(b.hub.next_batch(2, 10)) == [2, 3]
     assert b.ledger() | {"capacity": 0} == {
         "granted": 0, "redeemed": 0, "returned": 0, "expired": 0, "accepted": 4, "consumed": 4, "dropped": 0,
-        "stale": 0, "duplicate": 0, "damaged": 0, "running": 0, "queued": 0, "capacity": 0, "rolled_back": 0,
+        "stale": 0, "duplicate": 0, "damaged": 0, "running": 0, "queued": 0, "capacity": 0, "missing": 0,
     }  # fmt: skip
 
 
@@ -299,11 +299,11 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
     assert resumed.send(6, version=4)["outcome"] == "accepted"
     assert resumed.send(6, version=4)["outcome"] == "duplicate"
     ledger = resumed.ledger()
-    assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["rolled_back"]) == (5, 3, 2, 3)
+    assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["missing"]) == (5, 3, 2, 3)
     again = bench(batch=3, durable=resumed.hub.durable())
     again.hub.publish_weights(bundle(5), 5)
-    assert again.ledger()["rolled_back"] == 3 and again.ledger()["accepted"] == 3
-    assert again.send(7, version=5)["outcome"] == "accepted"
+    assert again.send(8, version=5)["outcome"] == "accepted"
+    assert again.ledger()["missing"] == 5 and again.ledger()["accepted"] == 4  # 6 and 7 were waiting as well
     with pytest.raises(CongraspError, match="epoch e, not f"):
         bench(epoch="f", durable=durable)
 
@@ -311,37 +311,43 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 40), st.booleans()), max_size=120))
 def test_marks_are_exact_within_their_window(arrivals):
-    marks, accepted = _Marks(), set()
-    for sequence, accept in arrivals:
-        assert marks.accepted(sequence) == (sequence in accepted)
-        if sequence not in accepted:
-            marks.decide(_header(sequence), accept)
-            accepted |= {sequence} if accept else set()
-    assert marks.rollouts == len(accepted)
+    marks, decided = _Marks(), {}
+    for sequence, accepted in arrivals:
+        assert (sequence in marks) == (sequence in decided)
+        assert (sequence in marks.refused) == (decided.get(sequence) is False)
+        if sequence not in decided:
+            marks.add(_header(sequence), accepted)
+            decided[sequence] = accepted
+        assert marks.missing == max(decided) + 1 - len(decided)
+    assert marks.rollouts == sum(decided.values())
 
 
 def test_marks_stay_small_whatever_is_missing():
     marks = _Marks()
     for sequence in range(1, 20_000, 2):
-        marks.decide(_header(sequence), sequence % 3 > 0)
+        marks.add(_header(sequence), sequence % 3 > 0)
         assert len(marks.ahead) <= 64 and len(marks.refused) <= 64
-    assert marks.accepted(19_999) and not marks.accepted(19_995) and not marks.accepted(20_001)
+    assert 19_999 in marks and 20_001 not in marks
+    assert marks.missing == 10_000
 
 
-def test_hole_that_was_filled_after_the_checkpoint_is_counted_and_a_refused_one_is_not(bench):
+def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
     b = bench(batch=2)
     b.hub.publish_weights(bundle(5), 5)
     assert b.send(0, version=0)["outcome"] == "stale"
     assert b.send(2, version=5)["outcome"] == b.send(3, version=5)["outcome"] == "accepted"
     assert sequences(b.hub.next_batch(2, 1)) == [2, 3]
     b.hub.publish_weights(bundle(6), 6)
+    assert b.ledger()["missing"] == 1
     durable = b.hub.durable()
     assert b.send(1, version=6)["outcome"] == "accepted"  # overtaken by 2 and 3, and lost with this learner
+    assert b.ledger()["missing"] == 0
     resumed = bench(batch=2, durable=durable)
     resumed.hub.publish_weights(bundle(6), 6)
-    assert resumed.send(0, version=0)["outcome"] == "stale"
+    assert resumed.send(0, version=6)["outcome"] == "stale"  # as before
     assert resumed.send(4, version=6)["outcome"] == "accepted"
-    assert resumed.ledger()["rolled_back"] == 1
+    ledger = resumed.ledger()
+    assert (ledger["consumed"], ledger["queued"], ledger["stale"], ledger["missing"]) == (2, 1, 1, 1)
 
 
 def _header(sequence):

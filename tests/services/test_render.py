@@ -138,6 +138,7 @@ def test_between_and_arrow_lie_where_they_are_asked_to() -> None:
     along = (end - start) / np.linalg.norm(end - start)
     np.testing.assert_allclose(corners[np.argmax(corners @ along)], end, atol=1e-12)
     assert shaft.kind == "capsule"
+    assert between(start, start, 0.01, RED).kind == "sphere"
 
 
 def test_beads_are_one_shape_at_the_points() -> None:
@@ -196,6 +197,11 @@ def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
     for step in (0, 11):
         assert np.abs(projected(camera, episode().arrays["link_position"][step].astype(float))).max() < 1
     frames = list(render_episode_frames(episode(), [0, 11], (64, 48)))
+    fallen = episode()
+    fallen.arrays["object_position"][-1, 2] -= 5.0
+    np.testing.assert_allclose(
+        best_camera(fallen, [0, 11]).target[2], best_camera(episode(), [0, 11]).target[2], atol=0.1
+    )
     assert [frame.shape for frame in frames] == [(48, 64, 3)] * 2
     assert np.abs(frames[0].astype(int) - frames[1]).max() > 50
 

@@ -1,0 +1,55 @@
+"""Benchmarks, as ratios against a reference in the same run."""
+
+
+def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines: tuple[str, ...] = ()) -> int:
+    """Actors' control steps a second beside the bare engine's, for each engine that the machine has.
+
+    Args:
+      environments: Worlds that run side by side.
+      threads: Threads of the native engine; 0 takes all cores.
+      repeats: Measurements of each, alternating; the medians are printed.
+      engines: Engines to measure; those that the machine is made for if none is named.
+    """
+    from services import bench
+
+    bench.bench_physics(environments, threads or bench.cores(), repeats, list(engines) or bench.engines())  # type: ignore[arg-type]
+    return 0
+
+
+def query(repeat: int = 1000, concurrency: int = 1) -> int:
+    """Latency of a policy server in a process of its own that serves an untrained policy, over the loopback interface.
+
+    Args:
+      repeat: Queries in all.
+      concurrency: Clients at the same time.
+    """
+    import pathlib
+    import subprocess
+    import sys
+    import tempfile
+
+    from common.policy import bundle as bundles
+    from services.load import example_episode, measure
+    from services.presets import get_preset
+    from services.quickstart import untrained
+    from services.train import free_port
+
+    with tempfile.TemporaryDirectory() as folder:
+        policy = pathlib.Path(folder, "policy.safetensors")
+        bundles.save(untrained(get_preset("quickstart")), policy)
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        command = [sys.executable, "-m", "services.cli.main", "serve", "--policy", str(policy), "--listen", endpoint]
+        server = subprocess.Popen(command, stdout=subprocess.PIPE)
+        try:
+            episode = example_episode(1_000_000)
+            assert server.stdout is not None
+            server.stdout.readline()
+            result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0)
+        finally:
+            server.terminate()
+            server.wait(10)
+    print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
+    return 0
+
+
+COMMANDS = {"physics": physics, "query": query}
