@@ -37,20 +37,23 @@ class PolicyClient:
     constraints and surface points (object frame). Metres, radians, newtons; quaternions (w, x, y, z).
     """
 
-    def __init__(self, connect: str, run: str = "policy", *, timeout: float = 1.0, wait: float = 10.0):
-        """Connects.
+    def __init__(
+        self, connect: str, run: str = "policy", *, hand: str = "human", timeout: float = 1.0, wait: float = 10.0
+    ):
+        """Connects; when the server goes away and comes back, so does the connection.
 
         Args:
           connect: the server's endpoint, such as tcp/10.0.0.7:7457.
           run: name under which the server serves.
+          hand: name of the hand that is to be controlled; a server with another hand's policy refuses.
           timeout: seconds that one call may take.
           wait: seconds to wait for the server to appear.
 
         Raises:
           TransportError: nobody is there.
         """
-        self._transport = ZenohTransport(connect=[connect], wait=wait)
-        self._keys, self._timeout = Keys(run), timeout
+        self._transport = ZenohTransport(connect=[connect], flows=("policy",), wait=wait)
+        self._keys, self._hand, self._timeout = Keys(run), hand, timeout
         self._episode: dict[str, np.ndarray] = {}
         self._constraints: list[str] = []
         self._time = 0
@@ -113,7 +116,7 @@ class PolicyClient:
                 name: np.asarray(value, bool if np.asarray(value).dtype == bool else np.float32)
                 for name, value in arrays.items()
             },
-            {"constraints": self._constraints, "timeout": self._timeout},
+            {"hand": self._hand, "constraints": self._constraints, "timeout": self._timeout},
         )
         began = time.perf_counter()
         reply = self._transport.query(self._keys.act, request, timeout=self._timeout)

@@ -1,7 +1,7 @@
 """The policy as one compiled function from a batch of flat queries to joint targets."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from common.config import TaskConfig
 from common.constraints.priority import Request, explain, resolve
 from common.errors import CongraspError
 from common.hands.spec import Hand
-from common.policy import network, normalizer
+from common.policy.bundle import Acting, mean_action
 from common.task import control, observation
 from common.task.features import features
 from common.task.types import MASKS, Goal, SceneState, Surface
@@ -34,15 +34,8 @@ class Answer(NamedTuple):
     """Which constraints are active, and why."""
 
 
-class Weights(NamedTuple):
-    """What a bundle contributes to the compiled function: arrays on the device."""
-
-    params: Any
-    affine: normalizer.Affine
-
-
 class PolicyFunction:
-    """The policy of one hand, task and network size, for any weights.
+    """The policy of one hand and task, for any weights.
 
     Attributes:
       layout: how queries are laid out.
@@ -52,12 +45,12 @@ class PolicyFunction:
         self.layout = Layout(hand, task)
         self._compiled = jax.jit(self._infer)
 
-    def warm_up(self, weights: Weights) -> None:
+    def warm_up(self, weights: Acting) -> None:
         """Compiles every batch size."""
         for size in BATCH_SIZES:
             jax.block_until_ready(self._compiled(weights, np.zeros((size, self.layout.size), np.float32)))
 
-    def __call__(self, weights: Weights, queries: Sequence[Query]) -> list[Answer | Exception]:
+    def __call__(self, weights: Acting, queries: Sequence[Query]) -> list[Answer | Exception]:
         """Answers at most `BATCH_SIZES[-1]` queries; a query that cannot be answered gets its own error."""
         size = next(size for size in BATCH_SIZES if size >= len(queries))
         batch = np.zeros((size, self.layout.size), np.float32)
@@ -65,7 +58,7 @@ class PolicyFunction:
         rows = np.asarray(self._compiled(weights, batch))[: len(queries)]
         return [self._answer(query, row) for query, row in zip(queries, rows, strict=True)]
 
-    def _infer(self, weights: Weights, vectors: jax.Array) -> jax.Array:
+    def _infer(self, weights: Acting, vectors: jax.Array) -> jax.Array:
         """(B, A + F + 6 + 2): action, targets, and the flags redirected and aligned, of flat queries (B, S)."""
         hand, task = self.layout.hand, self.layout.task
         fields = self.layout.unpack(vectors)
@@ -77,9 +70,7 @@ class PolicyFunction:
         resolution = resolve(hand, surface, Request(asked, *jnp.moveaxis(flags["asked"], -1, 0)))
         seen = features(hand, task, state, surface, resolution.goal)
         observed = observation.observe(task, state, seen, resolution.goal)
-        mean, _ = network.policy(
-            weights.params, observation.layout(hand, task), normalizer.apply(weights.affine, observed)
-        )
+        mean = mean_action(observation.layout(hand, task), weights, observed)
         action = control.decode(hand, task.control, state, seen, resolution.goal, mean)
         notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
         return jnp.concatenate([mean, action.q_target, action.u_target, notes], -1)

@@ -1,13 +1,64 @@
-"""A plausible query, and a latency test of a policy server."""
+"""A policy server in a process of its own, a plausible query for it, and a test of its latency."""
 
 import concurrent.futures
+import contextlib
+import os
+import pathlib
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from common.errors import TransportError
+from common.errors import CongraspError, TransportError
 from services.client import PolicyClient
+from services.shutdown import PARENT_VARIABLE
+from services.train import free_port
+
+
+@contextlib.contextmanager
+def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[str]:
+    """A server of a policy file on this machine while the block runs; its endpoint, at which it may still compile.
+
+    Args:
+      policy: the file.
+      log: takes what the server prints.
+    """
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = [sys.executable, "-m", "services.cli.main", "serve", "--policy", str(policy), "--listen", endpoint]
+    with log.open("wb") as output:
+        server = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
+            start_new_session=True,
+        )
+    try:
+        yield endpoint
+    finally:
+        server.terminate()
+        try:
+            server.wait(5.0)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait()
+
+
+def wait_until_ready(client: PolicyClient, seconds: float = 180.0) -> None:
+    """Returns once the server has compiled and answers; a CongraspError after `seconds`."""
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            client.health()
+            return
+        except TransportError:
+            if time.monotonic() > deadline:
+                raise CongraspError(f"The policy server is not ready after {seconds:g} s.") from None
+            time.sleep(0.2)
 
 
 def example_episode(seed: int) -> dict[str, Any]:
@@ -72,3 +123,18 @@ def measure(
         "failed": sum(failed for _, failed, _ in results),
         "overloaded": sum(overloaded for _, _, overloaded in results),
     }
+
+
+def one_answer(client: PolicyClient, episode: dict[str, Any]) -> str:
+    """Asks for the first action of an episode; the answer in words."""
+    client.reset(**episode["reset"])
+    answer = client.act(episode["state"])
+    with np.printoptions(precision=3, suppress=True):
+        return (
+            f"object       {episode['object']}, constraints: {', '.join(episode['reset']['constraints'])}\n"
+            f"active       {' '.join(answer.active)}\n"
+            f"q_target     {answer.q_target} rad\n"
+            f"u_target     {answer.u_target} m, rad\n"
+            f"version      {answer.version}\n"
+            f"timing       {answer.round_trip_ms:.2f} ms round trip, {answer.server_ms:.2f} ms in the server"
+        )

@@ -16,8 +16,10 @@ from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, policy_spec
 from learner import update as updates
-from learner.process import POLICY_FILE, create_run, open_run
+from learner.process import LOGS, POLICY_FILE, create_run, open_run
+from services.client import PolicyClient
 from services.evaluate import Evaluator, Row
+from services.load import example_episode, one_answer, serving, wait_until_ready
 from services.render import episode_sheet
 from services.sheets import save_png
 from services.shutdown import on_signal
@@ -72,6 +74,7 @@ def run_training(
         if evaluation:
             after = _evaluate(policy, config, evaluation, "after training")
             _compare(before, after)
+            _live_query(run_dir)
             _picture(policy, config, run_dir)
         _next_steps(run_dir, evaluation > 0)
     return 0
@@ -166,6 +169,16 @@ def _compare(before: list[Row], after: list[Row]) -> None:
             f"  {label:28s} {old.mean():7.2f} ± {old.std(ddof=1):5.2f}  ->  {new.mean():7.2f} ± {new.std(ddof=1):5.2f}"
             f"   {'better than the noise' if clear and new.mean() > old.mean() else 'within the noise, or worse'}"
         )
+
+
+def _live_query(run_dir: pathlib.Path) -> None:
+    """Serves the policy from a process of its own, and asks it for one action."""
+    console.print("\n[bold]One live query[/] of a policy server in a process of its own:")
+    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as endpoint:
+        episode = example_episode(HELD_OUT_SEED)
+        with PolicyClient(endpoint, wait=60.0, timeout=5.0) as client:
+            wait_until_ready(client)
+            console.print(one_answer(client, episode), markup=False)
 
 
 def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> None:

@@ -9,18 +9,22 @@ from typing import Any, NamedTuple
 from common.errors import CongraspError, TransportError
 from common.hands import get_hand
 from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle, content_hash
+from common.policy.bundle import Acting, PolicyBundle, content_hash
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode
 from services.batching import Batcher
-from services.inference import BATCH_SIZES, Answer, PolicyFunction, Weights
+from services.inference import BATCH_SIZES, Answer, PolicyFunction
 from services.requests import Query
 
 Source = Callable[[int], PolicyBundle | None]
 """(version that is held, -1 for none) -> a newer bundle, or None."""
 WINDOW = 0.001
-DEPTH = 256
+"""Seconds that a query may wait for others to join its batch."""
+DEPTH = 64
+"""Queries that wait for the next batch; one more is refused at once."""
+_WORKERS = DEPTH + BATCH_SIZES[-1] + 8  # enough that some are free to refuse while all others wait for their answers
+_MAX_TIMEOUT = 60.0
 _FOLLOW_SECONDS = 0.5
 
 
@@ -29,7 +33,7 @@ class _Held(NamedTuple):
 
     bundle: PolicyBundle
     hash: str
-    weights: Weights
+    acting: Acting
 
 
 class PolicyServer:
@@ -53,20 +57,21 @@ class PolicyServer:
         self._source, self._timeout = source, timeout
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
-        self._function.warm_up(self._held.weights)
+        self._function.warm_up(self._held.acting)
         self._answered = 0
+        self._trouble = ""
         self._closed = threading.Event()
         self._batcher: Batcher[Query, tuple[Answer, _Held, float, float]] = Batcher(
             self._infer, size=BATCH_SIZES[-1], window=WINDOW, depth=DEPTH
         )
         keys = Keys(run)
         transport.serve(keys.health, lambda key, request: Message({}, self.health()))
-        transport.serve(keys.act, self._act, workers=BATCH_SIZES[-1], depth=DEPTH)
+        transport.serve(keys.act, self._act, workers=_WORKERS, depth=_WORKERS)
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
 
     def health(self) -> dict[str, Any]:
-        """Readiness, version, hand and queue, as JSON."""
+        """Readiness, version, hand, queue, and why a newer policy was refused, as JSON."""
         held = self._held
         return {
             "ready": True,
@@ -77,6 +82,7 @@ class PolicyServer:
             "trajectory_points": held.bundle.task.trajectory_points,
             "queue": len(self._batcher),
             "answered": self._answered,
+            "trouble": self._trouble,
         }
 
     def close(self) -> None:
@@ -88,7 +94,7 @@ class PolicyServer:
     def _act(self, key: str, request: Message) -> Message:
         began = time.monotonic()
         query = self._function.layout.parse(request)
-        timeout = float(request.meta.get("timeout", self._timeout))
+        timeout = self._deadline(request.meta.get("timeout", self._timeout))
         future = self._batcher.submit(query, timeout)
         try:
             answer, held, queued, inferred = future.result(timeout + 1.0)
@@ -105,11 +111,19 @@ class PolicyServer:
         }
         return Message({"action": answer.action, "q_target": answer.q_target, "u_target": answer.u_target}, meta)
 
+    @staticmethod
+    def _deadline(seconds: Any) -> float:
+        if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT:
+            raise CongraspError(
+                f"The query's 'timeout' is {ascii(seconds)[:40]}.", f"It must be seconds, at most {_MAX_TIMEOUT:g}."
+            )
+        return float(seconds)
+
     def _infer(
         self, queries: Sequence[Query], queued: Sequence[float]
     ) -> list[tuple[Answer, _Held, float, float] | Exception]:
         held, began = self._held, time.monotonic()
-        answers = self._function(held.weights, queries)
+        answers = self._function(held.acting, queries)
         spent = time.monotonic() - began
         return [
             answer if isinstance(answer, Exception) else (answer, held, waited, spent)
@@ -121,19 +135,26 @@ class PolicyServer:
         while not self._closed.wait(_FOLLOW_SECONDS):
             try:
                 newer = self._source(self._held.bundle.version)
-                if newer is None:
-                    continue
-                self._held.bundle.spec.require(newer.spec, "that the server was to change to")
-                self._held = _hold(newer)
+                if newer is not None:
+                    self._swap(newer)
             except TransportError:
-                continue
+                continue  # the learner is away; it may come back
             except CongraspError as error:
-                print(f"congrasp: {error}", flush=True)
+                if str(error) != self._trouble:
+                    print(f"congrasp: {error}", flush=True)
+                self._trouble = str(error)
+
+    def _swap(self, newer: PolicyBundle) -> None:
+        old = self._held.bundle
+        old.spec.require(newer.spec, "that the server was to change to")
+        if newer.task != old.task:
+            raise CongraspError("The newer policy was trained on another task.", "Start the server anew to serve it.")
+        self._held = _hold(newer)
+        self._trouble = ""
 
 
 def _hold(bundle: PolicyBundle) -> _Held:
-    acting = bundle.acting
-    return _Held(bundle, content_hash(encode(bundle.to_message())), Weights(acting.params, acting.normalization))
+    return _Held(bundle, content_hash(encode(bundle.to_message())), bundle.acting)
 
 
 def follow_file(path: pathlib.Path) -> Source:
@@ -157,11 +178,7 @@ def follow_run(transport: Transport, run: str) -> Source:
     """A source that pulls the newest policy from a learner."""
 
     def pull(version: int) -> PolicyBundle | None:
-        reply = transport.query(Keys(run).weights, Message({}, {"newer_than": version, "life": life[-1]}), timeout=5.0)
-        if not reply.arrays:
-            life[:] = [str(reply.meta.get("life", ""))]
-            return None
-        return PolicyBundle.from_message(reply, "of the learner")
+        reply = transport.query(Keys(run).weights, Message({}, {"newer_than": version}), timeout=5.0)
+        return PolicyBundle.from_message(reply, "of the learner") if reply.arrays else None
 
-    life = [""]
     return pull

@@ -98,13 +98,16 @@ def train(
     try:
         for child in children:
             child.start()
-        with _connected(endpoint, learner, stop) as transport:
-            _supervise(children, transport, config.name, stop, report, notify)
+        transport = _connected(endpoint, learner, stop)
+        if transport is not None:
+            with transport:
+                _supervise(children, transport, config.name, stop, report, notify)
     finally:
         end_all(children)
 
 
-def _connected(endpoint: str, learner: Child, stop: threading.Event) -> ZenohTransport:
+def _connected(endpoint: str, learner: Child, stop: threading.Event) -> ZenohTransport | None:
+    """A connection to the learner once it listens; None if the run is stopped before."""
     deadline = time.monotonic() + 120.0
     while time.monotonic() < deadline and not stop.is_set():
         try:
@@ -113,7 +116,9 @@ def _connected(endpoint: str, learner: Child, stop: threading.Event) -> ZenohTra
             assert learner.process is not None
             if learner.process.poll() not in (None, 0):
                 break
-    raise CongraspError(f"The learner did not start: {learner.last_words()}")
+    if stop.is_set():
+        return None
+    raise CongraspError(f"The learner did not start: {learner.last_words()}", f"Its log is {learner.log}.")
 
 
 def _supervise(

@@ -22,6 +22,8 @@ class Cell:
     def __init__(self, scene: mujoco.MjModel):
         """A copy of the scene."""
         self.model = copy.copy(scene)
+        # MuJoCo would put a diverged world back by itself, to a pose that is no episode's start, and say nothing.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(self.model)
 
 

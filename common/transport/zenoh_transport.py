@@ -17,7 +17,7 @@ import struct
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import zenoh
@@ -77,14 +77,13 @@ class ZenohTransport:
         self._counts: dict[str, int] = {}
         self._counts_lock = threading.Lock()
         self._declared: list[Any] = []
-        self._sessions: dict[Flow, zenoh.Session] = {}
-        self._threads: list[threading.Thread] = []
-        self._finalizer = weakref.finalize(self, _close, self._sessions, self._threads)
+        self._work = _Work()
+        self._finalizer = weakref.finalize(self, self._work.close)
         deadline = time.monotonic() + wait
         try:
             for name, where in endpoints.items():
                 config = _config(name, where, bool(listen), max_message, extra or {})
-                self._sessions[name] = _listen(config, where) if listen else _connect(config, where, deadline)
+                self._work.sessions[name] = _listen(config, where) if listen else _connect(config, where, deadline)
         except BaseException:
             self.close()
             raise
@@ -96,21 +95,26 @@ class ZenohTransport:
         queryable = self._session(key).declare_queryable(key, FifoChannel(depth))
         self._declared.append(queryable)
         for _ in range(workers):
-            self._start(_serve, queryable.handler, handler, on_damage or (lambda *_: None), self._max_message)
+            self._work.start(_serve, queryable.handler, handler, on_damage or (lambda *_: None), self._max_message)
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
         payload = self._encode(request)
         refusal = None
         try:
-            replies = self._session(key).get(
-                key, FifoChannel(4), payload=payload, timeout=timeout, congestion_control=zenoh.CongestionControl.BLOCK
-            )
-            for reply in replies:
-                if reply.ok:
-                    return decode(reply.ok.payload.to_bytes(), max_bytes=self._max_message)
-                if reply.err:
-                    refusal = reply.err.payload.to_bytes()
+            with self._work.inside():
+                replies = self._session(key).get(
+                    key,
+                    FifoChannel(4),
+                    payload=payload,
+                    timeout=timeout,
+                    congestion_control=zenoh.CongestionControl.BLOCK,
+                )
+                for reply in replies:
+                    if reply.ok:
+                        return decode(reply.ok.payload.to_bytes(), max_bytes=self._max_message)
+                    if reply.err:
+                        refusal = reply.err.payload.to_bytes()
         except zenoh.ZError as error:
             raise TransportError(f"The query for {key} failed: {_first_line(error)}.") from None
         if refusal == b"Timeout":
@@ -126,13 +130,14 @@ class ZenohTransport:
             count = self._counts.get(key, 0)
             self._counts[key] = count + 1
         try:
-            self._session(key).put(
-                key,
-                payload,
-                congestion_control=zenoh.CongestionControl.DROP,
-                express=flow(key) == "control",
-                attachment=_STAMP.pack(self._sender, count),
-            )
+            with self._work.inside():
+                self._session(key).put(
+                    key,
+                    payload,
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    express=flow(key) == "control",
+                    attachment=_STAMP.pack(self._sender, count),
+                )
         except (zenoh.ZError, TransportError):
             if self._finalizer.alive:
                 raise
@@ -147,7 +152,7 @@ class ZenohTransport:
                 subscriber.undeclare()
 
         subscription = Subscription(depth, undeclare)
-        self._start(_listen_to, subscriber.handler, subscription, self._max_message)
+        self._work.start(_listen_to, subscriber.handler, subscription, self._max_message)
         return subscription
 
     def declare_alive(self, key: str) -> None:
@@ -159,7 +164,7 @@ class ZenohTransport:
         liveliness = self._session(key_expression).liveliness()
         subscriber = liveliness.declare_subscriber(key_expression, FifoChannel(_QUEUE), history=True)
         self._declared.append(subscriber)
-        self._start(_watch, subscriber.handler, on_change)
+        self._work.start(_watch, subscriber.handler, on_change)
 
     def close(self) -> None:
         """See `Transport.close`; takes half a second at most."""
@@ -173,15 +178,12 @@ class ZenohTransport:
 
     def _session(self, key: str) -> zenoh.Session:
         name = flow(key)
-        if name not in self._sessions:
+        session = self._work.sessions.get(name)
+        if session is None:
             raise TransportError(
                 f"The transport has no flow for {key}." if self._finalizer.alive else "The transport is closed."
             )
-        return self._sessions[name]
-
-    def _start(self, function: Callable[..., None], *arguments: Any) -> None:
-        self._threads[:] = [thread for thread in self._threads if thread.is_alive()]
-        self._threads.append(_start(function, *arguments))
+        return session
 
     def _encode(self, message: Message) -> bytes:
         payload = encode(message)
@@ -191,6 +193,53 @@ class ZenohTransport:
                 "Send fewer environments or steps in one rollout.",
             )
         return payload
+
+
+class _Work:
+    """The sessions, and the threads that are inside them.
+
+    A thread that is inside Zenoh when the interpreter ends aborts the process, so closing waits for all of them.
+    """
+
+    def __init__(self) -> None:
+        self.sessions: dict[Flow, zenoh.Session] = {}
+        self._threads: list[threading.Thread] = []
+        self._inside = 0
+        self._changed = threading.Condition()
+
+    def start(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Runs a function in a daemon thread of its own; it returns when the sessions are closed."""
+        thread = threading.Thread(target=function, args=arguments, daemon=True, name=f"zenoh-{function.__name__}")
+        thread.start()
+        self._threads = [*(one for one in self._threads if one.is_alive()), thread]
+
+    @contextlib.contextmanager
+    def inside(self) -> Iterator[None]:
+        """Around a call that a thread of the caller makes."""
+        with self._changed:
+            self._inside += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._inside -= 1
+                self._changed.notify_all()
+
+    def close(self) -> None:
+        """Closes the sessions, and waits a moment for the threads."""
+        sessions = list(self.sessions.values())
+        self.sessions.clear()
+        deadline = time.monotonic() + _CLOSE
+        for session in sessions:
+            try:
+                self.start(session.close)
+            except RuntimeError:  # the interpreter is ending and starts no threads
+                session.close()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, deadline - time.monotonic()))
+        with self._changed:
+            self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
 
 def _shifted(endpoint: str, offset: int) -> str:
@@ -258,27 +307,7 @@ def _first_line(error: Exception) -> str:
     return re.split(r" at /|\n", str(error))[0][:200].rstrip(". ")
 
 
-def _close(sessions: dict[Flow, zenoh.Session], threads: list[threading.Thread]) -> None:
-    """Closes the sessions and waits for the threads, which would abort the process if they outlived the interpreter."""
-    for session in sessions.values():
-        try:
-            threads.append(_start(session.close))
-        except RuntimeError:  # the interpreter is ending and starts no threads
-            session.close()
-    sessions.clear()
-    deadline = time.monotonic() + _CLOSE
-    for thread in threads:
-        if thread is not threading.current_thread():
-            thread.join(max(0.0, deadline - time.monotonic()))
-
-
-def _start(function: Callable[..., None], *arguments: Any) -> threading.Thread:
-    thread = threading.Thread(target=function, args=arguments, daemon=True, name=f"zenoh-{function.__name__}")
-    thread.start()
-    return thread
-
-
-def _received(channel: Any) -> Iterable[Any]:
+def _received(channel: Any) -> Iterator[Any]:
     """What comes out of a channel until it is closed."""
     with contextlib.suppress(zenoh.ZError):
         while True:

@@ -10,13 +10,17 @@ import dataclasses
 import functools
 import json
 import math
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from common.errors import CongraspError
+
+try:  # the same checksum, seven times as fast where it is installed
+    from isal.isal_zlib import crc32
+except ImportError:
+    from zlib import crc32
 
 MAX_MESSAGE = 256 << 20
 """Bytes that a message may have unless the caller says otherwise."""
@@ -87,7 +91,7 @@ def _encode(message: Message) -> bytes:
         end = offset + array.nbytes
         header[name] = {"dtype": _NAMES[array.dtype], "shape": array.shape, "data_offsets": [offset, end]}
         parts.append(array.reshape(-1).view(np.uint8).data)
-        crc = zlib.crc32(parts[-1], crc)
+        crc = crc32(parts[-1], crc)
         offset = end
     header["__metadata__"]["crc32"] = f"{crc:08x}"
     text = json.dumps(header, separators=(",", ":")).encode()
@@ -121,7 +125,7 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
     header = _header(data[8 : 8 + length])
     section = memoryview(data)[8 + length :]
     meta, crc = _metadata(header.pop("__metadata__", None))
-    if zlib.crc32(section) != crc:
+    if crc32(section) != crc:
         raise CongraspError("The message's data do not match their checksum.")
     return Message(_arrays(header, section), meta)
 

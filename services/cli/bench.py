@@ -24,30 +24,22 @@ def query(repeat: int = 1000, concurrency: int = 1) -> int:
       concurrency: Clients at the same time.
     """
     import pathlib
-    import subprocess
-    import sys
     import tempfile
 
     from common.policy import bundle as bundles
-    from services.load import example_episode, measure
+    from services.client import PolicyClient
+    from services.load import example_episode, measure, serving, wait_until_ready
     from services.presets import get_preset
     from services.quickstart import untrained
-    from services.train import free_port
 
     with tempfile.TemporaryDirectory() as folder:
         policy = pathlib.Path(folder, "policy.safetensors")
         bundles.save(untrained(get_preset("quickstart")), policy)
-        endpoint = f"tcp/127.0.0.1:{free_port()}"
-        command = [sys.executable, "-m", "services.cli.main", "serve", "--policy", str(policy), "--listen", endpoint]
-        server = subprocess.Popen(command, stdout=subprocess.PIPE)
-        try:
+        with serving(policy, pathlib.Path(folder, "serve.log")) as endpoint:
             episode = example_episode(1_000_000)
-            assert server.stdout is not None
-            server.stdout.readline()
+            with PolicyClient(endpoint, wait=60.0) as client:
+                wait_until_ready(client)
             result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0)
-        finally:
-            server.terminate()
-            server.wait(10)
     print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
     return 0
 

@@ -1,6 +1,6 @@
 """`congrasp query`: one query of a policy server, or a latency test."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -27,10 +27,15 @@ def query(
     """
     import json as json_module
 
-    from services.load import example_episode, measure
+    from common.errors import CongraspError
+    from services.client import PolicyClient
+    from services.load import example_episode, measure, one_answer
 
+    if repeat < 1 or concurrency < 1:
+        raise CongraspError(f"--repeat {repeat} and --concurrency {concurrency} must be at least 1.")
     if repeat == 1 and not json:
-        _print_one(connect, name, example_episode(object_seed), timeout)
+        with PolicyClient(connect, name, timeout=timeout) as client:
+            print(one_answer(client, example_episode(object_seed)))
         return 0
     result = measure(connect, name, example_episode(object_seed), repeat, concurrency, timeout)
     if json:
@@ -42,23 +47,6 @@ def query(
         lost = f"{result['failed']:.0f} failed, {result['overloaded']:.0f} overloaded"
         print(f"{repeat} queries from {concurrency} client(s): {latency}, {lost}")
     return 0 if result["failed"] == 0 else 1
-
-
-def _print_one(connect: str, name: str, episode: dict[str, Any], timeout: float) -> None:
-    import numpy as np
-
-    from services.client import PolicyClient
-
-    with PolicyClient(connect, name, timeout=timeout) as client:
-        client.reset(**episode["reset"])
-        answer = client.act(episode["state"])
-    with np.printoptions(precision=3, suppress=True):
-        print(f"object       {episode['object']}, constraints: {', '.join(episode['reset']['constraints'])}")
-        print(f"active       {' '.join(answer.active)}")
-        print(f"q_target     {answer.q_target} rad")
-        print(f"u_target     {answer.u_target} m, rad")
-        print(f"version      {answer.version}")
-        print(f"timing       {answer.round_trip_ms:.2f} ms round trip, {answer.server_ms:.2f} ms in the server")
 
 
 COMMAND = query

@@ -31,7 +31,7 @@ def serve(
     with on_signal() as stop:
         upstream = ZenohTransport(connect=[connect]) if connect else None
         source = follow_run(upstream, run) if upstream else follow_file(pathlib.Path(policy or ""))
-        with ZenohTransport(listen=[listen]) as transport:
+        with ZenohTransport(listen=[listen], flows=("policy",)) as transport:
             server = PolicyServer(transport, name, source)
             health = server.health()
             print(f"serving '{name}' at {listen}: hand {health['hand']}, version {health['version']}", flush=True)

@@ -89,17 +89,13 @@ def test_rollouts_go_through_whole_episodes_and_on(taskset):
     terms = sum(values for name, values in episodes.items() if name.startswith("term/"))
     np.testing.assert_allclose(terms, episodes["episode/return"], rtol=1e-3, atol=1e-2)
     assert np.all(episodes["episode/length"] == 75)
+    # The table goes after fifty steps.
+    np.testing.assert_array_equal(first.trace.table, np.arange(1, 76) < TASK.approach_steps)
     second = worker.collect(None, 30)
     assert not np.asarray(second.terminal).any() and not len(finished_episodes(second)["episode/return"])
     # The first observation of a rollout is the last one of the rollout before.
     np.testing.assert_array_equal(second.observation[0], first.last_observation)
     worker.physics.close()
-
-
-def test_the_table_goes_after_fifty_steps(taskset):
-    worker = _worker(taskset, batch=2)
-    trace = worker.collect(None, 75).trace
-    np.testing.assert_array_equal(trace.table, np.arange(1, 76) < TASK.approach_steps)
 
 
 def test_success_needs_the_object_to_stay_up(taskset):

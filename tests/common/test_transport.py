@@ -356,7 +356,7 @@ def test_peer_that_comes_back_is_found_again():
 
 
 BUSY_PROCESS = """
-    import sys, time
+    import contextlib, sys, threading, time
     from common.transport.keys import Keys
     from common.transport.zenoh_transport import ZenohTransport
     from common.wire.codec import Message
@@ -369,6 +369,12 @@ BUSY_PROCESS = """
     subscription = server.subscribe(keys.logs, depth=1)
     client.publish(keys.log("event", "actor", "a"), Message())
     client.query(keys.act, Message(), timeout=5)
+    def ask():
+        while True:
+            with contextlib.suppress(Exception):
+                client.query(keys.act, Message(), timeout=5)
+    for _ in range(3):
+        threading.Thread(target=ask, daemon=True).start()
     print("ready", flush=True)
     {end}
 """

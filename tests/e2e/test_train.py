@@ -1,0 +1,93 @@
+"""A whole small run of real processes over Zenoh, with an actor and the learner killed in the middle."""
+
+import json
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import psutil
+import pytest
+
+from common.logs.reader import read_episodes, read_metrics
+from common.policy import bundle as bundles
+
+pytestmark = pytest.mark.timeout(600)
+UPDATES = 40
+SMALL = [
+    *("--updates", str(UPDATES), "--environments", "4", "--rollout-steps", "75", "--checkpoint-every", "3"),
+    *("--episode-every", "1", "--objects.count", "2", "--objects.families", "box", "--network.hidden", "32"),
+    *("--network.encoder", "8", "--ppo.epochs", "1", "--ppo.minibatches", "2", "--evaluation", "0"),
+]
+
+
+def _eventually(condition: Callable[[], bool], seconds: float, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, f"the run ended early: {process.communicate()[0]}"
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.1)
+
+
+def _children(process: subprocess.Popen[str], role: str) -> list[psutil.Process]:
+    return [child for child in psutil.Process(process.pid).children() if role in child.cmdline()]
+
+
+def _version(run_dir: pathlib.Path) -> int:
+    try:
+        return int((run_dir / "version").read_text())
+    except (OSError, ValueError):
+        return -1
+
+
+def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path):
+    run_dir = tmp_path / "run"
+    command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(run_dir), *SMALL]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        _eventually(lambda: _version(run_dir) >= 4, 300, process)
+        actors = _children(process, "actor")
+        assert len(actors) == 2
+        victim = actors[0]
+        victim.send_signal(signal.SIGKILL)
+        reached = _version(run_dir)
+        _eventually(lambda: _version(run_dir) >= reached + 3, 60, process)  # the run goes on
+        _eventually(lambda: len(_children(process, "actor")) == 2, 60, process)  # and the actor is replaced
+        survivors = {child.pid for child in _children(process, "actor")}
+        (learner,) = _children(process, "learner")
+        learner.send_signal(signal.SIGKILL)
+        reached = _version(run_dir)
+        _eventually(lambda: _version(run_dir) >= reached + 3, 120, process)  # resumed, with rising versions
+        assert {child.pid for child in _children(process, "actor")} == survivors  # which did not have to restart
+        output, _ = process.communicate(timeout=300)
+    finally:
+        if process.poll() is None:
+            process.kill()
+    assert process.returncode == 0, output
+    assert "actor-0 died" in output or "actor-1 died" in output
+    assert "learner died" in output
+    policy = bundles.load(run_dir / "policy.safetensors")
+    assert policy.transitions == UPDATES * 2 * 4 * 75
+    metrics = read_metrics(run_dir)
+    assert any(name.endswith("episode/return") for name in metrics)
+    assert next(read_episodes(run_dir)).meta["hand"] == "human"
+    assert json.loads((run_dir / "config.json").read_text())["updates"] == UPDATES
+
+
+def test_ctrl_c_drains_within_seconds_and_leaves_nobody_behind(tmp_path):
+    run_dir = tmp_path / "run"
+    command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(run_dir), *SMALL]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        _eventually(lambda: len(_children(process, "actor")) == 2, 60, process)
+        family = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+    finally:
+        if process.poll() is None:
+            process.kill()
+    assert process.returncode == 130
+    _, alive = psutil.wait_procs(family, timeout=5)
+    assert not alive

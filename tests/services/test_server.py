@@ -1,0 +1,99 @@
+"""The live policy: answers, refusals in words, and swaps of weights, over both ends of the real wire."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+import pytest
+
+from common.config import NetworkConfig
+from common.errors import CongraspError, TransportError
+from common.policy import bundle as bundles
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message
+from services.client import PolicyClient
+from services.load import example_episode, measure
+from services.presets import get_preset
+from services.quickstart import untrained
+from services.server import PolicyServer, follow_file
+from services.train import free_port
+
+pytestmark = pytest.mark.timeout(300)
+CONFIG = dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    """A server over Zenoh that follows a policy file, and the start of an episode."""
+    path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
+    bundles.save(untrained(CONFIG), path)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ZenohTransport(listen=[endpoint], flows=("policy",)) as transport:
+        server = PolicyServer(transport, "policy", follow_file(path))
+        yield path, endpoint, example_episode(1_000_000)
+        server.close()
+
+
+def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
+    _, endpoint, episode = served
+    with PolicyClient(endpoint) as client:
+        client.reset(**episode["reset"])
+        first, second = (client.act(episode["state"]) for _ in range(2))
+        assert client.health()["ready"] and client.health()["hand"] == "human"
+    assert first.q_target.shape == (20,) and first.u_target.shape == (6,) and first.action.shape == (26,)
+    assert first.version == 0 and first.active == ("The heading guides the wrist.",)
+    # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the limits.
+    expected = first.q_target + 0.1 * second.action[:20]
+    np.testing.assert_allclose(second.q_target[3:7], expected[3:7], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"constraints": ["levitation"]}, "no constraint 'levitation'"),
+        ({"constraints": ["affordance"]}, "neither a heading"),
+        ({"constraints": ["pose"]}, "lacks the field 'pose_q'"),
+        ({"heading_direction": np.array([0.0, 0.0, 2.0])}, "not 1"),
+        ({"heading_position": np.array([np.nan, 0.0, 0.0])}, "not finite"),
+        ({"surface": np.zeros((5, 2))}, "surface_points"),
+        ({"q": np.zeros(7)}, "shape"),
+    ],
+)
+def test_bad_queries_are_refused_in_words_and_nobody_else_suffers(served, change, words):
+    _, endpoint, episode = served
+    with PolicyClient(endpoint) as client:
+        client.reset(**{**episode["reset"], **change})
+        with pytest.raises(TransportError, match=words):
+            client.act(episode["state"])
+        client.reset(**episode["reset"])
+        assert client.act(episode["state"]).version == 0
+
+
+def test_many_clients_and_a_swap_of_weights_without_a_failed_query(served):
+    path, endpoint, episode = served
+    newer = dataclasses.replace(untrained(CONFIG), version=7)
+    bundles.save(newer, path)
+    result = measure(endpoint, "policy", episode, repeat=200, concurrency=4, timeout=5.0)
+    assert result["failed"] == 0 and result["overloaded"] == 0
+    with PolicyClient(endpoint) as client:
+        for _ in range(100):
+            client.reset(**episode["reset"])
+            if client.act(episode["state"]).version == 7:
+                return
+    raise AssertionError("the server never took the newer policy")
+
+
+def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: pathlib.Path):
+    with MemoryTransport(MemoryHub()) as transport:
+        with pytest.raises(CongraspError, match="cannot be read"):
+            PolicyServer(transport, "p", follow_file(tmp_path / "none.safetensors"))
+        broken = tmp_path / "broken.safetensors"
+        broken.write_bytes(b"PK\x03\x04 not a policy")
+        with pytest.raises(CongraspError, match="damaged"):
+            PolicyServer(transport, "p", follow_file(broken))
+        with pytest.raises(CongraspError, match="no policy to serve"):
+            PolicyServer(transport, "p", lambda version: None)
+        with pytest.raises(TransportError):
+            transport.query(Keys("p").health, Message({}, {}), timeout=0.5)
