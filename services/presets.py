@@ -9,7 +9,7 @@ PRESETS = {
     "quickstart": RunConfig(
         name="quickstart",
         environments=64,
-        updates=100,
+        updates=50,
         physics="native",
         task=TaskConfig(headings="above", p_affordance=0.0, p_pose=0.0, p_trajectory=0.0),
         objects=ObjectsConfig(count=16),

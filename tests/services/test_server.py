@@ -1,7 +1,11 @@
 """The live policy: answers, refusals in words, and swaps of weights, over both ends of the real wire."""
 
+import concurrent.futures
+import contextlib
 import dataclasses
 import pathlib
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -14,10 +18,11 @@ from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 from services.client import PolicyClient
+from services.inference import PolicyFunction
 from services.load import example_episode, measure
 from services.presets import get_preset
 from services.quickstart import untrained
-from services.server import PolicyServer, follow_file
+from services.server import DEPTH, PolicyServer, follow_file, follow_run
 from services.train import free_port
 
 pytestmark = pytest.mark.timeout(300)
@@ -83,6 +88,81 @@ def test_many_clients_and_a_swap_of_weights_without_a_failed_query(served):
             if client.act(episode["state"]).version == 7:
                 return
     raise AssertionError("the server never took the newer policy")
+
+
+def test_a_client_of_another_hand_is_refused(served):
+    _, endpoint, episode = served
+    with PolicyClient(endpoint, hand="paw") as client:
+        client.reset(**episode["reset"])
+        with pytest.raises(TransportError, match="no hand 'paw'"):
+            client.act(episode["state"])
+
+
+def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, monkeypatch):
+    _, endpoint, episode = served
+    entered, go = threading.Semaphore(0), threading.Event()
+    infer = PolicyFunction.__call__
+
+    def hold(self, weights, queries):
+        entered.release()
+        assert go.wait(60)
+        return infer(self, weights, queries)
+
+    monkeypatch.setattr(PolicyFunction, "__call__", hold)
+
+    def ask(client: PolicyClient) -> int:
+        client.reset(**episode["reset"])
+        return client.act(episode["state"]).version
+
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(PolicyClient(endpoint, timeout=50.0)) for _ in range(DEPTH + 2)]
+        pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(len(clients)))
+        stack.callback(go.set)
+        asked = [pool.submit(ask, clients[0])]
+        assert entered.acquire(timeout=60)
+        asked += [pool.submit(ask, client) for client in clients[1:-1]]
+        deadline = time.monotonic() + 60
+        while clients[-1].health()["queue"] < DEPTH:
+            assert time.monotonic() < deadline, "the queue never filled"
+            time.sleep(0.01)
+        with pytest.raises(TransportError, match="Overloaded"):
+            ask(clients[-1])
+        assert not any(future.done() for future in asked)
+        go.set()
+        assert len({future.result(60) for future in asked}) == 1
+
+
+def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(served):
+    path, endpoint, _ = served
+    with PolicyClient(endpoint) as client:
+        version = client.health()["version"]
+        for other, words in (
+            (dataclasses.replace(CONFIG.task, dynamic_center=False), "another task"),
+            (dataclasses.replace(CONFIG.task, trajectory_points=3), "is needed"),
+        ):
+            policy = untrained(dataclasses.replace(CONFIG, task=other))
+            bundles.save(dataclasses.replace(policy, version=99), path)
+            deadline = time.monotonic() + 60
+            while words not in client.health()["trouble"]:
+                assert time.monotonic() < deadline, client.health()
+                time.sleep(0.05)
+            assert client.health()["version"] == version
+
+
+def test_following_a_run_pulls_only_what_is_newer():
+    keys, policy = Keys("r"), untrained(CONFIG)
+    with MemoryTransport(MemoryHub()) as transport:
+        pull = follow_run(transport, "r")
+        with pytest.raises(TransportError):
+            pull(-1)
+
+        def weights(key: str, request: Message) -> Message:
+            current = request.meta["newer_than"] == policy.version
+            return Message({}, {"version": policy.version}) if current else policy.to_message()
+
+        transport.serve(keys.weights, weights)
+        assert pull(-1).version == policy.version
+        assert pull(policy.version) is None
 
 
 def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: pathlib.Path):

@@ -1,0 +1,101 @@
+"""The thin client against a server of canned answers: what it sends, remembers, and survives."""
+
+import time
+
+import numpy as np
+import pytest
+
+from common.errors import TransportError
+from common.transport.keys import Keys
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message
+from services.client import PolicyClient
+
+RESET = {
+    "q": np.full(20, 0.1),
+    "wrist": (np.array([0.0, 0.0, 0.3]), np.array([1.0, 0.0, 0.0, 0.0])),
+    "obj": (np.array([0.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.0, 0.0])),
+    "surface": np.zeros((4, 3)),
+    "heading_position": np.zeros(3),
+    "heading_direction": np.array([0.0, 0.0, -1.0]),
+}
+STATE = {
+    "q": np.full(20, 0.2),
+    "u": np.zeros(6),
+    "object_position": RESET["obj"][0],
+    "object_quaternion": RESET["obj"][1],
+}
+
+
+class CannedServer:
+    """Answers the n-th query with targets of value n, and keeps the requests."""
+
+    def __init__(self, endpoint: str):
+        self.requests: list[Message] = []
+        self.transport = ZenohTransport(listen=[endpoint], flows=("policy",))
+        self.transport.serve(Keys("policy").act, self._act)
+        self.transport.serve(Keys("policy").health, lambda key, request: Message({}, {"ready": True}))
+
+    def _act(self, key: str, request: Message) -> Message:
+        self.requests.append(request)
+        n = np.float32(len(self.requests))
+        targets = {"q_target": np.full(20, n), "u_target": np.full(6, -n), "action": np.zeros(26, np.float32)}
+        return Message(targets, {"version": 3, "active": ["words"], "total_ms": 0.5})
+
+    def close(self) -> None:
+        self.transport.close()
+
+
+@pytest.fixture
+def endpoint(free_port):
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+def test_the_client_remembers_the_episode_and_the_previous_targets(endpoint):
+    server = CannedServer(endpoint)
+    with PolicyClient(endpoint) as client:
+        client.reset(**RESET)
+        answer = client.act(STATE)
+        client.act({**STATE, "table": False})
+        client.reset(**RESET)
+        client.act(STATE)
+    server.close()
+    first, second, third = (request.arrays for request in server.requests)
+    assert answer.version == 3 and answer.active == ("words",) and answer.server_ms == 0.5
+    np.testing.assert_array_equal(answer.u_target, np.full(6, -1.0))
+    np.testing.assert_allclose(first["q_target"], RESET["q"], rtol=1e-6)
+    np.testing.assert_array_equal(second["q_target"], np.full(20, 1.0))
+    np.testing.assert_array_equal(second["u_target"], np.full(6, -1.0))
+    np.testing.assert_allclose(third["q_target"], RESET["q"], rtol=1e-6)
+    assert [float(arrays["time"]) for arrays in (first, second, third)] == [0.0, 1.0, 0.0]
+    assert [bool(arrays["table"]) for arrays in (first, second, third)] == [True, False, True]
+    np.testing.assert_allclose(second["q_initial"], RESET["q"], rtol=1e-6)
+    assert server.requests[0].meta["hand"] == "human"
+
+
+def test_the_client_finds_a_server_again_that_was_started_anew(endpoint):
+    server = CannedServer(endpoint)
+    with PolicyClient(endpoint) as client:
+        client.reset(**RESET)
+        client.act(STATE)
+        server.close()
+        with pytest.raises(TransportError):
+            client.act(STATE)
+        server = CannedServer(endpoint)
+        deadline = time.monotonic() + 30
+        while True:
+            try:
+                client.act(STATE)
+                break
+            except TransportError:
+                assert time.monotonic() < deadline, "the client did not come back"
+                time.sleep(0.1)
+        # The failed query moved neither the clock nor the targets of the episode.
+        assert float(server.requests[0].arrays["time"]) == 1.0
+        np.testing.assert_array_equal(server.requests[0].arrays["q_target"], np.full(20, 1.0))
+    server.close()
+
+
+def test_nobody_there_is_said_in_one_line(endpoint):
+    with pytest.raises(TransportError, match="Nobody answers at"):
+        PolicyClient(endpoint, wait=0.5)
