@@ -14,7 +14,7 @@ import numpy as np
 
 from actors import environment
 from actors.environment import EPISODE_FIELDS, EnvironmentState
-from actors.physics.engine import Physics
+from actors.physics.engine import Physics, Readout
 from actors.taskset import TaskSet
 from common.config import TaskConfig
 from common.hands.spec import Hand
@@ -106,7 +106,7 @@ class RolloutWorker:
         )(taskset, episode_key)
         self.state = physics.start(self.env.world)
         self._act_jit = jax.jit(self._act)
-        self._score_jit = jax.jit(functools.partial(environment.score, hand, task))
+        self._score_jit = jax.jit(self._score)
         self._restart_jit = jax.jit(functools.partial(environment.restart, hand, task))
         self._moment_jit = jax.jit(functools.partial(environment.moment, hand, task))
         self._observe_jit = jax.jit(lambda scene, seen, goal: observe(task, scene, seen, goal).astype(self._dtype))
@@ -122,34 +122,38 @@ class RolloutWorker:
 
     def _act(
         self, parameters: Any, control: Any, env: EnvironmentState, scene: SceneState, seen: Features, key: Array
-    ) -> tuple[Array, Array, Array, Action, Array]:
+    ) -> tuple[Array, Array, Array, Action, Array, Array]:
         observation = observe(self._task, scene, seen, env.goal).astype(self._dtype)
         action, log_probability = self._policy(parameters, observation.astype(jnp.float32), key)
         target = decode(self._hand, control, scene, seen, env.goal, action)
         joints = jnp.concatenate([target.u_target, target.q_target], -1)
-        return observation, action, log_probability, target, joints
+        return observation, action, log_probability, target, joints, environment.table_present(env, self._task)
+
+    def _score(
+        self, weights: Any, env: EnvironmentState, readout: Readout, target: Action, action: Array
+    ) -> tuple[EnvironmentState, environment.Score, SceneState, Features, Trace]:
+        env, score, scene, seen = environment.score(self._hand, self._task, weights, env, readout, target)
+        return env, score, scene, seen, _trace(scene, seen, action, score)
 
     def _collect_stepwise(self, parameters: Any, key: Array, steps: int) -> Rollout:
         scene, seen = self._moment
         rows, traces = [], []
         for step_key in jax.random.split(key, steps):
             env = self.env
-            observation, action, log_probability, target, joints = self._act_jit(
+            observation, action, log_probability, target, joints, table = self._act_jit(
                 parameters, self._control, env, scene, seen, step_key
             )
-            self.state, readout = self.physics.step(
-                self.state, np.asarray(joints), np.asarray(environment.table_present(env, self._task))
-            )
-            self.env, score, scene, seen = self._score_jit(self._weights, env, readout, target)
+            self.state, readout = self.physics.step(self.state, np.asarray(joints), np.asarray(table))
+            self.env, score, scene, seen, trace = self._score_jit(self._weights, env, readout, target, action)
             rows.append((observation, action, log_probability, score.reward, score.terminal))
-            traces.append((scene, seen, action, score))
+            traces.append(trace)
             if bool(np.any(score.terminal)):
                 self.env = self._restart_jit(self._taskset, self.env, score.terminal)
                 self.state = self.physics.reset(self.state, score.terminal, self.env.world)
                 scene, seen = self._moment_jit(self.env, self.physics.read(self.state))
         self._moment = scene, seen
         columns = [np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)]
-        trace = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *(_trace(*t) for t in traces))
+        trace = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(traces))
         last = self._observe_jit(scene, seen, self.env.goal)
         return Rollout(*(*columns, last, self.env.finished, self.env.has_finished, trace))
 
@@ -168,12 +172,11 @@ class RolloutWorker:
 
         def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
             env, state, (scene, seen) = carry
-            observation, action, log_probability, target, joints = self._act(
+            observation, action, log_probability, target, joints, table = self._act(
                 parameters, control, env, scene, seen, step_key
             )
-            state, readout = physics.step(state, joints, environment.table_present(env, self._task))
-            env, score, scene, seen = environment.score(self._hand, self._task, weights, env, readout, target)
-            kept = _trace(scene, seen, action, score)
+            state, readout = physics.step(state, joints, table)
+            env, score, scene, seen, kept = self._score(weights, env, readout, target, action)
 
             def renew(operand: Any) -> Any:
                 env, state, _ = operand
@@ -191,8 +194,7 @@ class RolloutWorker:
 
 
 def _trace(scene: SceneState, seen: Features, action: Array, score: environment.Score) -> Trace:
-    contact = jnp if isinstance(scene.contact_force, jax.core.Tracer) else np
-    force = contact.sum(contact.where(scene.contact_found[0][..., None], scene.contact_force[0], 0.0), -2)
+    force = jnp.sum(jnp.where(scene.contact_found[0][..., None], scene.contact_force[0], 0.0), -2)
     return Trace(
         q=scene.q[0],
         u=scene.u[0],

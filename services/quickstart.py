@@ -2,9 +2,10 @@
 
 import os
 import pathlib
+import shutil
 import sys
 import time
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from rich.console import Console
@@ -27,6 +28,7 @@ from services.train import train, train_in_process
 
 _EVALUATION_OBJECTS = 12
 _SEEDS = 3
+_LINE_SECONDS = 10.0
 console = Console(highlight=False)
 
 
@@ -45,29 +47,38 @@ def run_training(
         if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / "config.json").exists():
             raise CongraspError(f"{run_dir} is not empty and is no run.", "Choose another --run-dir.")
         create_run(run_dir, config)
-    steps = config.rollout_steps * config.environments * config.ppo.rollouts_per_update
     console.print(
-        f"[bold]{config.name}[/]: {config.updates} updates of {steps} steps, "
-        f"{1 if in_process else actors} actor(s) with {config.environments} hands each on '{physics}' in {run_dir}"
+        f"[bold]{config.name}[/]: {config.updates} updates of {_steps_per_update(config)} steps, "
+        f"{1 if in_process else actors} actor(s) with {config.environments} hands each on '{physics}' in {run_dir}",
+        soft_wrap=True,
     )
     with on_signal() as stop:
         before = _evaluate(untrained(config), config, evaluation, "before training") if evaluation else []
         began = time.monotonic()
-        if in_process:
-            train_in_process(run_dir, config, physics=physics, stop=stop, resume=resume, on_update=_show_update(config))
-        else:
-            progress = _Progress(config)
-            train(
-                run_dir,
-                config,
-                actors=actors,
-                physics=physics,
-                stop=stop,
-                report=progress.show,
-                notify=lambda text: console.print(f"  [yellow]{text}[/]"),
-            )
+        with _Progress(config) as progress:
+            if in_process:
+                train_in_process(
+                    run_dir,
+                    config,
+                    physics=physics,
+                    stop=stop,
+                    resume=resume,
+                    on_update=lambda values: progress.show(
+                        {"values": values, "actors": 1, "version": int(values["version"])}
+                    ),
+                )
+            else:
+                train(
+                    run_dir,
+                    config,
+                    actors=actors,
+                    physics=physics,
+                    stop=stop,
+                    report=progress.show,
+                    notify=lambda text: console.print(f"  [yellow]{text}[/]", soft_wrap=True),
+                )
         if stop.is_set():
-            console.print(f"Stopped. Go on with: congrasp train --resume --run-dir {run_dir}")
+            console.print(f"Stopped. Go on with: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
             return stop.exit_code
         console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
         policy = bundles.load(run_dir / POLICY_FILE)
@@ -88,51 +99,60 @@ def untrained(config: RunConfig) -> PolicyBundle:
 
 
 class _Progress:
-    """One line about every ten seconds, or a live line on a terminal."""
+    """One line that is rewritten on a terminal; elsewhere a line about every ten seconds."""
 
     def __init__(self, config: RunConfig):
         self._config = config
+        self._began = time.monotonic()
         self._last = 0.0
         self._first: tuple[float, float] | None = None
+        self._line = ""
+        self._live = console.status("compiling, and filling the first batch") if console.is_terminal else None
+
+    def __enter__(self) -> Self:
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._live:
+            self._live.stop()
+            console.print(f"  {self._line}", soft_wrap=True)
 
     def show(self, status: dict[str, Any]) -> None:
-        """Shows the learner's newest metrics."""
-        progress = status.get("values", {})
+        """Shows the learner's newest metrics, if there are any yet, and the number of actors."""
         now = time.monotonic()
-        interval = 2.0 if sys.stdout.isatty() else 10.0
-        if now - self._last < interval:
-            return
-        self._last = now
-        alive = status["actors"]
-        if "transitions" not in progress:
-            if self._first is None:
-                console.print(f"  compiling, and filling the first batch; {alive} actor(s)", style="dim")
-            else:
-                self._last = 0.0
-            return
-        update = progress["transitions"] / (
-            self._config.rollout_steps * self._config.environments * self._config.ppo.rollouts_per_update
-        )
+        if "transitions" in status.get("values", {}):
+            self._line = self._progress(status, now)
+        elif self._first is None:
+            self._line = (
+                f"compiling, and filling the first batch: {now - self._began:.0f} s, {status['actors']} actor(s)"
+            )
+        if self._live:
+            self._live.update(self._line)
+        elif now - self._last >= _LINE_SECONDS:
+            self._last = now
+            console.print(f"  {self._line}", soft_wrap=True)
+
+    def _progress(self, status: dict[str, Any], now: float) -> str:
+        """One line of numbers; the time left counts from the first update, so that compiling is not part of it."""
+        values, updates = status["values"], self._config.updates
+        update = values["transitions"] / _steps_per_update(self._config)
         self._first = self._first or (now, update)
         pace = (update - self._first[1]) / max(now - self._first[0], 1e-6)
-        left = (self._config.updates - update) / pace if pace > 0 else float("nan")
-        console.print(
-            f"  update {update:4.0f}/{self._config.updates}  {progress['steps_per_second']:6.0f} steps/s  "
-            f"version {status['version']}  lag {progress.get('staleness_mean', 0.0):.1f}  "
-            f"success {100 * progress.get('episode/success', float('nan')):5.1f} %  "
-            f"links {progress.get('episode/links_at_removal', float('nan')):4.1f}  "
-            f"return {progress.get('episode/return', float('nan')):6.1f}  actors {alive}  "
+        left = (updates - update) / pace if pace > 0 else float("nan")
+        return (
+            f"update {update:4.0f}/{updates}  {values['steps_per_second']:6.0f} steps/s  "
+            f"version {status['version']}  lag {values.get('staleness_mean', 0.0):.1f}  "
+            f"success {100 * values.get('episode/success', float('nan')):5.1f} %  "
+            f"links {values.get('episode/links_at_removal', float('nan')):4.1f}  "
+            f"return {values.get('episode/return', float('nan')):6.1f}  actors {status['actors']}  "
             f"left {_minutes(left)}"
         )
 
 
-def _show_update(config: RunConfig) -> Any:
-    progress = _Progress(config)
-
-    def show(values: dict[str, float]) -> None:
-        progress.show({"values": values, "actors": 1, "version": int(values["version"])})
-
-    return show
+def _steps_per_update(config: RunConfig) -> int:
+    return config.rollout_steps * config.environments * config.ppo.rollouts_per_update
 
 
 def _minutes(seconds: float) -> str:
@@ -167,7 +187,8 @@ def _compare(before: list[Row], after: list[Row]) -> None:
         clear = abs(new.mean() - old.mean()) > old.std(ddof=1) + new.std(ddof=1)
         console.print(
             f"  {label:28s} {old.mean():7.2f} ± {old.std(ddof=1):5.2f}  ->  {new.mean():7.2f} ± {new.std(ddof=1):5.2f}"
-            f"   {'better than the noise' if clear and new.mean() > old.mean() else 'within the noise, or worse'}"
+            f"   {'better than the noise' if clear and new.mean() > old.mean() else 'within the noise, or worse'}",
+            soft_wrap=True,
         )
 
 
@@ -178,7 +199,7 @@ def _live_query(run_dir: pathlib.Path) -> None:
         episode = example_episode(HELD_OUT_SEED)
         with PolicyClient(endpoint, wait=60.0, timeout=5.0) as client:
             wait_until_ready(client)
-            console.print(one_answer(client, episode), markup=False)
+            console.print(one_answer(client, episode), markup=False, soft_wrap=True)
 
 
 def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> None:
@@ -188,10 +209,20 @@ def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> 
 
 
 def _next_steps(run_dir: pathlib.Path, picture: bool) -> None:
+    congrasp = _command()
+    rows = [(str(run_dir / "episode.png"), "an episode of the trained policy")] if picture else []
+    rows += [
+        (f"{congrasp} plot {run_dir}", "learning curves and reward terms"),
+        (f"{run_dir / LOGS}/*.mcap", "open in Foxglove or Rerun: plots, hand and object in 3-D"),
+        (f"{congrasp} evaluate --policy {run_dir / POLICY_FILE}", "the paper's protocol"),
+        (f"{congrasp} train --resume --run-dir {run_dir}", "go on training"),
+    ]
     console.print("\n[bold]What to look at next[/]")
-    if picture:
-        console.print(f"  {run_dir / 'episode.png'}: an episode of the trained policy")
-    console.print(f"  congrasp plot {run_dir}: learning curves and reward terms")
-    console.print(f"  {run_dir / 'logs'}/*.mcap: open in Foxglove or Rerun, hand and object in 3-D")
-    console.print(f"  congrasp evaluate --policy {run_dir / POLICY_FILE}: the paper's protocol")
-    console.print(f"  congrasp train --resume --run-dir {run_dir}: go on training")
+    for what, why in rows:
+        console.print(f"  {what}\n      {why}", soft_wrap=True)
+
+
+def _command() -> str:
+    """How to call the command line from here."""
+    script = pathlib.Path(sys.executable).with_name("congrasp")
+    return "congrasp" if shutil.which("congrasp") or not script.exists() else os.path.relpath(script)
