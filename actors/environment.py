@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from actors.physics.engine import Readout, World
+from actors.references import MAX_HEADING_M, MAX_HEADING_RAD, Grasps
 from actors.taskset import TaskSet
 from common import rotations
 from common.config import RewardWeights, TaskConfig
@@ -17,7 +18,7 @@ from common.hands import kinematics
 from common.hands.spec import Hand
 from common.task.control import heading_wrist_pose
 from common.task.features import Features, features
-from common.task.metrics import errors
+from common.task.metrics import Errors, errors
 from common.task.reward import TERMS, fallen, reward_terms
 from common.task.types import MASKS, Action, Array, Goal, SceneState, Surface
 
@@ -54,6 +55,8 @@ class EnvironmentState(NamedTuple):
     """Active constraints."""
     surface: Surface
     """Surface points of the worlds' objects."""
+    variant: Array
+    """(B,) int: the variant of the task set that the episodes were drawn from."""
     time: Array
     """(B,) control steps since the episode began."""
     hold: Array
@@ -76,6 +79,8 @@ class EnvironmentState(NamedTuple):
     """Sums (B,) over the episode."""
     terms: Array
     """(B, terms) sums of the reward's terms over the episode."""
+    grasps: Grasps
+    """Grasps of successful episodes under a heading alone."""
     finished: Array
     """(B, fields) metrics of the episode that ended last, in the order of `EPISODE_FIELDS`."""
     has_finished: Array
@@ -121,24 +126,23 @@ def scene_state(env: EnvironmentState, readout: Readout, task: TaskConfig) -> Sc
 
 def table_present(env: EnvironmentState, task: TaskConfig) -> Array:
     """(B,) bool: whether the table stands in the coming control step."""
-    return (env.time < task.approach_steps) | task.stationary_object
+    return (env.time < task.approach_steps) | env.world.stationary
 
 
-def start(hand: Hand, task: TaskConfig, taskset: TaskSet, key: Array, batch: int) -> EnvironmentState:
-    """Fresh episodes in every world."""
+def start(
+    hand: Hand, task: TaskConfig, taskset: TaskSet, key: Array, batch: int, stationary: Array | bool = False
+) -> EnvironmentState:
+    """Fresh episodes in every world; `stationary` () bool holds the objects in place (the paper's first phase)."""
     key, episode_key = jax.random.split(key)
-    world, goal, surface, hold = sample_episodes(hand, task, taskset, episode_key, batch)
-    return _fresh(key, world, goal, surface, hold, batch)
-
-
-def _fresh(key: Array, world: World, goal: Goal, surface: Surface, hold: Array, batch: int) -> EnvironmentState:
-    zero, no = jnp.zeros(batch), jnp.zeros(batch, bool)
+    world, goal, surface, variant, hold = sample_episodes(hand, task, taskset, episode_key, batch, stationary)
+    zero, no, index = jnp.zeros(batch), jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32)
     return EnvironmentState(
         key=key,
         world=world,
         goal=goal,
         surface=surface,
-        time=jnp.zeros(batch, jnp.int32),
+        variant=variant,
+        time=index,
         hold=hold,
         q_target=world.q,
         u_target=jnp.zeros((batch, 6)),
@@ -149,34 +153,34 @@ def _fresh(key: Array, world: World, goal: Goal, surface: Surface, hold: Array, 
         bad=no,
         sums=dict.fromkeys(_SUMS, zero),
         terms=jnp.zeros((batch, len(TERMS))),
+        grasps=Grasps(no, index, index, world.q, world.base_position, world.base_quaternion),
         finished=jnp.zeros((batch, len(EPISODE_FIELDS))),
         has_finished=no,
     )
 
 
-def restart(hand: Hand, task: TaskConfig, taskset: TaskSet, env: EnvironmentState, mask: Array) -> EnvironmentState:
+def restart(
+    hand: Hand, task: TaskConfig, taskset: TaskSet, env: EnvironmentState, mask: Array, stationary: Array | bool = False
+) -> EnvironmentState:
     """New episodes in the masked worlds (B,); the others are untouched."""
-    batch = mask.shape[0]
-    key, episode_key = jax.random.split(env.key)
-    world, goal, surface, hold = sample_episodes(hand, task, taskset, episode_key, batch)
-    fresh = _fresh(key, world, goal, surface, hold, batch)
+    fresh = start(hand, task, taskset, env.key, mask.shape[0], stationary)
 
     def pick(new: Array, old: Array) -> Array:
         return jnp.where(mask.reshape(-1, *([1] * (new.ndim - 1))), new, old)
 
-    merged = jax.tree.map(pick, fresh._replace(key=mask, finished=mask, has_finished=mask), env._replace(
-        key=mask, finished=mask, has_finished=mask
-    ))  # fmt: skip
-    return merged._replace(key=key, finished=env.finished, has_finished=env.has_finished)
+    # What is not of the episode stays.
+    kept = {name: getattr(env, name) for name in ("grasps", "finished", "has_finished")}
+    merged = jax.tree.map(pick, fresh._replace(key=mask, **kept), env._replace(key=mask))
+    return merged._replace(key=fresh.key)
 
 
 def sample_episodes(
-    hand: Hand, task: TaskConfig, taskset: TaskSet, key: Array, batch: int
-) -> tuple[World, Goal, Surface, Array]:
+    hand: Hand, task: TaskConfig, taskset: TaskSet, key: Array, batch: int, stationary: Array | bool = False
+) -> tuple[World, Goal, Surface, Array, Array]:
     """Objects, resting poses, constraints and initial hands (paper, sections Training Setup and Hand Initialization).
 
     Returns:
-      World, goal (after the priority rules), surface and hold length (B,) int.
+      World, goal (after the priority rules), surface, variant of the task set (B,) and hold length (B,) int.
     """
     keys = iter(jax.random.split(key, 10))
     uniform = lambda: jax.random.uniform(next(keys), (batch,))  # noqa: E731
@@ -184,18 +188,19 @@ def sample_episodes(
     rests = jax.random.randint(next(keys), (batch,), 0, taskset.rest.shape[1])
     affordance = (uniform() < task.p_affordance) & taskset.has_affordance[objects, rests]
     variant = affordance.astype(jnp.int32)
-    available = taskset.has_pose[objects, variant, rests]
-    pose = (uniform() < task.p_pose) & available
-    trajectory = (uniform() < task.p_trajectory) & available
+    valid = taskset.pose_valid[objects, variant, rests]
+    pose = (uniform() < task.p_pose) & jnp.any(valid, -1)
+    trajectory = (uniform() < task.p_trajectory) & jnp.any(valid, -1)
+    reference = jnp.argmax(jnp.where(valid, jax.random.uniform(next(keys), valid.shape), -1.0), -1)
     slot = jax.random.randint(next(keys), (batch,), 0, taskset.heading_index.shape[-1])
     heading = taskset.heading_index[objects, variant, rests, slot]
-    slot = jax.random.randint(next(keys), (batch,), 0, taskset.pose_index.shape[-1])
-    reference = taskset.pose_index[objects, variant, rests, slot]
+    back = taskset.heading_back[objects, variant, rests, slot][:, None]
+    direction = taskset.heading_direction[objects, variant, heading]
 
     surface = Surface(taskset.points[objects], taskset.minus[objects])
     asked = Goal(
-        heading_position=taskset.heading_position[objects, variant, heading],
-        heading_direction=taskset.heading_direction[objects, variant, heading],
+        heading_position=taskset.heading_position[objects, variant, heading] - back * direction,
+        heading_direction=direction,
         heading_cross=taskset.heading_cross[objects, variant, heading],
         pose_q=taskset.pose_q[objects, variant, reference],
         pose_position=taskset.pose_position[objects, variant, reference],
@@ -220,10 +225,10 @@ def sample_episodes(
         q=q,
         object_position=rest[:, :3],
         object_quaternion=rest[:, 3:],
-        stationary=jnp.full(batch, task.stationary_object),
+        stationary=jnp.broadcast_to(stationary, (batch,)),
     )
     hold = jax.random.randint(next(keys), (batch,), task.hold_steps, task.hold_steps_max + 1)
-    return world, goal, surface, hold
+    return world, goal, surface, variant, hold
 
 
 def initial_wrist(
@@ -292,6 +297,7 @@ def score(
     env = env._replace(kept=jnp.where(env.time == task.approach_steps + task.hold_steps, up, env.kept))
 
     error = errors(hand, task, scene, seen, env.goal)
+    env = env._replace(grasps=_grasps(task, env, scene, seen, error, up))
     force = jnp.linalg.norm(seen.force, axis=-1)
     before, after = had_table.astype(jnp.float32), 1.0 - had_table.astype(jnp.float32)
     step = {name: getattr(error, name) * (before if name.startswith("trajectory") else after) for name in _WINDOWED}
@@ -310,6 +316,24 @@ def score(
     finished = jnp.where(terminal[:, None], _episode(task, env, up), env.finished)
     env = env._replace(finished=finished, has_finished=env.has_finished | terminal)
     return env, Score(reward, terminal, stacked), scene, seen
+
+
+def _grasps(
+    task: TaskConfig, env: EnvironmentState, scene: SceneState, seen: Features, error: Errors, up: Array
+) -> Grasps:
+    """The grasps, with those that succeeded just now under a heading alone and near to it."""
+    _, finger, _, trajectory = (env.goal.mask[:, i] > 0 for i in range(len(MASKS)))
+    near = (error.heading_rad < MAX_HEADING_RAD) & (error.heading_m < MAX_HEADING_M)
+    now = (env.time == task.approach_steps + task.hold_steps) & up & near & ~finger & ~trajectory
+    position, quaternion = rotations.relative_pose(
+        scene.object_position, scene.object_quaternion, seen.wrist_position, seen.wrist_quaternion
+    )
+    fresh = Grasps(now, env.world.object_index, env.variant, scene.q, position, quaternion)
+    taken = [
+        jnp.where(now.reshape(-1, *([1] * (new.ndim - 1))), new, old)
+        for new, old in zip(fresh[1:], env.grasps[1:], strict=True)
+    ]
+    return Grasps(env.grasps.found | now, *taken)
 
 
 def _episode(task: TaskConfig, env: EnvironmentState, up: Array) -> Array:

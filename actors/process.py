@@ -116,11 +116,17 @@ class _Actor:
     def _rollout(self, bundle: PolicyBundle, ticket: Ticket) -> None:
         config, env = self._config, self._worker.env
         began = time.time()
+        self._worker.configure(
+            config.curriculum.weights(config.task.reward, bundle.version),
+            stationary=config.curriculum.stationary(bundle.version),
+        )
         started_fresh = bool(np.asarray(env.time)[0] == 0)
         rollout = self._worker.collect(bundle.acting, config.rollout_steps)
         steps = config.rollout_steps * config.environments
         names = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
-        arrays = {name: np.asarray(getattr(rollout, name)) for name in names} | finished_episodes(rollout)
+        arrays = {name: getattr(rollout, name) for name in names} | finished_episodes(rollout)
+        if config.task.own_references:
+            self._worker.renew_references()
         meta = {"version": bundle.version, "schema": self._spec.schema, "steps": steps}
         self._link.upload(Message(arrays, meta), ticket)
         seconds = time.time() - began

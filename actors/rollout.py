@@ -5,19 +5,20 @@ compiled piecewise around the C step.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors import environment
+from actors import environment, references
 from actors.environment import EPISODE_FIELDS, EnvironmentState
 from actors.physics.engine import Physics, Readout
 from actors.taskset import TaskSet
-from common.config import TaskConfig
+from common.config import RewardWeights, TaskConfig
 from common.hands.spec import Hand
+from common.objects.spec import GraspObject
 from common.task.control import decode
 from common.task.features import Features
 from common.task.observation import observe
@@ -99,11 +100,11 @@ class RolloutWorker:
         self.physics = physics
         self._hand, self._task, self._taskset, self._policy = hand, task, taskset, policy
         self._dtype = jnp.float16 if half else jnp.float32
-        self._weights, self._control = task.reward, task.control
+        self._weights, self._control, self._stationary = task.reward, task.control, np.array(False)
         episode_key, self._key = jax.random.split(jax.random.key(seed))
-        self.env: EnvironmentState = jax.jit(
-            functools.partial(environment.start, hand, task, batch=batch), static_argnames=()
-        )(taskset, episode_key)
+        self.env: EnvironmentState = jax.jit(functools.partial(environment.start, hand, task, batch=batch))(
+            taskset, episode_key, stationary=self._stationary
+        )
         self.state = physics.start(self.env.world)
         self._act_jit = jax.jit(self._act)
         self._score_jit = jax.jit(self._score)
@@ -112,6 +113,24 @@ class RolloutWorker:
         self._observe_jit = jax.jit(lambda scene, seen, goal: observe(task, scene, seen, goal).astype(self._dtype))
         self._scan_jit = jax.jit(self._scan, static_argnames="steps")
         self._moment: tuple[SceneState, Features] = self._moment_jit(self.env, physics.read(self.state))
+
+    def configure(self, weights: RewardWeights, *, stationary: bool) -> None:
+        """Sets the reward's weights, and whether the objects of episodes that start from now on are held in place."""
+        self._weights, self._stationary = weights, np.array(stationary)
+
+    def replace_objects(self, objects: Sequence[GraspObject], taskset: TaskSet) -> None:
+        """Episodes that start from now on are drawn from these objects, as many as before, and their task set."""
+        self.state = self.physics.replace_objects(self.state, objects)
+        self._taskset = taskset
+        found = self.env.grasps.found
+        self.env = self.env._replace(grasps=self.env.grasps._replace(found=jnp.zeros_like(found)))
+
+    def renew_references(self) -> None:
+        """Puts the grasps that succeeded since the last call into the task set as reference poses."""
+        self._key, key = jax.random.split(self._key)
+        grasps = self.env.grasps
+        self._taskset = references.renew(self._hand, self._task, self._taskset, grasps, key)
+        self.env = self.env._replace(grasps=grasps._replace(found=jnp.zeros_like(grasps.found)))
 
     def collect(self, parameters: Any, steps: int) -> Rollout:
         """The next `steps` control steps under these policy parameters."""
@@ -148,7 +167,7 @@ class RolloutWorker:
             rows.append((observation, action, log_probability, score.reward, score.terminal))
             traces.append(trace)
             if bool(np.any(score.terminal)):
-                self.env = self._restart_jit(self._taskset, self.env, score.terminal)
+                self.env = self._restart_jit(self._taskset, self.env, score.terminal, self._stationary)
                 self.state = self.physics.reset(self.state, score.terminal, self.env.world)
                 scene, seen = self._moment_jit(self.env, self.physics.read(self.state))
         self._moment = scene, seen
@@ -160,13 +179,21 @@ class RolloutWorker:
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         carry = (self.env, self.state, self._moment)
         carry, rollout = self._scan_jit(
-            parameters, self._weights, self._control, self._taskset, carry, key, steps=steps
+            parameters, self._weights, self._control, self._stationary, self._taskset, carry, key, steps=steps
         )
         self.env, self.state, self._moment = carry
         return rollout
 
     def _scan(
-        self, parameters: Any, weights: Any, control: Any, taskset: TaskSet, carry: Any, key: Array, steps: int
+        self,
+        parameters: Any,
+        weights: Any,
+        control: Any,
+        stationary: Array,
+        taskset: TaskSet,
+        carry: Any,
+        key: Array,
+        steps: int,
     ) -> tuple[Any, Rollout]:
         physics = self.physics
 
@@ -180,7 +207,7 @@ class RolloutWorker:
 
             def renew(operand: Any) -> Any:
                 env, state, _ = operand
-                env = environment.restart(self._hand, self._task, taskset, env, score.terminal)
+                env = environment.restart(self._hand, self._task, taskset, env, score.terminal, stationary)
                 state = physics.reset(state, score.terminal, env.world)
                 return env, state, environment.moment(self._hand, self._task, env, physics.read(state))
 

@@ -4,26 +4,33 @@ Stacked over the N objects of a pool, so that a compiled reset gathers by object
 0 for the whole surface, 1 for the affordance region O+.
 """
 
+import functools
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from common import rotations
 from common.config import TaskConfig
-from common.constraints.headings import Headings, above, feasible, sample_headings
-from common.constraints.poses import closed_poses
+from common.constraints.headings import Headings, above, clear_table, feasible, sample_headings
+from common.constraints.poses import Poses, closed_poses
 from common.constraints.trajectories import make_trajectories
 from common.errors import CongraspError
+from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
 from common.objects.spec import SURFACE_POINTS, GraspObject
+from common.parallel import parallel_map
 from common.task.types import Array
 
 HEADINGS = 256
 POSES = 20
-_WAYPOINT_CLEARANCE = 0.02
-_HEADING_CLEARANCE = -0.012
-"""Heading positions may lie this far under the table's top: 2 cm inside a thin object that lies flat."""
+_CLEARANCE = 0.02
+"""Metres over the table that every waypoint of a trajectory keeps."""
+_STEEPEST_UP = 0.1
+"""Largest upward component of a reference pose's approach direction."""
 
 
 class TaskSet(NamedTuple):
@@ -43,6 +50,8 @@ class TaskSet(NamedTuple):
     """(N, V, H, 3)."""
     heading_index: Array
     """(N, V, R, H) feasible headings of each resting pose, repeated to fill the row."""
+    heading_back: Array
+    """(N, V, R, H) metres by which the position of `heading_index` moves back to stay clear of the table."""
     pose_q: Array
     """(N, V, M, F)."""
     pose_position: Array
@@ -53,24 +62,10 @@ class TaskSet(NamedTuple):
     """(N, V, M, K, 3); trajectory m ends at pose m."""
     trajectory_quaternion: Array
     """(N, V, M, K, 4)."""
-    pose_index: Array
-    """(N, V, R, M) poses whose trajectory stays above the table in each resting pose, repeated to fill the row."""
-    has_pose: Array
-    """(N, V, R) bool: the row of `pose_index` is not empty."""
+    pose_valid: Array
+    """(N, V, R, M) bool: pose and trajectory stay above the table in the resting pose."""
     has_affordance: Array
     """(N, R) bool: the object has an O-, and its O+ can be approached in the resting pose."""
-
-
-def _repeat(indices: np.ndarray, length: int) -> np.ndarray:
-    """Indices repeated to a length; zeros where there are none."""
-    return np.resize(indices, length) if len(indices) else np.zeros(length, int)
-
-
-def _world(rest: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Heights (...,) over the table of points (..., 3) of the object frame in a resting pose (7,)."""
-    w, x, y, z = rest[3:]
-    row = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
-    return points @ row + rest[2]
 
 
 def build_taskset(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> TaskSet:
@@ -79,87 +74,124 @@ def build_taskset(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], 
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
-    rng = np.random.default_rng(seed)
-    rows = [_object_row(hand, task, obj, rng) for obj in objects]
+    rows = parallel_map(
+        _headings_of, itertools.repeat(task, len(objects)), objects, [(seed, n) for n in range(len(objects))]
+    )
     rests = max(len(row["rest"]) for row in rows)
     for row in rows:
         fill = np.resize(np.arange(len(row["rest"])), rests)
-        row["rest"] = row["rest"][fill]
-        for name in ("heading_index", "pose_index", "has_pose"):
-            row[name] = row[name][:, fill]
-        row["has_affordance"] = row["has_affordance"][fill]
-    stacked = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    return TaskSet(**{name: jnp.asarray(_compact(value)) for name, value in stacked.items()})
+        row["rest"], row["has_affordance"] = row["rest"][fill], row["has_affordance"][fill]
+        row["heading_index"], row["heading_back"] = row["heading_index"][:, fill], row["heading_back"][:, fill]
+    columns = {name: jnp.asarray(np.stack([row[name] for row in rows])) for name in rows[0]}
+    surfaces = [
+        jnp.asarray(np.stack([getattr(obj, name) for obj in objects]), jnp.float32) for name in ("points", "normals")
+    ]
+    poses = _closed(hand, *surfaces, *(columns.pop(f"chosen_{name}") for name in Headings._fields))
+    flat = Poses(*(field.reshape(-1, field.shape[-1]) for field in poses))
+    rest = jnp.repeat(columns["rest"], 2 * POSES, axis=0)
+    path, turns, valid = make_references(hand, flat, rest, jax.random.key(seed), task.trajectory_points)
+    shape = (len(objects), 2, POSES)
+    return TaskSet(
+        **columns,
+        pose_q=poses.q,
+        pose_position=poses.position,
+        pose_quaternion=poses.quaternion,
+        trajectory_position=path.reshape(*shape, *path.shape[1:]),
+        trajectory_quaternion=turns.reshape(*shape, *turns.shape[1:]),
+        pose_valid=jnp.swapaxes(valid.reshape(*shape, -1), -1, -2),
+    )
 
 
-def _compact(value: np.ndarray) -> np.ndarray:
-    if value.dtype == np.float64:
-        return value.astype(np.float32)
-    return value.astype(np.int32) if value.dtype == np.int64 else value
+def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int) -> tuple[Array, Array, Array]:
+    """A trajectory to each of M reference poses, and where the two can be used.
+
+    Args:
+      hand: the hand.
+      poses: M poses.
+      rest: (M, R, 7) resting poses of their objects.
+      key: random key of the trajectories.
+      waypoints: K.
+
+    Returns:
+      Trajectories (M, K, 3) and (M, K, 4), and (M, R) bool.
+    """
+    path, turns = make_trajectories(hand, poses.position, poses.quaternion, key, waypoints=waypoints)
+    heading = rotations.rotate(
+        poses.quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), poses.position.shape)
+    )
+    up = rotations.to_matrix(rest[..., 3:])[..., 2, :]
+    lowest = jnp.min(jnp.einsum("mri,mki->mrk", up, path), -1) + rest[..., 2]
+    rising = jnp.einsum("mri,mi->mr", up, heading)
+    return path, turns, (lowest > _CLEARANCE) & (rising < _STEEPEST_UP)
 
 
-def _object_row(hand: Hand, task: TaskConfig, obj: GraspObject, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Everything of one object; resting poses without a reachable heading are left out."""
-    variants = [_variant(hand, task, obj, use_affordance, rng) for use_affordance in (False, True)]
-    usable = [r for r in range(len(obj.rest_poses)) if variants[0]["feasible"][r].any()]
-    if not usable:
+@functools.partial(jax.jit, static_argnums=0)
+def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Poses:
+    """Reference poses (N, V, M, ...) at headings (N, V, M, 3) by closing the hand around the objects."""
+
+    def of_object(row: tuple[Array, ...]) -> Poses:
+        points, normals, *headings = row
+        flat = closed_poses(hand, points, normals, *(field.reshape(-1, 3) for field in headings))
+        return Poses(*(field.reshape(2, POSES, -1) for field in flat))
+
+    return jax.lax.map(of_object, (points, normals, *headings))
+
+
+def _headings_of(task: TaskConfig, obj: GraspObject, seed: tuple[int, int]) -> dict[str, np.ndarray]:
+    """What NumPy finds out about one object; resting poses without a reachable heading are left out."""
+    rng = np.random.default_rng(seed)
+    sets = [sample_headings(obj, rng, count=HEADINGS, use_affordance=use) for use in (False, True)]
+    reachable = np.array([[_reachable(task, headings, rest) for rest in obj.rest_poses] for headings in sets])
+    if task.headings == "above" and reachable[0].any():
+        steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
+        reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
+    usable = np.flatnonzero(reachable[0].any(-1))
+    if len(usable) == 0:
         raise CongraspError(
             f"The object '{obj.name}' cannot be approached in any of its resting poses.",
             "Scale it so that some part is narrower than 12 cm, or leave it out.",
         )
-    keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
-    minus = obj.non_graspable_points
-    return {
-        "points": obj.points[keep],
-        "minus": minus[keep],
-        "rest": obj.rest_poses[usable],
-        "has_affordance": np.array([minus[keep].any() and variants[1]["feasible"][r].any() for r in usable]),
-        "heading_index": np.array(
-            [[_repeat(np.flatnonzero(v["feasible"][r]), HEADINGS) for r in usable] for v in variants]
-        ),
-        "pose_index": np.array([[_repeat(np.flatnonzero(v["clear"][r]), POSES) for r in usable] for v in variants]),
-        "has_pose": np.array([[v["clear"][r].any() for r in usable] for v in variants]),
-        **{name: np.stack([v[name] for v in variants]) for name in variants[0] if name not in ("feasible", "clear")},
-    }
-
-
-def _variant(
-    hand: Hand, task: TaskConfig, obj: GraspObject, use_affordance: bool, rng: np.random.Generator
-) -> dict[str, np.ndarray]:
-    """Headings, poses and trajectories of one object for the whole surface or for O+."""
-    headings = sample_headings(obj, rng, count=HEADINGS, use_affordance=use_affordance)
-    reachable = np.stack([_reachable(task, headings, rest) for rest in obj.rest_poses])
+    reachable, rest = reachable[:, usable], obj.rest_poses[usable]
+    index = np.array([[_repeated(row) for row in variant] for variant in reachable])
+    back = np.array([[_back(headings, pose) for pose in rest] for headings in sets])
     # Reference poses are made at headings that some resting pose allows, where there are any.
-    candidates = np.flatnonzero(reachable.any(0)) if reachable.any() else np.arange(HEADINGS)
-    chosen = rng.choice(candidates, POSES, replace=len(candidates) < POSES)
-    poses = closed_poses(
-        hand,
-        jnp.asarray(obj.points),
-        jnp.asarray(obj.normals),
-        *(jnp.asarray(np.asarray(field)[chosen], jnp.float32) for field in headings),
-    )
-    position, quaternion = np.asarray(poses.position), np.asarray(poses.quaternion)
-    path, turns = make_trajectories(hand, position, quaternion, rng, task.trajectory_points)
-    clear = np.stack(
-        [
-            reachable[r][chosen] & (_world(rest, path).min(-1) > _WAYPOINT_CLEARANCE)
-            for r, rest in enumerate(obj.rest_poses)
-        ]
-    )
+    chosen = [_some(rng, variant.any(0)) for variant in reachable]
+    keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
+    minus = obj.non_graspable_points[keep]
+    floats = {
+        "points": obj.points[keep],
+        "rest": rest,
+        **{f"heading_{name}": np.stack([getattr(s, name) for s in sets]) for name in Headings._fields},
+        "heading_back": np.take_along_axis(back, index, -1),
+        **{
+            f"chosen_{name}": np.stack([getattr(s, name)[c] for s, c in zip(sets, chosen, strict=True)])
+            for name in Headings._fields
+        },
+    }
     return {
-        "heading_position": headings.position,
-        "heading_direction": headings.direction,
-        "heading_cross": headings.cross,
-        "feasible": reachable,
-        "pose_q": np.asarray(poses.q),
-        "pose_position": position,
-        "pose_quaternion": quaternion,
-        "trajectory_position": path,
-        "trajectory_quaternion": turns,
-        "clear": clear,
+        **{name: value.astype(np.float32) for name, value in floats.items()},
+        "minus": minus,
+        "heading_index": index.astype(np.int32),
+        "has_affordance": minus.any() & reachable[1].any(-1),
     }
 
 
 def _reachable(task: TaskConfig, headings: Headings, rest: np.ndarray) -> np.ndarray:
-    mask = feasible(headings, rest, clearance=_HEADING_CLEARANCE, back_off=task.back_off)
-    return mask & above(headings, rest) if task.headings == "above" else mask
+    return feasible(clear_table(headings, rest), rest, back_off=task.back_off)
+
+
+def _back(headings: Headings, rest: np.ndarray) -> np.ndarray:
+    """(H,) metres by which positions move back to stay clear of the table."""
+    return np.linalg.norm(clear_table(headings, rest).position - headings.position, axis=-1)
+
+
+def _repeated(which: np.ndarray) -> np.ndarray:
+    """(H,) indices of what is true in (H,), repeated; zeros where nothing is."""
+    indices = np.flatnonzero(which)
+    return np.resize(indices, HEADINGS) if len(indices) else np.zeros(HEADINGS, int)
+
+
+def _some(rng: np.random.Generator, which: np.ndarray) -> np.ndarray:
+    """(M,) random indices of what is true, of any where nothing is."""
+    candidates = np.flatnonzero(which) if which.any() else np.arange(len(which))
+    return rng.choice(candidates, POSES, replace=len(candidates) < POSES)

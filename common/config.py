@@ -98,8 +98,6 @@ class TaskConfig:
     """Control steps without the table that count for success (and the least in training)."""
     hold_steps_max: int = 25
     """Training draws the hold's length between `hold_steps` and this."""
-    stationary_object: bool = False
-    """The paper's first phase: the object is held in place and the table stays."""
     dynamic_center: bool = True
     """Hand centre from the live fingertips; false is the paper's ablation with a centre fixed in the wrist frame."""
     hand_table_collision: bool = False
@@ -117,7 +115,10 @@ class TaskConfig:
     p_trajectory: float = 0.5
     """Probability that an episode has a wrist trajectory."""
     headings: Literal["all", "above"] = "all"
-    """`above` keeps approach directions within 30 degrees of straight down (easier)."""
+    """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier)."""
+    own_references: bool = True
+    """Reference poses and trajectories are remade from the policy's own grasps as it learns; otherwise they stay those
+    that closing the hand around the objects gave."""
     mass_range: tuple[float, float] = (1.0, 1.0)
     """Factors of the object's mass, uniform at every reset."""
     friction_range: tuple[float, float] = (1.0, 1.0)
@@ -193,6 +194,33 @@ class PPOConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class CurriculumConfig:
+    """The paper's two phases: first stationary objects, then free ones with larger constraint weights."""
+
+    stationary_updates: int = 0
+    """Updates for which objects are held in place and the table stays."""
+    constraint_updates: int = 0
+    """Updates after which the constraint weights are multiplied by `constraint_factor`."""
+    constraint_factor: float = 1.0
+    """Factor on the weights of heading, pose, trajectory and affordance."""
+
+    def stationary(self, version: int) -> bool:
+        """Whether objects are held in place under the policy of this version."""
+        return version < self.stationary_updates
+
+    def weights(self, weights: RewardWeights, version: int) -> RewardWeights:
+        """The reward's weights under the policy of this version."""
+        if version < self.constraint_updates or self.constraint_factor == 1.0:
+            return weights
+        scaled = {
+            field.name: self.constraint_factor * getattr(weights, field.name)
+            for field in dataclasses.fields(weights)
+            if field.name.startswith(("heading", "pose", "trajectory", "affordance"))
+        }
+        return dataclasses.replace(weights, **scaled)
+
+
+@dataclasses.dataclass(frozen=True)
 class RunConfig:
     """One training run."""
 
@@ -216,6 +244,8 @@ class RunConfig:
     """Rollouts of an actor between two episodes that it publishes for logs."""
     task: TaskConfig = TaskConfig()
     """The task."""
+    curriculum: CurriculumConfig = CurriculumConfig()
+    """How the task changes while it is learnt."""
     objects: ObjectsConfig = ObjectsConfig()
     """The objects."""
     network: NetworkConfig = NetworkConfig()

@@ -73,10 +73,12 @@ def angle(a: Array, b: Array) -> Array:
     return 2.0 * jnp.arctan2(sine, jnp.abs(relative[..., 0]))
 
 
-def from_axis_angle(axis: Array, theta: Array) -> Array:
-    """Quaternions (..., 4) about unit axes (..., 3) by angles (...,)."""
-    half = 0.5 * theta[..., None]
-    return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1)
+def from_rotation_vector(vector: Array) -> Array:
+    """Quaternions (..., 4) of rotation vectors (..., 3): unit axis times angle in radians."""
+    half = 0.5 * vector
+    # jnp.sinc(x) is sin(pi x) / (pi x), finite at zero.
+    length = jnp.sqrt(jnp.sum(half**2, -1, keepdims=True) + 1e-20)
+    return jnp.concatenate([jnp.cos(length), jnp.sinc(length / jnp.pi) * half], -1)
 
 
 def axis_rotation(axis: Array, theta: Array) -> Array:

@@ -118,9 +118,7 @@ class Evaluator:
         """
         base = task or bundle.task
         self.bundle, self.objects = bundle, objects
-        self.task = dataclasses.replace(
-            base, hold_steps_max=hold_steps or base.hold_steps, stationary_object=False, headings=base.headings
-        )
+        self.task = dataclasses.replace(base, hold_steps_max=hold_steps or base.hold_steps)
         self._hold = hold_steps or base.hold_steps
         self._hand = get_hand(bundle.spec.hand)
         self._physics_name, self._threads, self._batch, self._seed = physics, threads, batch, seed

@@ -4,8 +4,10 @@
 threads and keeps its state in place. Both go through the same three calls.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
+from common.objects.spec import GraspObject
 from common.task.types import Array
 
 
@@ -65,6 +67,9 @@ class Physics(Protocol):
 
     def step(self, state: Any, target: Array, table: Array) -> tuple[Any, Readout]:
         """One control step with joint targets (B, 6 + F), wrist first; table (B,) says where the table stands."""
+
+    def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> Any:
+        """Other objects, as many as before, for the worlds that start anew from now on; present ones go on."""
 
     def read(self, state: Any) -> Readout:
         """The worlds as they are, without contacts after a reset."""

@@ -16,7 +16,7 @@ from mujoco import mjx
 from actors.physics.engine import Readout, World
 from actors.physics.readout import diverged, readout
 from actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, addresses
-from actors.physics.slots import build_pool
+from actors.physics.slots import Pool
 from common.config import TaskConfig
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
@@ -29,11 +29,16 @@ CONSTRAINTS_PER_WORLD = 320
 
 
 class MjxState(NamedTuple):
-    """Batched data, the leaves of each world's model, and what a diverged world is put back to."""
+    """A batch of worlds and what they draw from."""
 
     data: Any
+    """Batched `mjx.Data`."""
     leaves: dict[str, Array]
+    """Fields of the model of each world (B, ...)."""
     qpos_start: Array
+    """(B, nq), what a diverged world is put back to."""
+    pool: dict[str, Array]
+    """Fields of the model for each object (N, ...); see `actors.physics.slots.LEAVES`."""
 
 
 class MjxPhysics:
@@ -54,7 +59,7 @@ class MjxPhysics:
         """
         self.name: str = implementation
         self._task = task
-        pool = build_pool(hand, task, objects)
+        self._pool = pool = Pool(hand, task, objects)
         self._where = addresses(pool.model, hand)
         self._links = np.array([pool.model.body(link.name).id for link in hand.links])
         self._nq, self._nv, self._nu = pool.model.nq, pool.model.nv, pool.model.nu
@@ -69,16 +74,13 @@ class MjxPhysics:
             # Warp's kernels print every overflow and iteration limit; thousands of worlds would flood the log.
             quiet = self._model.opt._impl.replace(warn_overflow=0)
             self._model = self._model.replace(opt=self._model.opt.replace(_impl=quiet))
-        self._object_leaves = {
-            name: jnp.asarray(value, jnp.float32).reshape(len(objects), *getattr(self._model, name).shape)
-            for name, value in pool.leaves.items()
-        }
+        self._objects = self._leaves(objects)
         self._geoms = np.flatnonzero(pool.model.geom_bodyid == self._where.object_body)
         self._shared = {
             name: jnp.asarray(getattr(pool.model, name), jnp.float32)
             for name in ("body_pos", "body_quat", "geom_friction")
         }
-        axes = dict.fromkeys([*self._object_leaves, *self._shared], 0)
+        axes = dict.fromkeys([*self._objects, *self._shared], 0)
         self._axes = jax.tree.map(lambda _: None, self._model).replace(**axes)
         self._object_body = self._where.object_body
 
@@ -89,11 +91,15 @@ class MjxPhysics:
         sizes = warp if self.name == "warp" else {}
         data = mjx.make_data(self._host_model, impl=self.name, **sizes)
         data = jax.vmap(lambda q: data.replace(qpos=q))(jnp.zeros((batch, self._nq)))
-        return self._place(data, world)
+        return self._place(data, self._objects, world)
+
+    def replace_objects(self, state: MjxState, objects: Sequence[GraspObject]) -> MjxState:
+        """Other objects, as many as before and without meshes, for the episodes that start from now on."""
+        return state._replace(pool=self._leaves(objects))
 
     def reset(self, state: MjxState, mask: Array, world: World) -> MjxState:
         """Starts the masked worlds anew; see `Physics.reset`."""
-        fresh = self._place(state.data, world)
+        fresh = self._place(state.data, state.pool, world)
 
         def pick(new: Array, old: Array) -> Array:
             return jnp.where(mask.reshape(-1, *([1] * (new.ndim - 1))), new, old)
@@ -101,7 +107,7 @@ class MjxPhysics:
         names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "mocap_pos", "mocap_quat", "eq_active", "time")
         merged = {name: pick(getattr(fresh.data, name), getattr(state.data, name)) for name in names}
         leaves = {name: pick(fresh.leaves[name], state.leaves[name]) for name in state.leaves}
-        return MjxState(state.data.replace(**merged), leaves, pick(fresh.qpos_start, state.qpos_start))
+        return MjxState(state.data.replace(**merged), leaves, pick(fresh.qpos_start, state.qpos_start), state.pool)
 
     def step(self, state: MjxState, target: Array, table: Array) -> tuple[MjxState, Readout]:
         """One control step; see `Physics.step`."""
@@ -131,10 +137,16 @@ class MjxPhysics:
     def close(self) -> None:
         """Nothing to release."""
 
-    def _place(self, data: Any, world: World) -> MjxState:
+    def _leaves(self, objects: Sequence[GraspObject]) -> dict[str, Array]:
+        return {
+            name: jnp.asarray(value, jnp.float32).reshape(len(objects), *getattr(self._model, name).shape)
+            for name, value in self._pool.leaves(objects).items()
+        }
+
+    def _place(self, data: Any, pool: dict[str, Array], world: World) -> MjxState:
         where, batch = self._where, world.object_index.shape[0]
         body = self._object_body
-        leaves = {name: value[world.object_index] for name, value in self._object_leaves.items()}
+        leaves = {name: value[world.object_index] for name, value in pool.items()}
         for name in ("body_mass", "body_inertia"):
             scale = world.mass_scale.reshape(-1, *([1] * (leaves[name].ndim - 2)))
             leaves[name] = leaves[name].at[:, body].multiply(scale)
@@ -157,7 +169,7 @@ class MjxPhysics:
             mocap_quat=data.mocap_quat.at[:, where.anchor_mocap].set(world.object_quaternion),
             eq_active=data.eq_active.at[:, where.weld].set(world.stationary.astype(data.eq_active.dtype)),
         )
-        return MjxState(data, leaves, qpos)
+        return MjxState(data, leaves, qpos, pool)
 
     def _contacts(self, data: Any) -> Array:
         """(B, L * C * 13) in the layout of the contact sensors."""

@@ -88,6 +88,12 @@ class NativePhysics:
             self._restore(int(i))
         return self, self._readout(bad)
 
+    def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> "NativePhysics":
+        """Other objects; see `Physics.replace_objects`."""
+        self._objects = objects
+        self._scenes.clear()
+        return self
+
     def read(self, state: Any) -> Readout:
         """The worlds as they are; see `Physics.read`."""
         return self._readout(np.zeros(len(self._cells), bool))

@@ -13,6 +13,7 @@ import numpy as np
 
 from actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, finish_spec, scene_spec
 from common.config import TaskConfig
+from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.objects.mjcf import GEOM_TYPES, add_object
 from common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
@@ -37,84 +38,86 @@ LEAVES = (
 """Fields of the model that differ between objects."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Pool:
-    """A compiled model and its per-object leaves (N, ...), by the names in `LEAVES`."""
+    """The shared model of a pool of objects, and what differs between them."""
 
-    model: mujoco.MjModel
-    leaves: dict[str, np.ndarray]
+    def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]):
+        """Compiles the model.
 
+        Args:
+          hand: the hand.
+          task: timing and collision settings.
+          objects: at most `PRIMITIVE_SLOTS` primitive pieces each; meshes add geoms to the model.
+        """
+        spec = scene_spec(hand, task)
+        pieces = [Piece(kind, _shrunk(kind)) for kind, count in PRIMITIVE_SLOTS.items() for _ in range(count)]  # type: ignore[arg-type]
+        slots = len(pieces)
+        self._owners: list[int] = []
+        for n, obj in enumerate(objects):
+            meshes = [piece for piece in obj.pieces if piece.kind == "mesh"]
+            pieces += meshes
+            self._owners += [n] * len(meshes)
+        shared = dataclasses.replace(objects[0], pieces=tuple(pieces))
+        add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE)
+        finish_spec(spec, hand)
+        self.model: mujoco.MjModel = spec.compile()
+        geoms = np.array([self.model.geom(f"object_{i}").id for i in range(len(pieces))])
+        self._slots, self._meshes = geoms[:slots], geoms[slots:]
 
-def build_pool(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> Pool:
-    """The shared model of a pool of objects.
+    def leaves(self, objects: Sequence[GraspObject]) -> dict[str, np.ndarray]:
+        """Fields (N, ...) of the model for each object, by the names in `LEAVES`.
 
-    Args:
-      hand: the hand.
-      task: timing and collision settings.
-      objects: at most `PRIMITIVE_SLOTS` primitive pieces each; meshes add geoms to the model.
-    """
-    spec = scene_spec(hand, task)
-    pieces = [Piece(kind, _shrunk(kind)) for kind, count in PRIMITIVE_SLOTS.items() for _ in range(count)]  # type: ignore[arg-type]
-    owners: list[tuple[int, int]] = []
-    for n, obj in enumerate(objects):
-        for k, piece in enumerate(obj.pieces):
+        Args:
+          objects: those of the pool, or as many others without meshes.
+
+        Raises:
+          CongraspError: a mesh object that is not of the pool, or more pieces than slots.
+        """
+        base = {name: getattr(self.model, name).copy() for name in LEAVES}
+        rows = [self._leaves(base, obj, n) for n, obj in enumerate(objects)]
+        for name, value in base.items():
+            getattr(self.model, name)[:] = value
+        return {name: np.stack([row[name] for row in rows]) for name in LEAVES}
+
+    def _leaves(self, base: dict[str, np.ndarray], obj: GraspObject, index: int) -> dict[str, np.ndarray]:
+        """Leaves of one object: written into the model, completed by MuJoCo, and copied out."""
+        model = self.model
+        for name, value in base.items():
+            getattr(model, name)[:] = value
+        meshes = sum(piece.kind == "mesh" for piece in obj.pieces)
+        if meshes != self._owners.count(index):
+            raise CongraspError(
+                f"The meshes of the object '{obj.name}' are not in the model.", "Build another engine for its pool."
+            )
+        for geom, owner in zip(self._meshes, self._owners, strict=True):
+            if owner != index:
+                model.geom_pos[geom] = _OUT_OF_REACH
+        free = {kind: [g for g in self._slots if model.geom_type[g] == GEOM_TYPES[kind]] for kind in PRIMITIVE_SLOTS}
+        for piece in obj.pieces:
             if piece.kind == "mesh":
-                pieces.append(piece)
-                owners.append((n, k))
-    add_object(
-        spec,
-        dataclasses.replace(objects[0], pieces=tuple(pieces)),
-        contype=OBJECT_CONTYPE,
-        conaffinity=HAND_CONTYPE,
-    )
-    finish_spec(spec, hand)
-    model = spec.compile()
-    slots = sum(PRIMITIVE_SLOTS.values())
-    geoms = np.array([model.geom(f"object_{i}").id for i in range(len(pieces))])
-    base = {name: getattr(model, name).copy() for name in LEAVES}
-    rows = [_leaves(model, base, obj, n, geoms[:slots], geoms[slots:], owners) for n, obj in enumerate(objects)]
-    for name, value in base.items():
-        getattr(model, name)[:] = value
-    return Pool(model, {name: np.stack([row[name] for row in rows]) for name in LEAVES})
+                continue
+            if not free[piece.kind]:
+                raise CongraspError(
+                    f"The object '{obj.name}' has more than {PRIMITIVE_SLOTS[piece.kind]} pieces of the kind {piece.kind}.",
+                    "Make it of fewer pieces, or import it as a mesh.",
+                )
+            geom = free[piece.kind].pop(0)
+            model.geom_size[geom] = piece.size
+            model.geom_pos[geom] = piece.pos
+            model.geom_quat[geom] = piece.quat
+            model.geom_aabb[geom] = [0, 0, 0, *_half_extent(piece)]
+            model.geom_rbound[geom] = _bounding_radius(piece)
+        body = model.body("object").id
+        principal, axes = np.linalg.eigh(obj.inertia)
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+        model.body_mass[body], model.body_inertia[body] = obj.mass, principal
+        mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        return {name: getattr(model, name).copy() for name in LEAVES}
 
 
 def _shrunk(kind: str) -> tuple[float, float, float]:
     return (_UNUSED, _UNUSED, 0.0) if kind in ("cylinder", "capsule") else (_UNUSED, _UNUSED, _UNUSED)
-
-
-def _leaves(
-    model: mujoco.MjModel,
-    base: dict[str, np.ndarray],
-    obj: GraspObject,
-    index: int,
-    slots: np.ndarray,
-    meshes: np.ndarray,
-    owners: list[tuple[int, int]],
-) -> dict[str, np.ndarray]:
-    """Leaves of one object: written into the model, completed by MuJoCo, and copied out."""
-    for name, value in base.items():
-        getattr(model, name)[:] = value
-    for geom, (owner, _) in zip(meshes, owners, strict=True):
-        if owner != index:
-            model.geom_pos[geom] = _OUT_OF_REACH
-    free = {kind: [g for g in slots if model.geom_type[g] == GEOM_TYPES[kind]] for kind in PRIMITIVE_SLOTS}
-    for piece in obj.pieces:
-        if piece.kind == "mesh":
-            continue
-        geom = free[piece.kind].pop(0)
-        model.geom_size[geom] = piece.size
-        model.geom_pos[geom] = piece.pos
-        model.geom_quat[geom] = piece.quat
-        half = _half_extent(piece)
-        model.geom_aabb[geom] = [0, 0, 0, *half]
-        model.geom_rbound[geom] = _bounding_radius(piece)
-    body = model.body("object").id
-    principal, axes = np.linalg.eigh(obj.inertia)
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
-    model.body_mass[body], model.body_inertia[body] = obj.mass, principal
-    mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    return {name: getattr(model, name).copy() for name in LEAVES}
 
 
 def _half_extent(piece: Piece) -> tuple[float, float, float]:

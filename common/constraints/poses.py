@@ -1,7 +1,7 @@
 """Reference poses made by closing the hand around an object without physics.
 
-They stand in for final states of a trained policy's grasps until there is one (`poses_from_grasps`): the wrist is put
-where the heading wants it, and every finger closes until its skin meets the surface.
+They stand in for final states of a trained policy's grasps until there is one: the wrist is put where the heading wants
+it, and every finger closes until its skin meets the surface.
 """
 
 import functools
@@ -97,10 +97,4 @@ def closed_poses(
     center = kinematics.hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)))
     q = close(center)
     position, quaternion = heading_wrist_pose(hand, goal, center)
-    return Poses(q, position, quaternion)
-
-
-def poses_from_grasps(q: Array, wrist: tuple[Array, Array], obj: tuple[Array, Array]) -> Poses:
-    """Reference poses from final states of successful grasps: world poses of wrist and object, (M, 3) and (M, 4)."""
-    position, quaternion = rotations.relative_pose(*obj, *wrist)
     return Poses(q, position, quaternion)

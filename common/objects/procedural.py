@@ -11,6 +11,7 @@ from common.objects.families import BUILDERS, Draft
 from common.objects.resting import rest_poses
 from common.objects.spec import GraspObject
 from common.objects.surface import halves, mass_properties, sample_union
+from common.parallel import parallel_map
 
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)
 MASS_RANGE = (0.05, 0.5)
@@ -57,7 +58,7 @@ def generate_many(count: int, seed: int, families: Sequence[str] = ()) -> list[G
     Raises:
       CongraspError: unknown family or negative seed.
     """
-    return [generate(seed + i, family) for i, family in enumerate(family_turns(count, seed, families))]
+    return parallel_map(generate, range(seed, seed + count), family_turns(count, seed, families))
 
 
 def family_turns(count: int, seed: int, families: Sequence[str] = ()) -> list[str]:

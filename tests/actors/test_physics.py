@@ -12,7 +12,7 @@ from actors.physics import resolve_physics
 from actors.physics.engine import World
 from actors.physics.mjx import MjxPhysics
 from actors.physics.native import NativePhysics
-from actors.physics.slots import LEAVES, build_pool
+from actors.physics.slots import LEAVES, Pool
 from actors.taskset import build_taskset
 from common import rotations
 from common.config import TaskConfig
@@ -189,14 +189,13 @@ def test_reset_changes_only_the_masked_worlds(env):
 
 
 def test_slots_are_the_same_bodies_as_models_of_their_own():
-    pool = build_pool(HAND, TASK, OBJECTS)
+    pool = Pool(HAND, TASK, OBJECTS)
     body = pool.model.body("object").id
+    leaves = pool.leaves(OBJECTS)
     for i, obj in enumerate(OBJECTS):
-        np.testing.assert_allclose(pool.leaves["body_mass"][i, body], obj.mass)
-        np.testing.assert_allclose(
-            np.sort(pool.leaves["body_inertia"][i, body]), np.linalg.eigvalsh(obj.inertia), rtol=1e-6
-        )
-    assert set(pool.leaves) == set(LEAVES)
+        np.testing.assert_allclose(leaves["body_mass"][i, body], obj.mass)
+        np.testing.assert_allclose(np.sort(leaves["body_inertia"][i, body]), np.linalg.eigvalsh(obj.inertia), rtol=1e-6)
+    assert set(leaves) == set(LEAVES)
 
 
 @pytest.mark.timeout(400)

@@ -43,7 +43,7 @@ def _worker(taskset, task=TASK, seed=0, batch=BATCH):
 
 
 def test_masks_are_drawn_as_in_the_paper(taskset):
-    _, goal, _, hold = environment.sample_episodes(HAND, TASK, taskset, jax.random.key(0), 4000)
+    _, goal, _, _, hold = environment.sample_episodes(HAND, TASK, taskset, jax.random.key(0), 4000)
     mask = np.asarray(goal.mask)
     named = dict(zip(MASKS, mask.T, strict=True))
     assert abs(named["trajectory"].mean() - 0.5) < 0.08
@@ -54,7 +54,7 @@ def test_masks_are_drawn_as_in_the_paper(taskset):
 
 
 def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(taskset):
-    world, goal, _, _ = environment.sample_episodes(HAND, TASK, taskset, jax.random.key(1), 256)
+    world, goal, *_ = environment.sample_episodes(HAND, TASK, taskset, jax.random.key(1), 256)
     trajectory = np.asarray(goal.mask)[:, 3] > 0
     first = rotations.compose_pose(
         world.object_position,

@@ -1,0 +1,60 @@
+"""Reference poses and trajectories from the policy's own grasps (paper, section Hand Morphology).
+
+Successful episodes under a heading alone leave their final states behind; now and then these replace poses of the task
+set, so that what later episodes ask for is what this hand can do.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from actors.taskset import TaskSet, make_references
+from common.config import TaskConfig
+from common.constraints.poses import Poses
+from common.hands.spec import Hand
+from common.task.types import Array
+
+MAX_HEADING_RAD, MAX_HEADING_M = 0.25, 0.03
+"""Largest errors of a heading whose grasp becomes a reference."""
+
+
+class Grasps(NamedTuple):
+    """Final states of the grasps of a batch of worlds, in the object frame."""
+
+    found: Array
+    """(B,) bool: the world had a successful episode since its grasp was last taken."""
+    object_index: Array
+    """(B,) int."""
+    variant: Array
+    """(B,) int, the axis V of the task set."""
+    q: Array
+    """(B, F) finger angles."""
+    position: Array
+    """(B, 3) wrist."""
+    quaternion: Array
+    """(B, 4)."""
+
+
+@functools.partial(jax.jit, static_argnames=("hand", "task"))
+def renew(hand: Hand, task: TaskConfig, taskset: TaskSet, grasps: Grasps, key: Array) -> TaskSet:
+    """The task set with each grasp in the place of a random reference pose of its object and variant."""
+    slot_key, path_key = jax.random.split(key)
+    objects, poses = taskset.pose_q.shape[0], taskset.pose_q.shape[2]
+    fresh = Poses(grasps.q, grasps.position, grasps.quaternion)
+    path, turns, valid = make_references(
+        hand, fresh, taskset.rest[grasps.object_index], path_key, task.trajectory_points
+    )
+    slot = jax.random.randint(slot_key, grasps.found.shape, 0, poses)
+    # What is written outside of an array is dropped.
+    row = jnp.where(grasps.found & valid.any(-1), grasps.object_index, objects)
+    where = row, grasps.variant, slot
+    return taskset._replace(
+        pose_q=taskset.pose_q.at[where].set(fresh.q, mode="drop"),
+        pose_position=taskset.pose_position.at[where].set(fresh.position, mode="drop"),
+        pose_quaternion=taskset.pose_quaternion.at[where].set(fresh.quaternion, mode="drop"),
+        trajectory_position=taskset.trajectory_position.at[where].set(path, mode="drop"),
+        trajectory_quaternion=taskset.trajectory_quaternion.at[where].set(turns, mode="drop"),
+        pose_valid=taskset.pose_valid.at[row, grasps.variant, :, slot].set(valid, mode="drop"),
+    )
