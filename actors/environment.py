@@ -299,7 +299,9 @@ def score(
     error = errors(hand, task, scene, seen, env.goal)
     env = env._replace(grasps=_grasps(task, env, scene, seen, error, up))
     force = jnp.linalg.norm(seen.force, axis=-1)
-    before, after = had_table.astype(jnp.float32), 1.0 - had_table.astype(jnp.float32)
+    # The paper's window ends `hold_steps` after the removal, however much longer the episode holds.
+    window = ~had_table & (env.time <= task.approach_steps + task.hold_steps)
+    before, after = had_table.astype(jnp.float32), window.astype(jnp.float32)
     step = {name: getattr(error, name) * (before if name.startswith("trajectory") else after) for name in _WINDOWED}
     step |= {
         "return": reward,
@@ -339,8 +341,7 @@ def _grasps(
 def _episode(task: TaskConfig, env: EnvironmentState, up: Array) -> Array:
     """(B, fields) metrics of the present episodes, as if they ended now."""
     length = env.time.astype(jnp.float32)
-    before = jnp.full_like(length, task.approach_steps)
-    after = jnp.maximum(length - task.approach_steps, 1.0)
+    before, after = task.approach_steps, max(task.hold_steps, 1)
     metrics = {
         "success": env.kept,
         "held": env.kept & up,

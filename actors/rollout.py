@@ -26,6 +26,8 @@ from common.task.types import Action, Array, Goal, SceneState
 
 Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
 """(parameters, observation (B, D) float32, random key) -> action (B, A), log-probability (B,)."""
+Probe = Callable[[SceneState, Features], Any]
+"""The moment after a control step -> a pytree of arrays that someone wants of every world and step."""
 
 
 class Trace(NamedTuple):
@@ -68,6 +70,8 @@ class Rollout(NamedTuple):
     has_episode: Array
     """(B,) bool."""
     trace: Trace
+    probed: Any
+    """What the probe returned, with leading axis T; None without a probe."""
 
 
 class RolloutWorker:
@@ -84,6 +88,7 @@ class RolloutWorker:
         batch: int,
         seed: int,
         half: bool,
+        probe: Probe = lambda scene, seen: None,
     ):
         """Starts fresh episodes.
 
@@ -96,9 +101,11 @@ class RolloutWorker:
           batch: B, number of worlds.
           seed: seed of episodes and actions.
           half: observations are rounded to float16, for the policy as well as for the learner.
+          probe: what else to keep of every step.
         """
         self.physics = physics
         self._hand, self._task, self._taskset, self._policy = hand, task, taskset, policy
+        self._probe = probe
         self._dtype = jnp.float16 if half else jnp.float32
         self._weights, self._control, self._stationary = task.reward, task.control, np.array(False)
         episode_key, self._key = jax.random.split(jax.random.key(seed))
@@ -125,6 +132,13 @@ class RolloutWorker:
         found = self.env.grasps.found
         self.env = self.env._replace(grasps=self.env.grasps._replace(found=jnp.zeros_like(found)))
 
+    def restart(self) -> None:
+        """Fresh episodes in every world."""
+        everywhere = jnp.ones_like(self.env.bad)
+        self.env = self._restart_jit(self._taskset, self.env, everywhere, self._stationary)
+        self.state = self.physics.reset(self.state, everywhere, self.env.world)
+        self._moment = self._moment_jit(self.env, self.physics.read(self.state))
+
     def renew_references(self) -> None:
         """Puts the grasps that succeeded since the last call into the task set as reference poses."""
         self._key, key = jax.random.split(self._key)
@@ -150,31 +164,31 @@ class RolloutWorker:
 
     def _score(
         self, weights: Any, env: EnvironmentState, readout: Readout, target: Action, action: Array
-    ) -> tuple[EnvironmentState, environment.Score, SceneState, Features, Trace]:
+    ) -> tuple[EnvironmentState, environment.Score, SceneState, Features, tuple[Trace, Any]]:
         env, score, scene, seen = environment.score(self._hand, self._task, weights, env, readout, target)
-        return env, score, scene, seen, _trace(scene, seen, action, score)
+        return env, score, scene, seen, (_trace(scene, seen, action, score), self._probe(scene, seen))
 
     def _collect_stepwise(self, parameters: Any, key: Array, steps: int) -> Rollout:
         scene, seen = self._moment
-        rows, traces = [], []
+        rows, extras = [], []
         for step_key in jax.random.split(key, steps):
             env = self.env
             observation, action, log_probability, target, joints, table = self._act_jit(
                 parameters, self._control, env, scene, seen, step_key
             )
             self.state, readout = self.physics.step(self.state, np.asarray(joints), np.asarray(table))
-            self.env, score, scene, seen, trace = self._score_jit(self._weights, env, readout, target, action)
+            self.env, score, scene, seen, kept = self._score_jit(self._weights, env, readout, target, action)
             rows.append((observation, action, log_probability, score.reward, score.terminal))
-            traces.append(trace)
+            extras.append(kept)
             if bool(np.any(score.terminal)):
                 self.env = self._restart_jit(self._taskset, self.env, score.terminal, self._stationary)
                 self.state = self.physics.reset(self.state, score.terminal, self.env.world)
                 scene, seen = self._moment_jit(self.env, self.physics.read(self.state))
         self._moment = scene, seen
         columns = [np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)]
-        trace = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(traces))
+        trace, probed = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(extras))
         last = self._observe_jit(scene, seen, self.env.goal)
-        return Rollout(*(*columns, last, self.env.finished, self.env.has_finished, trace))
+        return Rollout(*(*columns, last, self.env.finished, self.env.has_finished, trace, probed))
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         carry = (self.env, self.state, self._moment)
@@ -214,10 +228,10 @@ class RolloutWorker:
             carry = jax.lax.cond(jnp.any(score.terminal), renew, lambda x: x, (env, state, (scene, seen)))
             return carry, (observation, action, log_probability, score.reward, score.terminal, kept)
 
-        carry, (*columns, trace) = jax.lax.scan(body, carry, jax.random.split(key, steps))
+        carry, (*columns, (trace, probed)) = jax.lax.scan(body, carry, jax.random.split(key, steps))
         env, _, (scene, seen) = carry
         last = observe(self._task, scene, seen, env.goal).astype(self._dtype)
-        return carry, Rollout(*(*columns, last, env.finished, env.has_finished, trace))
+        return carry, Rollout(*(*columns, last, env.finished, env.has_finished, trace, probed))
 
 
 def _trace(scene: SceneState, seen: Features, action: Array, score: environment.Score) -> Trace:

@@ -1,96 +1,59 @@
-"""Evaluation by the paper's protocol: the deterministic policy, one table row for each set of constraints."""
+"""Evaluation by the paper's protocol: the deterministic policy under chosen constraints on a pool of objects."""
 
+import contextlib
 import dataclasses
-import json
 import math
-import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from actors.environment import EPISODE_FIELDS, EnvironmentState
+from actors.environment import METRICS, EnvironmentState
 from actors.episode import episode_message
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes, goal_of_world
-from actors.taskset import TaskSet, build_taskset
+from actors.taskset import build_taskset
 from common.config import PhysicsName, TaskConfig
+from common.errors import CongraspError
 from common.hands import get_hand
+from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, mean_action
-from common.task.types import Array, Surface
+from common.task.features import Features
+from common.task.types import Array, SceneState, Surface
 from common.wire.codec import Message
+from services.scores import Row, Sample, active_mask, joined, matching, summarise
 
-TABLES = {
-    "single": ("heading", "pose", "trajectory", "affordance"),
-    "composed": ("pose+trajectory", "trajectory+affordance"),
-}
-"""Rows of the paper's tables, by the constraints that are active."""
-_ERRORS = {
-    "heading": ("heading_rad", "heading_m"),
-    "pose": ("pose_rad", "pose_m"),
-    "trajectory": ("trajectory_rad", "trajectory_m"),
-    "affordance": ("affordance_ratio",),
-}
-_NAMES = {
-    "heading_rad": "heading_rad",
-    "heading_m": "heading_m",
-    "pose_rad": "pose_rad",
-    "pose_m": "pose_m",
-    "trajectory_rad": "traj_rad",
-    "trajectory_m": "traj_m",
-    "affordance_ratio": "affordance_ratio",
-}
+HOLD_SECONDS = 2.0
+"""How long a grasp should last without the table, beyond the paper's quarter of a second."""
+_BATCH = {"native": 64, "warp": 4096, "jax": 256}
+_PATIENCE = 100
 
 
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """One row: rates with 95 % Wilson intervals, errors averaged over successful episodes."""
+def mixture(task: TaskConfig, constraints: Sequence[str]) -> TaskConfig:
+    """The task whose episodes belong to these rows, each row with the same probability or more than others."""
+    asked = [constraint.split("+") for constraint in constraints]
 
-    constraint: str
-    hand: str
-    method: str
-    episodes: int
-    success: float
-    success_low: float
-    success_high: float
-    held: float
-    """Rate of success that also lasts to the end of the hold."""
-    episode_return: float
-    links_at_removal: float
-    force_sum: float
-    """Mean sum of the links' contact forces after the removal, N."""
-    errors: dict[str, float | None]
+    def probability(part: str) -> float:
+        share = sum(part in parts for parts in asked) / len(asked)
+        return share if share in (0.0, 1.0) else 0.5
 
-    def to_json(self) -> dict[str, Any]:
-        """The row as it is written to `--json`."""
-        row = dataclasses.asdict(self)
-        return {**row, **row.pop("errors"), "return": row.pop("episode_return")}
-
-
-def wilson(successes: int, count: int) -> tuple[float, float]:
-    """95 % Wilson score interval of a rate."""
-    if count == 0:
-        return 0.0, 1.0
-    z, p = 1.959964, successes / count
-    middle = p + z * z / (2 * count)
-    spread = z * math.sqrt(p * (1 - p) / count + z * z / (4 * count * count))
-    return (middle - spread) / (1 + z * z / count), (middle + spread) / (1 + z * z / count)
-
-
-def with_constraints(task: TaskConfig, constraint: str) -> TaskConfig:
-    """The task with exactly these constraints active, wherever an object allows them."""
-    parts = constraint.split("+")
     return dataclasses.replace(
         task,
-        p_affordance=float("affordance" in parts),
-        p_pose=float("pose" in parts),
-        p_trajectory=float("trajectory" in parts),
+        p_affordance=probability("affordance"),
+        p_pose=probability("pose"),
+        p_trajectory=probability("trajectory"),
     )
 
 
+def two_seconds(task: TaskConfig) -> int:
+    """Control steps in `HOLD_SECONDS`."""
+    return round(HOLD_SECONDS / task.control_dt)
+
+
 class Evaluator:
-    """A policy on a pool of objects; worlds are built once and used for every row."""
+    """A policy on a pool of objects."""
 
     def __init__(
         self,
@@ -98,7 +61,7 @@ class Evaluator:
         objects: Sequence[GraspObject],
         *,
         physics: PhysicsName = "native",
-        batch: int = 64,
+        batch: int = 0,
         threads: int = 2,
         seed: int = 0,
         task: TaskConfig | None = None,
@@ -109,57 +72,132 @@ class Evaluator:
         Args:
           bundle: the policy.
           objects: what it grasps.
-          physics: engine.
-          batch: worlds that run side by side.
+          physics: engine; not `auto`.
+          batch: worlds that run side by side; 0 chooses by the engine.
           threads: threads of the `native` engine.
           seed: seed of constraints and episodes.
-          task: where it is not to be the bundle's.
-          hold_steps: control steps without the table (the paper's 25 always count as success; the rest as `held`).
+          task: where it is not to be the bundle's; mass and friction are in the middle of their ranges.
+          hold_steps: control steps without the table; the task's, which count for success, if not given.
         """
         base = task or bundle.task
+        hold = hold_steps or base.hold_steps
         self.bundle, self.objects = bundle, objects
-        self.task = dataclasses.replace(base, hold_steps_max=hold_steps or base.hold_steps)
-        self._hold = hold_steps or base.hold_steps
+        self.task = dataclasses.replace(
+            base,
+            hold_steps=min(base.hold_steps, hold),
+            hold_steps_max=hold,
+            mass_range=_nominal(base.mass_range),
+            friction_range=_nominal(base.friction_range),
+        )
+        self._hold = hold
         self._hand = get_hand(bundle.spec.hand)
-        self._physics_name, self._threads, self._batch, self._seed = physics, threads, batch, seed
-        self._taskset: TaskSet = build_taskset(self._hand, self.task, objects, seed)
+        self._physics, self._threads, self._seed = physics, threads, seed
+        self._batch = batch or _BATCH[physics]
+        self._taskset = build_taskset(self._hand, self.task, objects, seed)
 
-    def row(self, constraint: str, episodes: int, progress: Callable[[int], None] = lambda n: None) -> Row:
-        """Runs whole batches until `episodes` have ended, and summarises the first `episodes` of them."""
-        collected = [found for found, _ in self._run(constraint, episodes, progress)]
-        values = {name: np.concatenate([part[name] for part in collected])[:episodes] for name in collected[0]}
-        return summarise(constraint, self.bundle.spec.hand, values)
+    def samples(
+        self, constraints: Sequence[str], episodes: int, progress: Callable[[int], None] = lambda done: None
+    ) -> dict[str, Sample]:
+        """Episodes for every row, in one run: an episode counts for the row whose constraints were all it had.
 
-    def rows(self, constraint: str, episodes: int, count: int) -> list[Row]:
+        Args:
+          constraints: names of rows.
+          episodes: for each row.
+          progress: is told how many episodes of all rows there are.
+
+        Raises:
+          CongraspError: no object of the pool allows a row's constraints, or too few resting poses do.
+        """
+        with self._worker(mixture(self.task, constraints), episodes) as worker:
+            return self._gather(worker, constraints, episodes, progress)
+
+    def samples_of_pools(
+        self,
+        constraint: str,
+        pools: Iterable[Sequence[GraspObject]],
+        episodes: int,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Iterator[Sample]:
+        """`episodes` on this evaluator's objects, then on each of further pools, with nothing compiled anew.
+
+        Args:
+          constraint: name of a row.
+          pools: as many objects each as this evaluator has; primitive ones where the engine is compiled.
+          episodes: on each pool.
+          progress: is told how many episodes of the present pool there are.
+        """
+        with self._worker(mixture(self.task, [constraint]), episodes) as worker:
+            yield self._gather(worker, [constraint], episodes, progress)[constraint]
+            for number, objects in enumerate(pools, 1):
+                self.objects = objects
+                self._taskset = build_taskset(self._hand, self.task, objects, self._seed + number)
+                worker.replace_objects(objects, self._taskset)
+                worker.restart()
+                yield self._gather(worker, [constraint], episodes, progress)[constraint]
+
+    def _gather(
+        self, worker: RolloutWorker, constraints: Sequence[str], episodes: int, progress: Callable[[int], None]
+    ) -> dict[str, Sample]:
+        for constraint in constraints:
+            self._check_available(constraint)
+        found: dict[str, list[Sample]] = {constraint: [] for constraint in constraints}
+        counts = dict.fromkeys(constraints, 0)
+        seen, limit = 0, _PATIENCE * (episodes + self._batch)
+        while min(counts.values()) < episodes:
+            if seen > limit:
+                scarce = min(counts, key=lambda name: counts[name])
+                raise CongraspError(
+                    f"Of {seen} episodes only {counts[scarce]} had the constraints '{scarce}'.",
+                    "Ask for fewer --episodes, or add objects that allow these constraints.",
+                )
+            batch = self._batch_of_episodes(worker)
+            seen += len(batch.values["success"])
+            for name in constraints:
+                sample = batch.where(matching(batch.values, name)).first(episodes - counts[name])
+                found[name].append(sample)
+                counts[name] += len(sample.values["success"])
+            progress(sum(counts.values()))
+        return {name: joined(parts) for name, parts in found.items()}
+
+    def rows(
+        self, constraints: Sequence[str], episodes: int, progress: Callable[[int], None] = lambda done: None
+    ) -> list[Row]:
+        """One row for each set of constraints; see `samples`."""
+        samples = self.samples(constraints, episodes, progress)
+        return [self.row(name, sample) for name, sample in samples.items()]
+
+    def row(self, constraint: str, sample: Sample, group: str = "") -> Row:
+        """A row of episodes of this evaluator's protocol."""
+        held = self._hold == two_seconds(self.task)
+        return summarise(constraint, self.bundle.spec.hand, sample, held_2s=held, group=group)
+
+    def draws(self, constraint: str, episodes: int, count: int) -> list[Row]:
         """`count` rows of `episodes` each from independent draws, to see how much chance there is in one."""
-        collected = [found for found, _ in self._run(constraint, episodes * count, lambda n: None)]
-        values = {name: np.concatenate([part[name] for part in collected]) for name in collected[0]}
-        return [
-            summarise(
-                constraint,
-                self.bundle.spec.hand,
-                {name: column[i * episodes : (i + 1) * episodes] for name, column in values.items()},
-            )
-            for i in range(count)
-        ]
+        sample = self.samples([constraint], episodes * count)[constraint]
+        order = np.arange(episodes * count) // episodes
+        return [self.row(constraint, sample.where(order == i)) for i in range(count)]
 
     def episode(self, constraint: str, tries: int = 1) -> Message:
-        """An episode of world 0 under a set of constraints: the first that succeeds, or the last of `tries`."""
+        """An episode of one world under a set of constraints: the first that succeeds, or the last of `tries`.
+
+        Raises:
+          CongraspError: the pool does not allow these constraints.
+        """
+        self._check_available(constraint)
         message: Message | None = None
-        for _, (env, rollout) in self._run(constraint, tries * min(self._batch, tries), lambda n: None):
-            message = self._message(env, rollout)
-            if message.meta["success"]:
-                break
-        assert message is not None
-        return message
+        with self._worker(mixture(self.task, [constraint]), 1) as worker:
+            for _ in range(_PATIENCE * tries):
+                env = self._begin(worker)
+                rollout = worker.collect(self.bundle.acting, self.task.approach_steps + self._hold)
+                if not matching(_metrics(rollout), constraint)[0]:
+                    continue
+                message, tries = self._message(env, rollout), tries - 1
+                if message.meta["success"] or not tries:
+                    return message
+        raise CongraspError(f"No episode had the constraints '{constraint}'.", "Choose other objects.")
 
     def _message(self, env: EnvironmentState, rollout: Rollout) -> Message:
-        values = np.asarray(rollout.episodes)[0]
-        metrics = {
-            name.removeprefix("episode/"): float(value)
-            for name, value in zip(EPISODE_FIELDS, values, strict=True)
-            if name.startswith("episode/")
-        }
+        metrics = {name: float(column[0]) for name, column in _metrics(rollout).items()}
         return episode_message(
             self._hand,
             self.task,
@@ -175,85 +213,80 @@ class Evaluator:
             },
         )
 
-    def _run(self, constraint: str, episodes: int, progress: Callable[[int], None]) -> Any:
-        task = with_constraints(self.task, constraint)
-        physics = make_physics(self._physics_name, self._hand, task, self.objects, threads=self._threads)
-        layout = self.bundle.spec.layout
+    def _check_available(self, constraint: str) -> None:
+        affordance, *pose, trajectory = active_mask(constraint)
+        allowed = np.ones(self._taskset.has_affordance.shape, bool)
+        if affordance:
+            allowed &= np.asarray(self._taskset.has_affordance)
+        if trajectory or any(pose):
+            allowed &= np.asarray(self._taskset.pose_valid)[:, int(affordance)].any(-1)
+        if not allowed.any():
+            raise CongraspError(
+                f"None of the {len(self.objects)} objects allows the constraint '{constraint}'.",
+                "An affordance needs labelled parts, poses and trajectories need room above the table.",
+            )
+
+    @contextlib.contextmanager
+    def _worker(self, task: TaskConfig, episodes: int) -> Iterator[RolloutWorker]:
+        """Worlds that act by the policy's mean, not many more than `episodes` of each row need."""
+        rows = 2 ** sum(p not in (0.0, 1.0) for p in (task.p_affordance, task.p_pose, task.p_trajectory))
+        batch = min(self._batch, 1 << (episodes * rows - 1).bit_length())
+        physics = make_physics(self._physics, self._hand, task, self.objects, threads=self._threads)
+        layout, hand = self.bundle.spec.layout, self._hand
 
         def policy(acting: Any, observation: Array, key: Array) -> tuple[Array, Array]:
             return mean_action(layout, acting, observation), observation[..., 0] * 0.0
 
+        def probe(scene: SceneState, seen: Features) -> tuple[Array, Array]:
+            force = jnp.linalg.norm(seen.force, axis=-1)
+            return force.astype(jnp.float16), torque_share(hand, scene).astype(jnp.float16)
+
         try:
             worker = RolloutWorker(
-                self._hand,
-                dataclasses.replace(task, hold_steps_max=self._hold),
-                physics,
-                self._taskset,
-                policy,
-                batch=min(self._batch, episodes),
-                seed=self._seed,
-                half=False,
+                hand, task, physics, self._taskset, policy, batch=batch, seed=self._seed, half=False, probe=probe
             )
-            done = 0
-            while done < episodes:
-                env = worker.env
-                rollout: Rollout = worker.collect(self.bundle.acting, task.approach_steps + self._hold)
-                found = finished_episodes(rollout)
-                done += len(found["episode/success"])
-                progress(min(done, episodes))
-                yield found, (env, rollout)
+            yield worker
         finally:
             physics.close()
 
+    def _begin(self, worker: RolloutWorker) -> EnvironmentState:
+        """Gives the episodes that begin now the full hold, whatever was drawn for them."""
+        worker.env = worker.env._replace(hold=jnp.full_like(worker.env.hold, self._hold))
+        return worker.env
 
-def summarise(constraint: str, hand: str, values: dict[str, np.ndarray]) -> Row:
-    """A row from metrics (E,) of episodes, by the names of `actors.environment.EPISODE_FIELDS`."""
-    success = values["episode/success"] > 0
-    low, high = wilson(int(success.sum()), len(success))
-    errors: dict[str, float | None] = dict.fromkeys(_NAMES.values())
-    for part in constraint.split("+"):
-        for name in _ERRORS[part]:
-            errors[_NAMES[name]] = float(values[f"episode/{name}"][success].mean()) if success.any() else None
-    return Row(
-        constraint=constraint,
-        hand=hand,
-        method="ours",
-        episodes=len(success),
-        success=float(success.mean()),
-        success_low=low,
-        success_high=high,
-        held=float((values["episode/held"] > 0).mean()),
-        episode_return=float(values["episode/return"].mean()),
-        links_at_removal=float(values["episode/links_at_removal"].mean()),
-        force_sum=float(values["episode/force_sum"].mean()),
-        errors=errors,
-    )
+    def _batch_of_episodes(self, worker: RolloutWorker) -> Sample:
+        """One episode of every world; all of them begin and end together.
 
-
-def write_json(rows: Sequence[Row], path: pathlib.Path) -> None:
-    """Writes `{"rows": [...]}`."""
-    path.write_text(json.dumps({"rows": [row.to_json() for row in rows]}, indent=2))
+        It is collected in pieces, so that a large batch's observations need not be in memory for all steps.
+        """
+        start, window = self.task.approach_steps, self.task.hold_steps
+        length = start + self._hold
+        piece = math.gcd(start, self._hold)
+        piece = piece if piece >= 10 else length
+        kept: list[Any] = []
+        self._begin(worker)
+        for step in range(0, length, piece):
+            rollout = worker.collect(self.bundle.acting, piece)
+            if step + piece > start and step < start + window:
+                rows = slice(max(0, start - step), start + window - step)
+                kept.append([np.asarray(values)[rows].swapaxes(0, 1) for values in rollout.probed])
+        force, torque = (np.concatenate(parts, 1) for parts in zip(*kept, strict=True))
+        return Sample(_metrics(rollout), force, torque)
 
 
-def table_of(rows: Sequence[Row], title: str) -> Any:
-    """Rows as a rich table."""
-    from rich.table import Table
-
-    table = Table(title=title)
-    for column in ("constraint", "episodes", "success", "95 %", "held", "error", "force"):
-        table.add_column(column, justify="left" if column in ("constraint", "error") else "right")
-    for row in rows:
-        parts = [f"{value:.3f} {_UNITS[name]}" for name, value in row.errors.items() if value is not None]
-        table.add_row(
-            row.constraint,
-            str(row.episodes),
-            f"{100 * row.success:.1f} %",
-            f"{100 * row.success_low:.1f}-{100 * row.success_high:.1f}",
-            f"{100 * row.held:.1f} %",
-            ", ".join(parts),
-            f"{row.force_sum:.1f} N",
-        )
-    return table
+def _nominal(bounds: tuple[float, float]) -> tuple[float, float]:
+    middle = (bounds[0] + bounds[1]) / 2
+    return middle, middle
 
 
-_UNITS = {name: name.rsplit("_", 1)[1] for name in _NAMES.values()}
+def torque_share(hand: Hand, scene: SceneState) -> Array:
+    """(B, F) |clip(kp (q_target - q) - kv q_velocity, limit)| / limit: finger torques by the hand's position servos."""
+    gains = np.array([(joint.kp, joint.kv, joint.torque_limit) for joint in hand.joints], np.float32)
+    torque = gains[:, 0] * (scene.q_target - scene.q) - gains[:, 1] * scene.q_velocity
+    return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)
+
+
+def _metrics(rollout: Rollout) -> dict[str, np.ndarray]:
+    """Metrics (E,) of the episodes that ended, by the names in `METRICS`."""
+    episodes = finished_episodes(rollout)
+    return {name: episodes[f"episode/{name}"] for name in METRICS}

@@ -19,9 +19,10 @@ from common.policy.bundle import PolicyBundle, policy_spec
 from learner import update as updates
 from learner.process import LOGS, POLICY_FILE, create_run, open_run
 from services.client import PolicyClient
-from services.evaluate import Evaluator, Row
+from services.evaluate import Evaluator
 from services.load import example_episode, one_answer, serving, wait_until_ready
 from services.render import episode_sheet
+from services.scores import Row
 from services.sheets import save_png
 from services.shutdown import on_signal
 from services.train import train, train_in_process
@@ -173,7 +174,7 @@ def _evaluator(policy: PolicyBundle, config: RunConfig, seed: int, batch: int) -
 def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, when: str) -> list[Row]:
     """Rows of the heading constraint for three draws of episodes, on objects that training never sees."""
     console.print(f"Evaluating {when}: {_SEEDS} x {episodes} episodes on {_EVALUATION_OBJECTS} held-out objects …")
-    return _evaluator(policy, config, 0, episodes).rows("heading", episodes, _SEEDS)
+    return _evaluator(policy, config, 0, episodes).draws("heading", episodes, _SEEDS)
 
 
 def _compare(before: list[Row], after: list[Row]) -> None:

@@ -18,7 +18,7 @@ from common.hands import get_hand
 from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
 from common.objects import procedural
 from common.task.observation import layout
-from common.task.types import MASKS
+from common.task.types import MASKS, Action
 
 HAND = get_hand("human")
 TASK = TaskConfig()
@@ -95,6 +95,11 @@ def test_rollouts_go_through_whole_episodes_and_on(taskset):
     assert not np.asarray(second.terminal).any() and not len(finished_episodes(second)["episode/return"])
     # The first observation of a rollout is the last one of the rollout before.
     np.testing.assert_array_equal(second.observation[0], first.last_observation)
+    assert np.all(np.asarray(worker.env.time) == 30)
+    worker.restart()
+    assert not np.asarray(worker.env.time).any()
+    third = worker.collect(None, 1)
+    np.testing.assert_allclose(third.trace.object_position[0], worker.env.world.object_position[0], atol=0.01)
     worker.physics.close()
 
 
@@ -121,8 +126,6 @@ def test_a_lifted_object_that_stays_is_a_success(taskset):
     found = np.zeros(readout.contact_found.shape, bool)
     found[:, 0, 0] = True
     readout = readout._replace(contact_found=found)
-    from common.task.types import Action
-
     targets = Action(env.q_target, env.u_target)
     score = jax.jit(lambda e, r: environment.score(HAND, TASK, TASK.reward, e, r, targets)[0])
     for step in range(75):
@@ -133,6 +136,31 @@ def test_a_lifted_object_that_stays_is_a_success(taskset):
     finished = dict(zip(EPISODE_FIELDS, np.asarray(env.finished).T, strict=True))
     np.testing.assert_array_equal(finished["episode/success"], [1.0, 0.0])
     assert set(METRICS) <= {name.removeprefix("episode/") for name in EPISODE_FIELDS}
+    physics.close()
+
+
+def test_a_longer_hold_changes_neither_success_nor_the_errors(taskset):
+    """Errors and forces are those of the paper's 25 steps; only `held` looks at the end of the hold."""
+    task = dataclasses.replace(TASK, hold_steps_max=40)
+    env = environment.start(HAND, task, taskset, jax.random.key(2), 2)
+    env = env._replace(hold=jnp.full(2, 40))
+    physics = NativePhysics(HAND, task, OBJECTS, 1)
+    readout = physics.read(physics.start(env.world))
+    found, force = np.zeros(readout.contact_found.shape, bool), np.zeros(readout.contact_force.shape, np.float32)
+    found[:, 0, 0] = True
+    targets = Action(env.q_target, env.u_target)
+    score = jax.jit(lambda e, r: environment.score(HAND, task, task.reward, e, r, targets)[0])
+    for step in range(1, 91):
+        position = np.array(readout.object_position)
+        position[1, 2] -= 0.06 if step > 80 else 0.0
+        pressed = force.copy()
+        pressed[:, 0, 0, 0] = 3.0 if step <= 75 else 30.0
+        env = score(env, readout._replace(object_position=position, contact_found=found, contact_force=pressed))
+    finished = dict(zip(EPISODE_FIELDS, np.asarray(env.finished).T, strict=True))
+    np.testing.assert_array_equal(finished["episode/length"], [90.0, 90.0])
+    np.testing.assert_array_equal(finished["episode/success"], [1.0, 1.0])
+    np.testing.assert_array_equal(finished["episode/held"], [1.0, 0.0])
+    np.testing.assert_allclose(finished["episode/force_sum"], [3.0, 3.0], rtol=1e-5)
     physics.close()
 
 
