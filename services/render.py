@@ -62,6 +62,26 @@ def hand_shapes(
     return shapes
 
 
+def posed_hand(
+    hand: Hand,
+    q: np.ndarray,
+    position: np.ndarray,
+    wrist: Rotation,
+    colour: tuple[float, float, float],
+    alpha: float = 1.0,
+) -> list[Shape]:
+    """The hand with finger angles (F,) and its wrist at a position (3,) and orientation in the world."""
+    links, quaternion = link_poses(hand, q)
+    turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
+    return hand_shapes(hand, wrist.apply(links) + position, turned, [colour] * len(hand.links), alpha)
+
+
+def table_shape(below: np.ndarray) -> Shape:
+    """A round table top at height zero under a point (3,)."""
+    position = np.array([below[0], below[1], -_TABLE_HALF_HEIGHT], float)
+    return Shape("cylinder", (_TABLE_RADIUS, _TABLE_HALF_HEIGHT, 0), TABLE, position, shine=0.0)
+
+
 def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: tuple[float, float, float]) -> list[Shape]:
     """A shaft with a cone whose tip is at `end` (3,)."""
     along = np.subtract(end, start)
@@ -97,9 +117,7 @@ def episode_shapes(episode: Message, step: int) -> list[Shape]:
     shapes = hand_shapes(hand, arrays["link_position"][step], arrays["link_quaternion"][step], colours)
     shapes.append(_object(episode, step))
     if arrays["table"][step]:
-        below = np.array([0.0, 0.0, -_TABLE_HALF_HEIGHT])
-        start = arrays["object_position"][0] * [1, 1, 0]
-        shapes.append(Shape("cylinder", (_TABLE_RADIUS, _TABLE_HALF_HEIGHT, 0), TABLE, start + below, shine=0.0))
+        shapes.append(table_shape(arrays["object_position"][0]))
     return shapes + _constraints(hand, episode, step)
 
 
@@ -140,11 +158,8 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
         shapes.append(beads(points, 0.0035, WAYPOINT))
     if mask["pose_finger"]:
         wrist = turn * Rotation.from_quat(arrays["goal/pose_quaternion"], scalar_first=True)
-        position, quaternion = link_poses(hand, arrays["goal/pose_q"])
-        world = wrist * Rotation.from_quat(quaternion, scalar_first=True)
-        position = wrist.apply(position) + turn.apply(arrays["goal/pose_position"]) + origin
-        ghost = [APPROACH] * len(hand.links)
-        shapes += hand_shapes(hand, position, world.as_quat(scalar_first=True), ghost, alpha=0.25)
+        position = turn.apply(arrays["goal/pose_position"]) + origin
+        shapes += posed_hand(hand, arrays["goal/pose_q"], position, wrist, APPROACH, alpha=0.25)
     return shapes
 
 

@@ -57,6 +57,7 @@ def evaluate(
     from actors.physics import resolve_physics
     from common.objects.pool import HELD_OUT_SEED
     from common.policy import bundle as bundles
+    from services.objects import objects_of
     from services.scores import TABLES, tables_of, write_json
 
     for name, value, least in (("episodes", episodes, 1), ("pool", pool, 0), ("batch", batch, 0), ("seed", seed, 0)):
@@ -72,7 +73,7 @@ def evaluate(
             task = progress.add_task(text, total=total)
             return lambda done: progress.update(task, completed=done)
 
-        given = _load(objects, track) if objects else None
+        given = objects_of(objects, track) if objects else None
         settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed}
         constraints = [name for key in TABLES if key in table or "all" in table for name in TABLES[key]]
         if constraints:
@@ -93,23 +94,6 @@ def evaluate(
         }
         write_json(rows, json, about)
     return 0
-
-
-def _load(path: pathlib.Path, track: Track) -> "list[GraspObject]":
-    """Objects of a catalogue's folder or file, or meshes to import."""
-    from common.objects import store
-    from common.objects.meshes import ImportOptions, import_source
-    from common.objects.sources import find_sources
-
-    files = [path] if path.suffix == store.SUFFIX else sorted(path.glob(f"*{store.SUFFIX}"))
-    if files:
-        return [store.load(file) for file in files]
-    sources = find_sources(path)
-    advance, loaded = track("Importing objects", len(sources)), []
-    for source in sources:
-        loaded.append(import_source(source, ImportOptions())[0])
-        advance(len(loaded))
-    return loaded
 
 
 def _constraint_rows(

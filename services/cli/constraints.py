@@ -1,0 +1,114 @@
+"""Constraint sets of objects: headings, reference poses and wrist trajectories as training draws them."""
+
+import dataclasses
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from common.errors import CongraspError
+from common.objects.spec import GraspObject
+
+_console = Console(highlight=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class ConstraintsGenerate:
+    """Makes the constraint sets of objects and writes one file each, which says what its arrays mean.
+
+    For the whole surface and for the graspable region O+: 256 headings by the paper's rules, reference poses that
+    close the hand around the object, and wrist trajectories that end at them.
+    """
+
+    objects: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7."""
+    count: int = 0
+    """Besides, this many procedural objects."""
+    families: tuple[str, ...] = ()
+    """Their families, in turn; all if none is named."""
+    first_seed: int = 0
+    """Seed of the first of them; the others follow."""
+    hand: str = "human"
+    """Name of the hand."""
+    folder: str = "objects"
+    """Folder of objects."""
+    out: pathlib.Path = pathlib.Path("constraints")
+    """Folder for the files."""
+    seed: int = 0
+    """Seed of the constraints."""
+
+    def run(self) -> int:
+        """Runs the command; returns its exit code."""
+        from common.config import TaskConfig
+        from common.hands import get_hand
+        from common.objects.procedural import generate_many
+        from services.constraint_sets import make_sets, save
+
+        if not self.objects and self.count < 1:
+            raise CongraspError("There is no object to make constraints for.", "Name objects, or set --count.")
+        hand = get_hand(self.hand)
+        with _console.status("Preparing objects") as status:
+            objects = [obj for text in self.objects for obj in _find(text, self.folder)]
+            objects += generate_many(self.count, self.first_seed, self.families)
+            status.update(f"Making the constraints of {len(objects)} objects")
+            for constraints in make_sets(hand, TaskConfig(hand=hand.name), objects, self.seed):
+                save(constraints, self.out)
+        _console.print(f"The constraint sets of {len(objects)} objects are in {escape(str(self.out))}.")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class ConstraintsShow:
+    """Says what a constraint set holds, and draws some of it."""
+
+    file: Annotated[pathlib.Path, tyro.conf.Positional]
+    """A file of 'congrasp constraints generate'."""
+    png: pathlib.Path | None = None
+    """Picture to write: headings, affordance, trajectories and reference poses."""
+    rest: int = 1
+    """Resting pose of the picture, from 1."""
+    seed: int = 0
+    """Draws which constraints the picture shows."""
+
+    def run(self) -> int:
+        """Runs the command; returns its exit code."""
+        from services.constraint_sets import describe, load
+
+        constraints = load(self.file)
+        rests = len(constraints.arrays["rest"])
+        if not 1 <= self.rest <= rests:
+            raise CongraspError(f"--rest is {self.rest}.", f"The object has the resting poses 1 to {rests}.")
+        table = Table(show_header=False, box=None)
+        for key, value in describe(constraints).items():
+            table.add_row(key, escape(value))
+        _console.print(table)
+        if self.png is not None:
+            from services.constraint_sheet import constraint_sheet
+            from services.sheets import save_png
+
+            save_png(self.png, constraint_sheet(constraints, self.rest - 1, self.seed))
+            _console.print(f"The picture is {escape(str(self.png))}.")
+        return 0
+
+
+def _find(text: str, folder: str) -> list[GraspObject]:
+    from services.cli.objects import find_object
+    from services.objects import objects_of
+
+    path = pathlib.Path(text)
+    return objects_of(path) if path.exists() else [find_object(text, folder)]
+
+
+SUBCOMMANDS: dict[str, Callable[..., Any]] = {"generate": ConstraintsGenerate, "show": ConstraintsShow}
+
+
+def parse(arguments: Sequence[str]) -> Callable[[], int]:
+    """The command that the arguments name, ready to run."""
+    chosen = tyro.extras.subcommand_cli_from_dict(
+        SUBCOMMANDS, prog="congrasp constraints", description=__doc__, args=list(arguments)
+    )
+    return chosen.run

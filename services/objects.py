@@ -1,0 +1,33 @@
+"""Objects that a user points to: folders of object files, object files, and meshes to import."""
+
+import pathlib
+from collections.abc import Callable
+
+from common.objects import store
+from common.objects.meshes import ImportOptions, import_source
+from common.objects.sources import find_sources
+from common.objects.spec import GraspObject
+
+
+def objects_of(
+    path: pathlib.Path, track: Callable[[str, int | None], Callable[[int], None]] | None = None
+) -> list[GraspObject]:
+    """Every object of a path, which is what 'congrasp objects import' made or what it takes.
+
+    Args:
+      path: a folder of object files or one of them; or meshes, see `common.objects.sources.find_sources`.
+      track: (what is done, how much) -> what is told how much is done; import may take long.
+
+    Raises:
+      CongraspError: there is nothing of the kind, or it cannot be read or imported.
+    """
+    files = [path] if path.suffix == store.SUFFIX else sorted(path.glob(f"*{store.SUFFIX}"))
+    if files:
+        return [store.load(file) for file in files]
+    sources = find_sources(path)
+    advance = track("Importing objects", len(sources)) if track else lambda done: None
+    objects = []
+    for source in sources:
+        objects.append(import_source(source, ImportOptions())[0])
+        advance(len(objects))
+    return objects
