@@ -15,6 +15,7 @@ from actors.rollout import Rollout, RolloutWorker, finished_episodes, goal_of_wo
 from actors.taskset import build_taskset
 from common.config import PhysicsName, RunConfig, run_config_from_json
 from common.hands import get_hand
+from common.logs.channels import finite
 from common.objects.pool import load_pool
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
 from common.task.types import Surface
@@ -124,13 +125,18 @@ class _Actor:
         rollout = self._worker.collect(bundle.acting, config.rollout_steps)
         steps = config.rollout_steps * config.environments
         names = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
-        arrays = {name: getattr(rollout, name) for name in names} | finished_episodes(rollout)
+        episodes, left_out = countable(finished_episodes(rollout))
+        arrays = {name: getattr(rollout, name) for name in names} | episodes
         if config.task.own_references:
             self._worker.renew_references()
         meta = {"version": bundle.version, "schema": self._spec.schema, "steps": steps}
         self._link.upload(Message(arrays, meta), ticket)
         seconds = time.time() - began
-        values = {"steps_per_second": steps / seconds, "rollouts": self._rollouts + 1.0}
+        values = {
+            "steps_per_second": steps / seconds,
+            "rollouts": self._rollouts + 1.0,
+            "episodes_left_out": float(left_out),
+        }
         self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
         if self._rollouts % config.episode_every == 0 and started_fresh:
             self._publish_episode(bundle, rollout, env)
@@ -154,4 +160,12 @@ class _Actor:
         self._publish("episode", message)
 
     def _publish(self, kind: str, message: Message) -> None:
+        # JSON has no NaN: one such number would cost the whole message.
+        message = Message(message.arrays, finite(message.meta))
         self._transport.publish(self._link.keys.log(kind, "actor", self._link.actor), message)
+
+
+def countable(episodes: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
+    """The episodes whose metrics (E,) are all finite numbers, and how many are not: the learner takes no others."""
+    fine = np.isfinite(np.stack(list(episodes.values()))).all(0)
+    return {name: values[fine] for name, values in episodes.items()}, int((~fine).sum())

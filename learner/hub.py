@@ -21,7 +21,7 @@ from common.errors import CongraspError
 from common.transport.base import Transport
 from common.transport.keys import Alive, Keys, check_name, parse_alive
 from common.wire.codec import Message, SharedMessage
-from common.wire.messages import TICKET, RolloutHeader, validate, validate_bundle, validate_rollout
+from common.wire.messages import TICKET, RolloutForm, RolloutHeader, validate, validate_bundle, validate_rollout
 from learner.staleness import Owner, StalenessManager
 
 _INCARNATIONS = 1024  # whose marks are kept
@@ -80,8 +80,7 @@ class LearnerHub:
         config_json: str,
         epoch: str,
         schema: str,
-        observation_size: int,
-        action_size: int,
+        form: RolloutForm,
         staleness: StalenessManager,
         queue_limit: int = 64,
         name: str = "0",
@@ -95,8 +94,7 @@ class LearnerHub:
           config_json: the run's configuration, for actors that connect.
           epoch: identifies this training; another one after a start from scratch, the same after a resume.
           schema: policy schema that rollouts must have.
-          observation_size: D.
-          action_size: A.
+          form: sizes that all rollouts must have: an actor with others is refused alone.
           staleness: admission, at its start.
           queue_limit: rollouts that wait for an update.
           name: the learner's name, for logs.
@@ -111,7 +109,7 @@ class LearnerHub:
         self._transport = transport
         self._config = config_json
         self._schema = schema
-        self._observation_size, self._action_size = observation_size, action_size
+        self._form = form
         self._staleness = staleness
         self._limit = queue_limit
         self._name = check_name("learner", name)
@@ -251,12 +249,7 @@ class LearnerHub:
         meta = message.meta
         ticket = str(meta.get("ticket", ""))
         try:
-            header = validate_rollout(
-                message,
-                observation_size=self._observation_size,
-                action_size=self._action_size,
-                schema=self._schema,
-            )
+            header = validate_rollout(message, self._form, schema=self._schema)
         except CongraspError as error:
             self._staleness.refuse_damaged((str(meta.get("actor")), str(meta.get("incarnation"))), ticket)
             self._event("warning", f"A rollout was refused: {error}", kind="refused")

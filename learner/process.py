@@ -19,11 +19,13 @@ import numpy as np
 from common.config import RunConfig, run_config_from_json, to_json
 from common.errors import CongraspError, PhysicsError
 from common.files import write_atomically
+from common.logs.channels import finite
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, PolicySpec
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode
+from common.wire.messages import RolloutForm
 from learner import update as updates
 from learner.checkpoint import Checkpoints, flatten
 from learner.hub import LearnerHub
@@ -159,8 +161,13 @@ class _Learner:
             config_json=to_json(config),
             epoch=self._epoch,
             schema=self._spec.schema,
-            observation_size=sum(size for _, size in self._spec.layout),
-            action_size=self._spec.action_size,
+            form=RolloutForm(
+                config.rollout_steps,
+                config.environments,
+                sum(size for _, size in self._spec.layout),
+                self._spec.action_size,
+                config.half_observations,
+            ),
             staleness=StalenessManager(config.ppo.max_staleness, config.ppo.rollouts_per_update),
             name=name,
             durable=hub_state,
@@ -294,5 +301,5 @@ class _Learner:
         self._log("event", {"level": level, "text": text})
 
     def _log(self, kind: str, meta: dict[str, object]) -> None:
-        message = Message(meta={"time": time.time(), **meta})
+        message = Message(meta=finite({"time": time.time(), **meta}))
         self._transport.publish(self._keys.log(kind, "learner", self._name), message)

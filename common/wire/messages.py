@@ -206,28 +206,46 @@ class RolloutHeader(NamedTuple):
         return self.actor, self.incarnation
 
 
-def validate_rollout(
-    message: Message, *, observation_size: int, action_size: int, schema: str | None = None
-) -> RolloutHeader:
+class RolloutForm(NamedTuple):
+    """What the rollouts of one run have in common, so that any of them make a batch without another compilation."""
+
+    steps: int
+    """T."""
+    worlds: int
+    """B."""
+    observation: int
+    """D."""
+    action: int
+    """A."""
+    half: bool
+    """Observations are float16, or else float32."""
+
+
+def validate_rollout(message: Message, form: RolloutForm, *, schema: str | None = None) -> RolloutHeader:
     """Checks a rollout.
 
     Args:
       message: a rollout.
-      observation_size: D.
-      action_size: A.
+      form: sizes and type that it must have.
       schema: the policy schema that it must have been made with, if that matters.
 
     Raises:
       CongraspError: naming the array or the entry, and the rule that it breaks.
     """
-    sizes = validate(message, ROLLOUT, D=observation_size, A=action_size)
+    validate(message, ROLLOUT, T=form.steps, B=form.worlds, D=form.observation, A=form.action)
+    dtype = "float16" if form.half else "float32"
+    for name in ("observation", "last_observation"):
+        if str(message.arrays[name].dtype) != dtype:
+            raise CongraspError(f"The rollout's array '{name}' has dtype {message.arrays[name].dtype}, not {dtype}.")
     header = RolloutHeader(*(message.meta[name] for name in RolloutHeader._fields))
     check_name("actor", header.actor)
     check_name("incarnation", header.incarnation)
     if not (0 <= header.sequence < _COUNTS and 0 <= header.version < _COUNTS):
         raise CongraspError("The rollout's meta entries 'sequence' and 'version' must be counts.")
-    if header.steps != sizes["T"] * sizes["B"] or header.steps == 0:
-        raise CongraspError(f"The rollout's meta entry 'steps' is {header.steps}, not T*B = {sizes['T']}*{sizes['B']}.")
+    if header.steps != form.steps * form.worlds:
+        raise CongraspError(
+            f"The rollout's meta entry 'steps' is {header.steps}, not T*B = {form.steps}*{form.worlds}."
+        )
     if schema is not None and header.schema != schema:
         raise CongraspError(
             f"The rollout was made with the policy schema {ascii(header.schema)[:40]}, not {schema}.",

@@ -6,7 +6,16 @@ import pytest
 
 from common.errors import CongraspError
 from common.wire.codec import Message, decode, encode
-from common.wire.messages import EPISODE, EVENT, MessageSpec, is_finite, validate, validate_bundle, validate_rollout
+from common.wire.messages import (
+    EPISODE,
+    EVENT,
+    MessageSpec,
+    RolloutForm,
+    is_finite,
+    validate,
+    validate_bundle,
+    validate_rollout,
+)
 
 T, B, D, A, E = 3, 2, 5, 4, 1
 
@@ -30,7 +39,7 @@ def rollout(arrays=None, **meta):
 
 
 def check(message, **options):
-    return validate_rollout(message, observation_size=D, action_size=A, **options)
+    return validate_rollout(message, RolloutForm(T, B, D, A, half=True), **options)
 
 
 def test_valid_rollout_gives_its_header():
@@ -63,6 +72,8 @@ def full(shape, value, dtype=np.float32):
         ({"reward": np.zeros((T + 1, B), np.float32)}, r"'reward' has shape \(4, 2\), not \(T=3, B=2\)"),
         ({"reward": np.zeros((T, B, 1), np.float32)}, "'reward' has shape"),
         ({"last_observation": np.zeros((B + 1, D), np.float16)}, "'last_observation' has shape"),
+        ({"observation": np.zeros((T, B, D), np.float32)}, "'observation' has dtype float32, not float16"),
+        ({"last_observation": np.zeros((B, D), np.float32)}, "'last_observation' has dtype float32, not float16"),
         ({"term/distance": np.zeros(E + 1, np.float32)}, "'term/distance' has shape"),
         ({"observation": full((T, B, D), np.nan, np.float16)}, "'observation' has values that are not finite"),
         ({"observation": full((T, B, D), -np.inf, np.float16)}, "'observation' has values that are not finite"),
@@ -99,7 +110,7 @@ def test_empty_rollout_is_refused():
     nothing = {
         name: array[:0] for name, array in rollout().arrays.items() if "/" not in name and name != "last_observation"
     }
-    with pytest.raises(CongraspError, match="'steps' is 0"):
+    with pytest.raises(CongraspError, match=r"has shape \(0, 2, 5\), not \(T=3, B=2, D=5\)"):
         check(rollout(nothing, steps=0))
 
 

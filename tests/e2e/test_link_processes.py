@@ -23,13 +23,14 @@ from common.errors import CongraspError, TransportError
 from common.transport.keys import Keys
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message, encode
+from common.wire.messages import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 
 pytestmark = pytest.mark.timeout(60)
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 KEYS = Keys("chaos")
-B, D, A = 16, 32, 4
+T, B, D, A = 20, 16, 32, 4
 BATCH = 2
 
 
@@ -56,7 +57,7 @@ def rollout(steps, value, version):
 # --- the two roles ---
 
 
-def run_learner(endpoint, epoch, checkpoint):
+def run_learner(endpoint, epoch, checkpoint, steps):
     """Consumes batches and checkpoints after each, until it is told to stop (SIGTERM) or killed."""
     path = pathlib.Path(checkpoint)
     saved = json.loads(path.read_text()) if path.exists() else {"durable": None, "history": [], "version": 0}
@@ -65,8 +66,9 @@ def run_learner(endpoint, epoch, checkpoint):
     signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
     with ZenohTransport(listen=[endpoint], max_message=64 << 20) as transport:
         hub = LearnerHub(
-            transport, run="chaos", config_json="{}", epoch=epoch, schema="s", observation_size=D, action_size=A,
-            staleness=StalenessManager(1, BATCH), durable=saved["durable"],
+            transport, run="chaos", config_json="{}", epoch=epoch, schema="s",
+            form=RolloutForm(int(steps), B, D, A, half=True), staleness=StalenessManager(1, BATCH),
+            durable=saved["durable"],
         )  # fmt: skip
         hub.publish_weights(bundle(version, epoch), version)
         print("ready", flush=True)
@@ -143,6 +145,7 @@ class Cluster:
         self.folder = folder
         self.endpoint = f"tcp/127.0.0.1:{base_port()}"
         self.checkpoint = folder / "checkpoint"
+        self.steps = T
         self.processes = []
         self.observer = None
 
@@ -156,14 +159,14 @@ class Cluster:
         return process
 
     def start_learner(self, epoch="e"):
-        process = self.start("learner", epoch, self.checkpoint)
+        process = self.start("learner", epoch, self.checkpoint, self.steps)
         assert process.stdout.readline() == b"ready\n", (self.folder / "learner.err").read_text()
         if self.observer is None:
             self.observer = ZenohTransport(connect=[self.endpoint], max_message=64 << 20)
         return process
 
-    def start_actor(self, name="a", steps=20):
-        return self.start("actor", name, steps, self.folder / f"{name}.log")
+    def start_actor(self, name="a"):
+        return self.start("actor", name, self.steps, self.folder / f"{name}.log")
 
     def status(self):
         try:
@@ -229,9 +232,10 @@ def assert_books_balance(final):
 
 
 def test_actor_killed_while_it_uploads_leaves_nothing_behind(cluster):
+    cluster.steps = 2000  # a rollout has about 2.8 MB, and one is always on its way
     learner = cluster.start_learner()
     for _ in range(3):
-        actor = cluster.start_actor(steps=2000)  # about 2.8 MB, always one on its way
+        actor = cluster.start_actor()
         before = cluster.wait(lambda status: len(actors(status)) == 1)["ledger"]["accepted"]
         cluster.wait(lambda status, before=before: status["ledger"]["accepted"] >= before + 4)
         time.sleep(random.uniform(0, 0.05))
@@ -316,15 +320,16 @@ def test_hostile_messages_harm_nobody_else(cluster):
     header = {"actor": "evil", "incarnation": "66", "sequence": 0, "epoch": "e", "ticket": "x"}
 
     def evil(arrays=None, **meta):
-        good = rollout(4, 0, cluster.status()["version"])
+        good = rollout(T, 0, cluster.status()["version"])
         return Message({**good.arrays, **(arrays or {})}, {**good.meta, **header, **meta})
 
     refused = [
-        evil({"reward": np.full((4, B), np.nan, np.float32)}),
-        evil({"observation": np.full((4, B, D), np.inf, np.float16)}),
-        evil({"action": np.zeros((4, B, A + 1), np.float32)}),
+        evil({"reward": np.full((T, B), np.nan, np.float32)}),
+        evil({"observation": np.full((T, B, D), np.inf, np.float16)}),
+        evil({"action": np.zeros((T, B, A + 1), np.float32)}),
         evil({"optimizer": np.zeros(3)}),
         evil(schema="other"),
+        evil(rollout(T + 1, 0, 0).arrays, steps=(T + 1) * B),
         evil(steps=10**9),
         evil(sequence=-1),
         evil(actor="../../x"),

@@ -1,5 +1,6 @@
 """The learner's end, over the in-memory transport."""
 
+import re
 import threading
 import time
 
@@ -13,8 +14,10 @@ from common.transport.base import RefusedError
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
+from common.wire.messages import RolloutForm
 from learner.hub import LearnerHub, _Marks
 from learner.staleness import StalenessManager
+from learner.update import collate
 
 pytestmark = pytest.mark.timeout(30)
 KEYS = Keys("test")
@@ -50,7 +53,7 @@ class Bench:
         self.server, self.peer = MemoryTransport(shared), MemoryTransport(shared)
         self.staleness = StalenessManager(max_staleness, batch)
         defaults = {"run": "test", "config_json": "{}", "epoch": "e", "schema": "s"}
-        sizes = {"observation_size": D, "action_size": A}
+        sizes = {"form": RolloutForm(T, B, D, A, half=True)}
         self.hub = LearnerHub(self.server, **{**defaults, **sizes, **options}, staleness=self.staleness)
 
     def ask(self, key, meta=None, arrays=None):
@@ -217,6 +220,29 @@ def test_hostile_rollouts_are_refused_alone(bench, change, why):
     assert reply["outcome"] == "refused" and why in reply["why"]
     assert b.ledger()["damaged"] == 1 and b.ledger()["queued"] == 0
     assert b.send(0)["outcome"] == "accepted"
+
+
+def _sized(steps, worlds):
+    """A rollout that agrees with itself, of so many control steps of so many worlds."""
+    good = rollout()
+    arrays = {name: np.resize(array, (steps, worlds, *array.shape[2:])) for name, array in good.arrays.items()}
+    arrays["last_observation"] = np.zeros((worlds, D), np.float16)
+    return Message(arrays, {**good.meta, "steps": steps * worlds})
+
+
+@pytest.mark.parametrize(
+    ("steps", "worlds", "rule"),
+    [(T + 1, B, r"\(4, 2, 5\), not \(T=3, B=2"), (T, B + 1, r"\(3, 3, 5\), not \(T=3, B=2")],
+)
+def test_an_actor_of_another_configuration_is_refused_alone(bench, steps, worlds, rule):
+    """Batches are counted in rollouts, so one of another length or width would not fit beside the others."""
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    reply = b.peer.query(KEYS.rollout, _sized(steps, worlds), timeout=5).meta
+    assert reply["outcome"] == "refused" and re.search(rule, reply["why"])
+    assert b.send(0)["outcome"] == b.send(1)["outcome"] == "accepted"
+    batch = b.hub.next_batch(2, 1)
+    assert collate([message.arrays for message in batch])["reward"].shape == (T, 2 * B)
 
 
 def test_refusal_ends_the_ticket(bench):

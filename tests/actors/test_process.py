@@ -1,0 +1,138 @@
+"""What an actor sends, with rollouts that a test invents and a real learner's end."""
+
+import threading
+import types
+
+import jax
+import numpy as np
+import pytest
+
+from actors import process
+from actors.environment import EPISODE_FIELDS
+from actors.rollout import Rollout, Trace
+from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
+from common.hands import get_hand
+from common.objects import procedural
+from common.policy.bundle import PolicyBundle, policy_spec
+from common.task.reward import TERMS
+from common.task.types import Goal, Surface
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.wire.codec import encode
+from common.wire.messages import EPISODE, RolloutForm, validate
+from learner.hub import LearnerHub
+from learner.staleness import StalenessManager
+from learner.update import init_state
+
+T, B = 5, 3
+CONFIG = RunConfig(
+    name="t",
+    environments=B,
+    rollout_steps=T,
+    episode_every=1,
+    objects=ObjectsConfig(count=1),
+    network=NetworkConfig(hidden=(8,), encoder=2),
+    ppo=PPOConfig(rollouts_per_update=1),
+)
+HAND = get_hand("human")
+SPEC = policy_spec(CONFIG.task, CONFIG.network)
+SIZE = sum(size for _, size in SPEC.layout)
+
+
+def invented(episodes: np.ndarray) -> Rollout:
+    """A rollout of zeros in which every world ended an episode with these metrics (B, fields)."""
+    zeros = {
+        **dict.fromkeys(("q", "q_target"), (T, len(HAND.joints))),
+        **dict.fromkeys(("u", "u_target"), (T, 6)),
+        **dict.fromkeys(("wrist_position", "object_position"), (T, 3)),
+        **dict.fromkeys(("wrist_quaternion", "object_quaternion"), (T, 4)),
+        "contact_force": (T, len(HAND.links), 3),
+        "action": (T, SPEC.action_size),
+        "terms": (T, len(TERMS)),
+    }
+    flags = dict.fromkeys(("table", "terminal"), np.zeros(T, bool))
+    given = {
+        "observation": np.zeros((T, B, SIZE), np.float16),
+        "action": np.zeros((T, B, SPEC.action_size), np.float32),
+        "terminal": np.zeros((T, B), bool),
+        "last_observation": np.zeros((B, SIZE), np.float16),
+        "episodes": episodes,
+        "has_episode": np.ones(B, bool),
+        "trace": Trace(**{name: np.zeros(shape, np.float32) for name, shape in zeros.items()}, **flags),
+    }
+    defaults = dict.fromkeys(Rollout._fields, np.zeros((T, B), np.float32))
+    return Rollout(**{**defaults, **given})
+
+
+class InventedWorker:
+    """Stands in for worlds: gives the same rollout again and again."""
+
+    rollout: Rollout
+
+    def __init__(self, *args, **options):
+        goal = Goal(*(np.zeros((1, 4), np.float32) for _ in Goal._fields))
+        surface = Surface(np.zeros((1, 8, 3), np.float32), np.zeros((1, 8), bool))
+        world = types.SimpleNamespace(object_index=np.zeros(1, int))
+        self.env = types.SimpleNamespace(time=np.zeros(1), goal=goal, surface=surface, world=world)
+
+    def configure(self, *args, **options):
+        pass
+
+    def renew_references(self):
+        pass
+
+    def collect(self, parameters, steps):
+        return self.rollout
+
+
+@pytest.fixture
+def heard(monkeypatch):
+    """Runs an actor on one invented rollout; what the learner took, and what the logs heard."""
+
+    def run(rollout: Rollout):
+        monkeypatch.setattr(InventedWorker, "rollout", rollout, raising=False)
+        monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
+        monkeypatch.setattr(process, "build_taskset", lambda *args: None)
+        monkeypatch.setattr(process, "load_pool", lambda *args: [procedural.generate(0, "box")])
+        broker, stop = MemoryHub(), threading.Event()
+        with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
+            logs = server.subscribe(Keys("t").logs, depth=100)
+            form = RolloutForm(T, B, SIZE, SPEC.action_size, half=True)
+            hub = LearnerHub(
+                server, run="t", config_json=to_json(CONFIG), epoch="e", schema=SPEC.schema, form=form,
+                staleness=StalenessManager(0, 1),
+            )  # fmt: skip
+            state = jax.device_get(init_state(0, SPEC.layout, SPEC.action_size, CONFIG.network, CONFIG.ppo))
+            weights = state.params, state.observation, state.value
+            hub.publish_weights(PolicyBundle(SPEC, CONFIG.task, *weights, 0, "e", 0).to_message(), 0)
+            actor = threading.Thread(
+                target=process.run_actor,
+                args=(peer,),
+                kwargs={"run": "t", "actor": "a", "stop": stop, "physics": "native", "patience": 5.0},
+            )
+            actor.start()
+            batch = hub.next_batch(1, 30.0)
+            stop.set()
+            actor.join(30.0)
+            received = list(iter(lambda: logs.receive(0.0), None))
+        return batch, {key.split("/")[3]: message for key, message in received if "/actor/" in key}
+
+    return run
+
+
+@pytest.mark.timeout(60)
+def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(heard):
+    episodes = np.tile(np.arange(len(EPISODE_FIELDS), dtype=np.float32), (B, 1))
+    episodes[0, EPISODE_FIELDS.index("episode/heading_rad")] = np.nan
+    episodes[2, EPISODE_FIELDS.index("term/contact")] = np.inf
+    batch, logs = heard(invented(episodes))
+    assert batch is not None, "the learner refused the rollout"
+    arrays = batch[0].arrays
+    for i, name in enumerate(EPISODE_FIELDS):  # world 1's
+        np.testing.assert_array_equal(arrays[name], [i], err_msg=name)
+    assert logs["metrics"].meta["values"]["episodes_left_out"] == 2
+    episode = logs["episode"].meta["metrics"]
+    assert "heading_rad" not in episode and episode["heading_m"] == EPISODE_FIELDS.index("episode/heading_m")
+    for message in logs.values():
+        encode(message)  # a number that JSON has not would be an error here, and the end of the actor
+    validate(logs["episode"], EPISODE)
