@@ -18,10 +18,12 @@ from common.hands import get_hand
 from common.logs.channels import finite
 from common.objects.pool import load_pool
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
-from common.task.types import Surface
+from common.task.types import Array, Surface
 from common.transport.base import Transport
 from common.wire.codec import Message
 
+ROLLOUT_ARRAYS = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
+"""What a rollout holds of every step, and the observation after the last one."""
 _TICKET_SECONDS = 1.0
 _FLUSH_SECONDS = 2.0
 
@@ -62,6 +64,14 @@ def run_actor(
                 return
             except RunRestarted:
                 continue
+
+
+def first_worlds(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:
+    """The arrays of the first `count` worlds of a rollout, axes (T, B, ...) or, for the last observation, (B, D)."""
+    return {
+        name: np.asarray(array[:count] if name == "last_observation" else array[:, :count])
+        for name, array in arrays.items()
+    }
 
 
 class _Actor:
@@ -124,9 +134,9 @@ class _Actor:
         started_fresh = bool(np.asarray(env.time)[0] == 0)
         rollout = self._worker.collect(bundle.acting, config.rollout_steps)
         steps = config.rollout_steps * config.environments
-        names = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
+        taken = {name: getattr(rollout, name) for name in ROLLOUT_ARRAYS}
         episodes, left_out = countable(finished_episodes(rollout))
-        arrays = {name: getattr(rollout, name) for name in names} | episodes
+        arrays = taken | episodes
         if config.task.own_references:
             self._worker.renew_references()
         meta = {"version": bundle.version, "schema": self._spec.schema, "steps": steps}
@@ -140,7 +150,23 @@ class _Actor:
         self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
         if self._rollouts % config.episode_every == 0 and started_fresh:
             self._publish_episode(bundle, rollout, env)
+        if config.log_rollout_every and self._rollouts % config.log_rollout_every == 0:
+            self._publish("rollout", self._sampled(bundle, taken))
         self._rollouts += 1
+
+    def _sampled(self, bundle: PolicyBundle, arrays: dict[str, Array]) -> Message:
+        """A rollout's first worlds, with what a reader needs to take the arrays apart."""
+        meta = {
+            "time": time.time(),
+            "version": bundle.version,
+            "actor": self._link.actor,
+            "rollout": self._rollouts,
+            "hand": self._hand.name,
+            "control_dt": self._config.task.control_dt,
+            "layout": [[name, size] for name, size in self._spec.layout],
+            "environments": self._config.environments,
+        }
+        return Message(first_worlds(arrays, self._config.log_rollout_worlds or self._config.environments), meta)
 
     def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, env: EnvironmentState) -> None:
         """World 0's episode, from the rollout that it began in."""

@@ -242,6 +242,10 @@ class RunConfig:
     """Updates between two checkpoints."""
     episode_every: int = 10
     """Rollouts of an actor between two episodes that it publishes for logs."""
+    log_rollout_every: int = 20
+    """Rollouts of an actor between two that it publishes for logs; 1 publishes all of them, 0 none."""
+    log_rollout_worlds: int = 4
+    """Environments of a rollout that are published for logs; 0 publishes all of them."""
     task: TaskConfig = TaskConfig()
     """The task."""
     curriculum: CurriculumConfig = CurriculumConfig()

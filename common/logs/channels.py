@@ -16,6 +16,8 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 OPAQUE = "x-safetensors"
 """Encoding of messages that are the bytes of `common.wire.codec`."""
+ROLLOUT_SCHEMA = "congrasp.Rollout"
+"""Name of the schema of rollouts."""
 
 CONVENTIONS = {
     "units": "metres, radians, seconds, newtons, kilograms",

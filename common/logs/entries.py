@@ -1,7 +1,7 @@
 """Log messages as they travel (`congrasp/<run>/log/<kind>/<role>/<name>`), turned into what a recorder writes.
 
 Kinds: `metrics` (meta: time, update or version, values), `event` (time, level, text), `version` (any scalars),
-`rollout` (opaque) and `episode` (see `common.logs.scene`).
+`rollout` (some worlds of an actor's rollout, opaque) and `episode` (see `common.logs.scene`).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -9,11 +9,10 @@ from typing import Any
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from common.logs.channels import Entry, JsonChannels, finite, nest, opaque_channel, protobuf_channel
+from common.logs.channels import ROLLOUT_SCHEMA, Entry, JsonChannels, finite, nest, opaque_channel, protobuf_channel
 from common.logs.scene import duration, episode_entries
 from common.wire.codec import Message, encode
 
-ROLLOUT_SCHEMA = "congrasp.Rollout"
 _LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
 
 

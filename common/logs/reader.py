@@ -14,7 +14,7 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import MCAP0_MAGIC
 
 from common.errors import CongraspError
-from common.logs.channels import flatten
+from common.logs.channels import ROLLOUT_SCHEMA, flatten
 from common.logs.scene import EPISODE_SCHEMA
 from common.logs.writer import PART
 from common.wire.codec import Message, decode
@@ -111,7 +111,19 @@ def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]
 
 def read_episodes(path: pathlib.Path) -> Iterator[Message]:
     """The recorded episodes at `path`, a file or a folder, as the actors sent them, in the order of recording."""
+    return _messages(path, EPISODE_SCHEMA, lambda topic: topic.startswith("/episode/") and topic.endswith("/raw"))
+
+
+def read_rollouts(path: pathlib.Path) -> Iterator[Message]:
+    """The recorded rollouts at `path`, a file or a folder, as the actors sent them, in the order of recording.
+
+    Axes are (T, B, ...); `meta["layout"]` lists the blocks of an observation with their sizes.
+    """
+    return _messages(path, ROLLOUT_SCHEMA, lambda topic: topic.startswith("/rollout/"))
+
+
+def _messages(path: pathlib.Path, schema: str, wanted: Callable[[str], bool]) -> Iterator[Message]:
     for file in log_files(path):
-        for record in read_records(file, lambda topic: topic.startswith("/episode/") and topic.endswith("/raw")):
-            if record.schema == EPISODE_SCHEMA:
+        for record in read_records(file, wanted):
+            if record.schema == schema:
                 yield decode(record.data)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from common.logs.channels import Entry
-from common.logs.reader import is_complete, log_files, read_episodes, read_metrics, read_records
+from common.logs.reader import is_complete, log_files, read_episodes, read_metrics, read_records, read_rollouts
 from common.logs.recorder import Recorder
 from common.logs.writer import LogWriter
 from common.transport.keys import FLOWS, Keys
@@ -80,6 +80,10 @@ def test_everything_a_run_publishes_is_in_the_file(transport: MemoryTransport, t
     (kept,) = read_episodes(tmp_path)
     np.testing.assert_array_equal(kept.arrays["link_position"], episode().arrays["link_position"])
     assert kept.meta["metrics"] == {"return": 1.0}
+    (read,) = read_rollouts(tmp_path)
+    assert dict(read.meta) == dict(rollout.meta) and set(read.arrays) == set(rollout.arrays)
+    for name, array in rollout.arrays.items():
+        np.testing.assert_array_equal(read.arrays[name], array)
 
 
 def test_damaged_messages_are_left_out_and_counted(transport: MemoryTransport, tmp_path: pathlib.Path) -> None:

@@ -8,17 +8,29 @@ import sys
 import time
 from collections.abc import Callable
 
+import numpy as np
 import psutil
 import pytest
 
-from common.logs.reader import read_episodes, read_metrics
+from common.logs.reader import read_episodes, read_metrics, read_rollouts
 from common.policy import bundle as bundles
 
 pytestmark = pytest.mark.timeout(600)
 UPDATES = 40
 SMALL = [
     *("--updates", str(UPDATES), "--environments", "4", "--rollout-steps", "75", "--checkpoint-every", "3"),
-    *("--episode-every", "1", "--objects.count", "2", "--objects.families", "box", "--network.hidden", "32"),
+    *(
+        "--log-rollout-worlds",
+        "3",
+        "--episode-every",
+        "1",
+        "--objects.count",
+        "2",
+        "--objects.families",
+        "box",
+        "--network.hidden",
+        "32",
+    ),
     *("--network.encoder", "8", "--ppo.epochs", "1", "--ppo.minibatches", "2", "--evaluation", "0"),
 ]
 
@@ -73,6 +85,10 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path):
     metrics = read_metrics(run_dir)
     assert any(name.endswith("episode/return") for name in metrics)
     assert next(read_episodes(run_dir)).meta["hand"] == "human"
+    sampled = next(read_rollouts(run_dir))
+    assert sampled.arrays["observation"].shape == (75, 3, sum(size for _, size in sampled.meta["layout"]))
+    assert sampled.arrays["action"].shape == (75, 3, 26) and sampled.arrays["last_observation"].shape[0] == 3
+    assert np.isfinite(sampled.arrays["reward"]).all() and sampled.meta["environments"] == 4
     assert json.loads((run_dir / "config.json").read_text())["updates"] == UPDATES
 
 
