@@ -98,7 +98,7 @@ class Pool:
                 continue
             if not free[piece.kind]:
                 raise CongraspError(
-                    f"The object '{obj.name}' has more than {PRIMITIVE_SLOTS[piece.kind]} pieces of the kind {piece.kind}.",
+                    f"The object '{obj.name}' has more than {PRIMITIVE_SLOTS[piece.kind]} {piece.kind} pieces.",
                     "Make it of fewer pieces, or import it as a mesh.",
                 )
             geom = free[piece.kind].pop(0)
