@@ -146,6 +146,7 @@ class _Actor:
             "steps_per_second": steps / seconds,
             "rollouts": self._rollouts + 1.0,
             "episodes_left_out": float(left_out),
+            **physics_usage(np.asarray(rollout.usage)),
         }
         self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
         if self._rollouts % config.episode_every == 0 and started_fresh:
@@ -189,6 +190,16 @@ class _Actor:
         # JSON has no NaN: one such number would cost the whole message.
         message = Message(message.arrays, finite(message.meta))
         self._transport.publish(self._link.keys.log(kind, "actor", self._link.actor), message)
+
+
+def physics_usage(usage: np.ndarray) -> dict[str, float]:
+    """Metrics of `Rollout.usage`: steps in which the engine had no room for some contacts or rows, and the fullest."""
+    contacts, rows = usage.max(0)
+    return {
+        "overflow": float((usage > 1.0).any(-1).sum()),
+        "contacts_peak": float(contacts),
+        "rows_peak": float(rows),
+    }
 
 
 def countable(episodes: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:

@@ -63,6 +63,8 @@ class Rollout(NamedTuple):
     """(T, B)."""
     terminal: Array
     """(T, B) bool."""
+    usage: Array
+    """(T, 2), see `actors.physics.engine.Readout`."""
     last_observation: Array
     """(B, D)."""
     episodes: Array
@@ -178,7 +180,7 @@ class RolloutWorker:
             )
             self.state, readout = self.physics.step(self.state, np.asarray(joints), np.asarray(table))
             self.env, score, scene, seen, kept = self._score_jit(self._weights, env, readout, target, action)
-            rows.append((observation, action, log_probability, score.reward, score.terminal))
+            rows.append((observation, action, log_probability, score.reward, score.terminal, readout.usage))
             extras.append(kept)
             if bool(np.any(score.terminal)):
                 self.env = self._restart_jit(self._taskset, self.env, score.terminal, self._stationary)
@@ -226,7 +228,7 @@ class RolloutWorker:
                 return env, state, environment.moment(self._hand, self._task, env, physics.read(state))
 
             carry = jax.lax.cond(jnp.any(score.terminal), renew, lambda x: x, (env, state, (scene, seen)))
-            return carry, (observation, action, log_probability, score.reward, score.terminal, kept)
+            return carry, (observation, action, log_probability, score.reward, score.terminal, readout.usage, kept)
 
         carry, (*columns, (trace, probed)) = jax.lax.scan(body, carry, jax.random.split(key, steps))
         env, _, (scene, seen) = carry

@@ -50,6 +50,9 @@ class Readout(NamedTuple):
     contact_found: Array
     bad: Array
     """(B,) bool: the world diverged in this step (`readout.diverged`) and was put back to its start."""
+    usage: Array
+    """(2,) contacts and constraint rows at the step's fullest moment, as shares of what the engine has room for: what
+    is beyond 1 was left out of the simulation. Zero where room is made as it is needed."""
 
 
 class Physics(Protocol):

@@ -116,7 +116,12 @@ class MjxPhysics:
         data = state.data.replace(ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height))
         model = self._model.replace(**state.leaves)
         step = jax.vmap(mjx.step, in_axes=(self._axes, 0))
-        data, _ = jax.lax.scan(lambda carry, _: (step(model, carry), None), data, None, length=self._task.substeps)
+
+        def substep(data: Any, _: None) -> tuple[Any, Array]:
+            data = step(model, data)
+            return data, self._usage(data)
+
+        data, usage = jax.lax.scan(substep, data, None, length=self._task.substeps)
         bad = diverged(jnp, data.qpos, data.qvel)[:, None]
         data = data.replace(
             qpos=jnp.where(bad, state.qpos_start, data.qpos),
@@ -125,14 +130,14 @@ class MjxPhysics:
         )
         sensors = jnp.where(bad, 0.0, self._contacts(data))
         state = state._replace(data=data)
-        return state, readout(jnp, where, data.qpos, data.qvel, sensors, bad[:, 0])
+        return state, readout(jnp, where, data.qpos, data.qvel, sensors, bad[:, 0], jnp.max(usage, 0))
 
     def read(self, state: MjxState) -> Readout:
         """The worlds as they are, without contacts; see `Physics.read`."""
         data = state.data
         batch = data.qpos.shape[0]
         none = jnp.zeros((batch, len(self._links) * CONTACTS_PER_LINK * SENSOR_WIDTH))
-        return readout(jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool))
+        return readout(jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
 
     def close(self) -> None:
         """Nothing to release."""
@@ -170,6 +175,14 @@ class MjxPhysics:
             eq_active=data.eq_active.at[:, where.weld].set(world.stationary.astype(data.eq_active.dtype)),
         )
         return MjxState(data, leaves, qpos, pool)
+
+    def _usage(self, data: Any) -> Array:
+        """(2,) of `Readout.usage`: warp counts what it finds beyond its buffers, too; MJX-JAX has room for all."""
+        if self.name == "jax":
+            return jnp.zeros(2)
+        found = data._impl
+        contacts = jnp.maximum(found.ncollision, found.nacon).max() / found.naconmax
+        return jnp.stack([contacts, found.nefc.max() / found.njmax])
 
     def _contacts(self, data: Any) -> Array:
         """(B, L * C * 13) in the layout of the contact sensors."""

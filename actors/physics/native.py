@@ -42,6 +42,8 @@ class NativePhysics:
           objects: the pool that `World.object_index` points into.
           threads: threads that step worlds in parallel.
         """
+        # MuJoCo would write every warning to a file in the working directory; `diverged` sees what they speak of.
+        mujoco.set_mju_user_warning(lambda text: None)
         self._hand, self._task, self._objects = hand, task, objects
         self._threads = max(1, threads)
         self._pool = concurrent.futures.ThreadPoolExecutor(self._threads, thread_name_prefix="physics")
@@ -148,5 +150,5 @@ class NativePhysics:
             self._qpos[i], self._qvel[i], self._sensors[i] = data.qpos, data.qvel, data.sensordata
 
     def _readout(self, bad: np.ndarray) -> Readout:
-        values = readout(np, self._where, self._qpos, self._qvel, self._sensors, bad)
+        values = readout(np, self._where, self._qpos, self._qvel, self._sensors, bad, np.zeros(2))
         return Readout(*(np.asarray(v, bool if v.dtype == bool else np.float32) for v in values))

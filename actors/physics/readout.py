@@ -14,7 +14,9 @@ def diverged(xp: types.ModuleType, qpos: Array, qvel: Array) -> Array:
     return ~(xp.all(xp.abs(qvel) < MAX_SPEED, -1) & xp.all(xp.abs(qpos) < MAX_DISTANCE, -1))
 
 
-def readout(xp: Any, where: Addresses, qpos: Array, qvel: Array, sensordata: Array, bad: Array) -> Readout:
+def readout(
+    xp: Any, where: Addresses, qpos: Array, qvel: Array, sensordata: Array, bad: Array, usage: Array
+) -> Readout:
     """Readout of raw arrays (B, nq), (B, nv), (B, L * C * 13).
 
     Args:
@@ -24,6 +26,7 @@ def readout(xp: Any, where: Addresses, qpos: Array, qvel: Array, sensordata: Arr
       qvel: generalised velocities; the free joint's angular part is in the object frame and is turned to the world.
       sensordata: contact sensors of all links, strongest contacts first.
       bad: (B,) bool, passed through.
+      usage: (2,), passed through.
     """
     batch = qpos.shape[0]
     contacts = sensordata.reshape(batch, -1, CONTACTS_PER_LINK, SENSOR_WIDTH)
@@ -49,4 +52,5 @@ def readout(xp: Any, where: Addresses, qpos: Array, qvel: Array, sensordata: Arr
         contact_position=contacts[..., 4:7],
         contact_found=found,
         bad=bad,
+        usage=usage,
     )

@@ -157,7 +157,8 @@ def test_gains_hold_half_a_kilogram_without_shaking():
     physics.close()
 
 
-def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env):
+def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     physics = NativePhysics(HAND, TASK, OBJECTS, 2)
     world = _above(env.world, 0.3)
     state = physics.start(world)
@@ -170,6 +171,7 @@ def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env):
     np.testing.assert_allclose(seen.q[1], np.asarray(world.q)[1], atol=1e-6)
     state, seen = physics.step(state, still, np.ones(WORLDS, bool))
     assert not seen.bad.any()
+    assert not list(tmp_path.iterdir()), "MuJoCo wrote its own log"
     physics.close()
 
 
@@ -200,8 +202,10 @@ def test_slots_are_the_same_bodies_as_models_of_their_own():
 
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize("implementation", ["warp", "jax"])
-def test_engines_agree(env, implementation):
+def test_engines_agree(env, implementation, monkeypatch):
     """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
+    from actors.physics import mjx
+
     world = _above(env.world, 0.19)
     native = NativePhysics(HAND, TASK, OBJECTS, 1)
     other = MjxPhysics(HAND, TASK, OBJECTS, implementation)
@@ -216,6 +220,11 @@ def test_engines_agree(env, implementation):
         if not x.contact_found.any() and i < 10:
             for name in ("q", "u", "object_position", "q_velocity", "u_velocity"):
                 np.testing.assert_allclose(getattr(x, name), getattr(y, name), atol=2e-4, err_msg=f"{name} at {i}")
+            if implementation == "warp":  # what fills its buffers is what MuJoCo C finds
+                found = [sum(cell.data.ncon for cell in native.cells), max(cell.data.nefc for cell in native.cells)]
+                room = [WORLDS * mjx.CONTACTS_PER_WORLD, mjx.CONSTRAINTS_PER_WORLD]
+                np.testing.assert_allclose(y.usage, np.divide(found, room), rtol=1e-5)
+        assert not x.usage.any() and np.all(y.usage <= 1)
         force += [np.linalg.norm(seen.contact_force, axis=-1).sum((1, 2)) for seen in (x, y)]
     assert force[0].max() > 0, "the script must make contact"
     assert not np.asarray(y.bad).any()
@@ -227,6 +236,12 @@ def test_engines_agree(env, implementation):
     again = other.read(other.reset(b, mask, jax.tree.map(jnp.asarray, world)))
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(again.u[1:], y.u[1:], atol=1e-6)
+    if implementation == "warp":
+        monkeypatch.setattr(mjx, "CONTACTS_PER_WORLD", 2)
+        _, crowded = step(other.start(jax.tree.map(jnp.asarray, world)), jnp.asarray(target, jnp.float32), table)
+        assert crowded.usage[0] > 1 > crowded.usage[1]
+    else:
+        assert not np.any(y.usage)
     native.close()
 
 

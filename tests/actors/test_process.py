@@ -57,6 +57,7 @@ def invented(episodes: np.ndarray) -> Rollout:
         "terminal": np.zeros((T, B), bool),
         "last_observation": np.zeros((B, SIZE), np.float16),
         "episodes": episodes,
+        "usage": np.zeros((T, 2), np.float32),
         "has_episode": np.ones(B, bool),
         "trace": Trace(**{name: np.zeros(shape, np.float32) for name, shape in zeros.items()}, **flags),
     }
@@ -118,6 +119,11 @@ def heard(monkeypatch):
         return batch, {key.split("/")[3]: message for key, message in received if "/actor/" in key}
 
     return run
+
+
+def test_steps_in_which_the_physics_left_contacts_out_are_counted():
+    usage = np.array([[0.5, 0.1], [1.0, 0.2], [1.25, 0.2], [0.3, 1.5]], np.float32)
+    assert process.physics_usage(usage) == {"overflow": 2.0, "contacts_peak": 1.25, "rows_peak": 1.5}
 
 
 @pytest.mark.timeout(60)
