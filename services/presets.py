@@ -4,8 +4,7 @@ from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, Ta
 from common.errors import CongraspError
 
 PRESETS = {
-    # Minutes on two CPU cores. Easier than the full task: small compact objects, approaches from above only, and the
-    # heading as the only constraint.
+    # Minutes on two CPU cores; `easier` says what that takes.
     "quickstart": RunConfig(
         name="quickstart",
         environments=64,
@@ -19,6 +18,28 @@ PRESETS = {
     # The full task of the paper for the human hand, sized for a GPU.
     "human": RunConfig(name="human", environments=4096, updates=400, objects=ObjectsConfig(count=64)),
 }
+
+
+def easier(config: RunConfig) -> list[str]:
+    """What makes a run easier than the full task, in words; empty if nothing does."""
+    task, full = config.task, PRESETS["human"]
+    words = []
+    if task.headings == "above" and full.task.headings != "above":
+        words.append("hands approach from above only")
+    odds = {
+        "an affordance": task.p_affordance,
+        "a reference pose": task.p_pose,
+        "a wrist trajectory": task.p_trajectory,
+    }
+    absent = [name for name, probability in odds.items() if not probability]
+    if absent:
+        words.append(f"no episode has {' or '.join(absent)}")
+    if not config.objects.folder and config.objects.count < full.objects.count:
+        words.append(f"an actor has {config.objects.count} objects, not {full.objects.count}")
+    if sum(config.network.hidden) < sum(full.network.hidden):
+        layers = [" and ".join(map(str, network.hidden)) for network in (config.network, full.network)]
+        words.append(f"networks have layers of {layers[0]} units, not {layers[1]}")
+    return words
 
 
 def get_preset(name: str) -> RunConfig:

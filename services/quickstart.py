@@ -16,17 +16,21 @@ from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, policy_spec
+from common.policy.shipped import shipped
 from learner import update as updates
 from learner.process import LOGS, POLICY_FILE, create_run, open_run
 from services.client import PolicyClient
 from services.evaluate import Evaluator
 from services.load import example_episode, one_answer, serving, wait_until_ready
+from services.presets import easier
 from services.render import episode_sheet
 from services.scores import Row
 from services.sheets import save_png
+from services.showcase import CONSTRAINTS, showcase
 from services.shutdown import on_signal
 from services.train import train, train_in_process
 
+EPISODE, SHIPPED = "episode.png", "shipped.png"
 _EVALUATION_OBJECTS = 12
 _SEEDS = 3
 _LINE_SECONDS = 10.0
@@ -53,6 +57,8 @@ def run_training(
         f"{1 if in_process else actors} actor(s) with {config.environments} hands each on '{physics}' in {run_dir}",
         soft_wrap=True,
     )
+    if words := easier(config):
+        console.print(f"Easier than the full task: {'; '.join(words)}.\nThe full task is --preset human, for a GPU.")
     with on_signal() as stop:
         before = _evaluate(untrained(config), config, evaluation, "before training") if evaluation else []
         began = time.monotonic()
@@ -88,7 +94,9 @@ def run_training(
             _compare(before, after)
             _live_query(run_dir)
             _picture(policy, config, run_dir)
-        _next_steps(run_dir, evaluation > 0)
+            if words and (best := shipped(config.task.hand)):
+                _shipped_picture(best, run_dir)
+        _next_steps(run_dir)
     return 0
 
 
@@ -107,7 +115,7 @@ class _Progress:
         self._began = time.monotonic()
         self._last = 0.0
         self._first: tuple[float, float] | None = None
-        self._line = ""
+        self._line = self._printed = ""
         self._live = console.status("compiling, and filling the first batch") if console.is_terminal else None
 
     def __enter__(self) -> Self:
@@ -118,7 +126,7 @@ class _Progress:
     def __exit__(self, *exception: object) -> None:
         if self._live:
             self._live.stop()
-            console.print(f"  {self._line}", soft_wrap=True)
+        self._print()
 
     def show(self, status: dict[str, Any]) -> None:
         """Shows the learner's newest metrics, if there are any yet, and the number of actors."""
@@ -133,7 +141,12 @@ class _Progress:
             self._live.update(self._line)
         elif now - self._last >= _LINE_SECONDS:
             self._last = now
+            self._print()
+
+    def _print(self) -> None:
+        if self._line != self._printed:
             console.print(f"  {self._line}", soft_wrap=True)
+            self._printed = self._line
 
     def _progress(self, status: dict[str, Any], now: float) -> str:
         """One line of numbers; the time left counts from the first update, so that compiling is not part of it."""
@@ -206,12 +219,26 @@ def _live_query(run_dir: pathlib.Path) -> None:
 def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> None:
     """A successful episode if a few tries find one."""
     evaluator = _evaluator(policy, config, 0, 1)
-    save_png(run_dir / "episode.png", episode_sheet(evaluator.episode("heading", tries=12)))
+    save_png(run_dir / EPISODE, episode_sheet(evaluator.episode("heading", tries=12)))
 
 
-def _next_steps(run_dir: pathlib.Path, picture: bool) -> None:
+def _shipped_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
+    """What the same kind of policy does after training on the full task."""
+    with console.status("The policy that comes with congrasp …") as status:
+        grasps = showcase(bundles.load(policy), run_dir / SHIPPED, lambda text: status.update(f"{text} …"))
+    console.print(
+        f"The policy that comes with congrasp, trained on the full task: {grasps} of {len(CONSTRAINTS)} grasps, "
+        f"one under each constraint ({', '.join(CONSTRAINTS)})."
+    )
+
+
+def _next_steps(run_dir: pathlib.Path) -> None:
     congrasp = _command()
-    rows = [(str(run_dir / "episode.png"), "an episode of the trained policy")] if picture else []
+    pictures = (
+        (EPISODE, "an episode of the trained policy"),
+        (SHIPPED, "a grasp under each of the four constraints, by the policy that comes with congrasp"),
+    )
+    rows = [(str(run_dir / name), why) for name, why in pictures if (run_dir / name).exists()]
     rows += [
         (f"{congrasp} plot {run_dir}", "learning curves and reward terms"),
         (f"{run_dir / LOGS}/*.mcap", "open in Foxglove or Rerun: plots, hand and object in 3-D"),

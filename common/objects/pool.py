@@ -10,7 +10,6 @@ from common.objects.store import Catalogue
 
 HELD_OUT_SEED = 1_000_000
 """Seeds from here upward are never trained on."""
-_STRIDE = 100_000
 
 
 def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:
@@ -33,5 +32,11 @@ def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:
         return objects
     if config.count < 1:
         raise CongraspError(f"A pool of {config.count} objects is empty.", "Set --objects.count to at least 1.")
-    first = config.seed + (shift * _STRIDE) % HELD_OUT_SEED if config.seed < HELD_OUT_SEED else config.seed
-    return procedural.generate_many(config.count, first, config.families)
+    return procedural.generate_many(config.count, first_seed(config, shift), config.families)
+
+
+def first_seed(config: ObjectsConfig, shift: int) -> int:
+    """The first seed of actor number `shift`: neighbours follow one another, and nobody reaches the held-out seeds."""
+    if config.seed >= HELD_OUT_SEED:
+        return config.seed
+    return (config.seed + shift * config.count) % max(1, HELD_OUT_SEED - config.count + 1)

@@ -38,10 +38,9 @@ def status(
     for role in found["roles"]:
         roles.add_row(*(str(role.get(name, "")) for name in ("role", "id", "incarnation", "rollouts", "version")))
     console.print(roles)
-    ledger = Table(title="Ledger of tickets and rollouts")
-    for name in found["ledger"]:
-        ledger.add_column(name)
-    ledger.add_row(*(str(value) for value in found["ledger"].values()))
+    ledger = Table("tickets and rollouts", "number", title="Ledger")
+    for name, value in found["ledger"].items():
+        ledger.add_row(name, str(value))
     console.print(ledger)
     console.print(f"{found['rates']['steps_per_second']:.0f} steps/s, {found['queue']['length']} rollout(s) waiting")
     return 0

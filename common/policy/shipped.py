@@ -1,0 +1,29 @@
+"""Trained policies that come with the package, one for a hand."""
+
+import pathlib
+
+from common.errors import CongraspError
+from common.hands import get_hand
+
+_FOLDER = pathlib.Path(__file__).with_name("data")
+
+
+def shipped(hand: str) -> pathlib.Path | None:
+    """The file of the policy that comes with the package for this hand; None if none does."""
+    path = _FOLDER / f"{hand}.safetensors"
+    return path if path.exists() else None
+
+
+def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path:
+    """The policy file that a command was given, or the shipped one for this hand.
+
+    Raises:
+      CongraspError: neither is there, or there is no such hand.
+    """
+    path = given or shipped(get_hand(hand).name)
+    if path is None:
+        raise CongraspError(
+            f"No policy was named, and none comes with this installation for the hand '{hand}'.",
+            "Give --policy FILE: every run of 'congrasp train' has a policy.safetensors.",
+        )
+    return path
