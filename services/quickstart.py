@@ -1,10 +1,13 @@
 """What `congrasp train` does around training: evaluations, progress, a picture, what to look at next."""
 
+import contextlib
+import dataclasses
 import os
 import pathlib
 import shutil
 import sys
 import time
+from collections.abc import Iterator
 from typing import Any, Self
 
 import numpy as np
@@ -34,6 +37,7 @@ EPISODE, SHIPPED = "episode.png", "shipped.png"
 _EVALUATION_OBJECTS = 12
 _SEEDS = 3
 _LINE_SECONDS = 10.0
+_SPACE = 64 << 10  # bytes without which a disk is as good as full
 console = Console(highlight=False)
 
 
@@ -51,6 +55,7 @@ def run_training(
     else:
         if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / "config.json").exists():
             raise CongraspError(f"{run_dir} is not empty and is no run.", "Choose another --run-dir.")
+        _check(config)
         create_run(run_dir, config)
     console.print(
         f"[bold]{config.name}[/]: {config.updates} updates of {_steps_per_update(config)} steps, "
@@ -58,7 +63,10 @@ def run_training(
         soft_wrap=True,
     )
     if words := easier(config):
-        console.print(f"Easier than the full task: {'; '.join(words)}.\nThe full task is --preset human, for a GPU.")
+        console.print(
+            f"Easier than the full task: {'; '.join(words)}.\nThe full task is --preset human, for a GPU.",
+            soft_wrap=True,
+        )
     with on_signal() as stop:
         before = _evaluate(untrained(config), config, evaluation, "before training") if evaluation else []
         began = time.monotonic()
@@ -75,15 +83,16 @@ def run_training(
                     ),
                 )
             else:
-                train(
-                    run_dir,
-                    config,
-                    actors=actors,
-                    physics=physics,
-                    stop=stop,
-                    report=progress.show,
-                    notify=lambda text: console.print(f"  [yellow]{text}[/]", soft_wrap=True),
-                )
+                with _full_disk_said(run_dir):
+                    train(
+                        run_dir,
+                        config,
+                        actors=actors,
+                        physics=physics,
+                        stop=stop,
+                        report=progress.show,
+                        notify=lambda text: console.print(f"  [yellow]{text}[/]", soft_wrap=True),
+                    )
         if stop.is_set():
             console.print(f"Stopped. Go on with: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
             return stop.exit_code
@@ -98,6 +107,28 @@ def run_training(
                 _shipped_picture(best, run_dir)
         _next_steps(run_dir)
     return 0
+
+
+def _check(config: RunConfig) -> None:
+    """Raises `CongraspError` for what would end the run's processes as soon as they have started."""
+    policy_spec(config.task, config.network)
+    load_pool(dataclasses.replace(config.objects, count=min(1, config.objects.count)))
+    if config.environments < 1 or config.rollout_steps < 1:
+        raise CongraspError(f"A rollout of {config.rollout_steps} steps of {config.environments} hands is empty.")
+
+
+@contextlib.contextmanager
+def _full_disk_said(run_dir: pathlib.Path) -> Iterator[None]:
+    """A process that dies of a full disk cannot write its last words into its log: this says them."""
+    try:
+        yield
+    except CongraspError:
+        if shutil.disk_usage(run_dir).free >= _SPACE:
+            raise
+        raise CongraspError(
+            f"The disk of {run_dir} is full, and the run ended.",
+            f"What was written before is whole: free space and add --resume --run-dir {run_dir}.",
+        ) from None
 
 
 def untrained(config: RunConfig) -> PolicyBundle:

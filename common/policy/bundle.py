@@ -144,7 +144,7 @@ class PolicyBundle:
             version, epoch, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
             shapes = _shapes(spec)
         except (KeyError, TypeError, ValueError, CongraspError, dacite.DaciteError) as error:
-            raise CongraspError(f"The policy {source} has bad meta data: {error}.", _REMEDY) from None
+            raise CongraspError(f"The policy {source} has bad meta data: {str(error).rstrip('.')}.", _REMEDY) from None
         if meta.get("schema") != spec.schema:
             raise CongraspError(f"The policy {source} names a schema that is not its own.", _REMEDY)
         _check_arrays(message.arrays, shapes, source)

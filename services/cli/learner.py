@@ -37,12 +37,10 @@ class Learner:
         from services.shutdown import on_signal
 
         has_checkpoint = (self.run_dir / "checkpoints" / "latest").exists()
-        if self.resume:
-            config = open_run(self.run_dir)
-        else:
-            config = self.config
-            create_run(self.run_dir, config)
+        config = open_run(self.run_dir) if self.resume else self.config
         with on_signal() as stop, ZenohTransport(listen=[self.listen]) as transport:
+            if not self.resume:
+                create_run(self.run_dir, config)
             run_learner(
                 self.run_dir,
                 config,

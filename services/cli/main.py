@@ -1,13 +1,17 @@
 """`congrasp COMMAND …`: finds the command's module, runs it, and turns errors into one line and an exit code."""
 
+import contextlib
+import errno
+import functools
 import importlib
 import inspect
+import io
 import os
 import pathlib
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TextIO
 
 from common.errors import CongraspError
 from services.shutdown import follow_parent, on_signal
@@ -31,6 +35,7 @@ COMMANDS = {
 """Commands in the order of the help; `services.cli.<name>` is the module."""
 
 USAGE_ERROR = 2
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXTRAS = {"foxglove": "viz", "imageio_ffmpeg": "viz", "matplotlib": "viz", "warp": "cuda"}
 
 
@@ -45,6 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = run(arguments)
     except CongraspError as error:
         code = _complain(str(error), error.exit_code, debug)
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
+        code = _complain(f"{where}: {error.strerror}. Free space and start again.", USAGE_ERROR, debug)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("common", "actors", "learner", "services"):
             raise
@@ -53,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = _complain(
             f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug
         )
-    sys.stdout.flush()
+    _last_words(sys.stdout)
     sys.exit(code)
 
 
@@ -73,26 +83,56 @@ def run(arguments: list[str]) -> int:
     _prepare_environment()
     with on_signal(interrupt=True) as stop:
         try:
-            result = load(name)(rest)
+            result = _parsed(name, load(name), rest)()
         except KeyboardInterrupt:
             result = None
         return stop.exit_code or (result if isinstance(result, int) else 0)
 
 
-def load(name: str) -> Callable[[list[str]], Any]:
-    """The command's module as a function of its arguments."""
+def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
+    """The command's module as a function from its arguments to the call that they ask for."""
     module = importlib.import_module(f"services.cli.{name}")
     if hasattr(module, "parse"):
-        return lambda rest: module.parse(rest)()
+        return module.parse
     import tyro
 
     prog = f"congrasp {name}"
     if hasattr(module, "COMMANDS"):
         description = inspect.getdoc(module)
+        commands = {key: _deferred(command) for key, command in module.COMMANDS.items()}
         return lambda rest: tyro.extras.subcommand_cli_from_dict(
-            module.COMMANDS, prog=prog, description=description, args=rest
+            commands, prog=prog, description=description, args=rest
         )
-    return lambda rest: tyro.cli(module.COMMAND, prog=prog, args=rest)
+    return lambda rest: tyro.cli(_deferred(module.COMMAND), prog=prog, args=rest)
+
+
+def _deferred(command: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
+    """The command with its arguments bound, to be called once they are known to be right."""
+
+    @functools.wraps(command)
+    def bind(*args: Any, **options: Any) -> Callable[[], Any]:
+        return functools.partial(command, *args, **options)
+
+    bind.__annotations__ = {**command.__annotations__, "return": Any}
+    return bind
+
+
+def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: list[str]) -> Callable[[], Any]:
+    """Parses a command line; what is wrong with it becomes one line instead of the parser's box."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return parse(rest)
+    except SystemExit as end:
+        if not end.code:
+            raise
+        inside = [line.strip("│ ") for line in said.getvalue().splitlines() if line.startswith("│")]
+        rules = [i for i, line in enumerate(inside) if line.startswith("─")] or [len(inside)]
+        rest = inside[rules[0] :]
+        similar = [line.split()[0] for line in rest if line.startswith("--")] if "Perhaps you meant:" in rest else []
+        hint = f"Perhaps you meant {' or '.join(similar)}. " if similar else ""
+        what = " ".join(inside[: rules[0]]).rstrip(".")
+        raise CongraspError(f"{what}.", f"{hint}See 'congrasp {name} --help'.") from None
 
 
 def usage() -> str:
@@ -119,8 +159,17 @@ def _prepare_environment() -> None:
 def _complain(text: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    print(f"congrasp: error: {text}", file=sys.stderr)
+    _last_words(sys.stderr, f"congrasp: error: {text}\n")
     return code
+
+
+def _last_words(stream: TextIO, text: str = "") -> None:
+    """Writes and flushes; a log on a full disk must not turn the exit code into another."""
+    try:
+        stream.write(text)
+        stream.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 if __name__ == "__main__":

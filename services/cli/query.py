@@ -33,11 +33,12 @@ def query(
 
     if repeat < 1 or concurrency < 1:
         raise CongraspError(f"--repeat {repeat} and --concurrency {concurrency} must be at least 1.")
-    if repeat == 1 and not json:
-        with PolicyClient(connect, name, timeout=timeout) as client:
-            print(one_answer(client, example_episode(object_seed)))
-        return 0
-    result = measure(connect, name, example_episode(object_seed), repeat, concurrency, timeout)
+    with PolicyClient(connect, name, timeout=timeout) as client:
+        episode = example_episode(object_seed)
+        if repeat == 1 and not json:
+            print(one_answer(client, episode))
+            return 0
+    result = measure(connect, name, episode, repeat, concurrency, timeout)
     if json:
         print(json_module.dumps(result))
     else:

@@ -1,12 +1,14 @@
 """What `congrasp train` says around training."""
 
+import dataclasses
 import io
 import types
 
 import pytest
 from rich.console import Console
 
-from common.config import NetworkConfig, ObjectsConfig, RunConfig
+from common.config import NetworkConfig, ObjectsConfig, RunConfig, TaskConfig
+from common.errors import CongraspError
 from services import quickstart
 from services.quickstart import EPISODE, SHIPPED, _compare, _minutes, _next_steps, _Progress
 
@@ -109,6 +111,39 @@ def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, t
     (tmp_path / SHIPPED).touch()
     _next_steps(tmp_path)
     assert any(line.strip() == str(tmp_path / SHIPPED) for line in said())
+
+
+@pytest.mark.parametrize(("free", "words"), [(1000, "disk of .* is full.*--resume"), (10**9, "it said nothing")])
+def test_a_run_that_dies_of_a_full_disk_says_so(said, monkeypatch, tmp_path, free, words):
+    def die(*args, **options):
+        raise CongraspError("The learner failed: it said nothing")  # its log is on the same disk
+
+    monkeypatch.setattr(quickstart, "train", die)
+    monkeypatch.setattr(quickstart.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
+    with pytest.raises(CongraspError, match=words):
+        quickstart.run_training(CONFIG, tmp_path, actors=1, resume=False, in_process=False, evaluation=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"task": TaskConfig(hand="paw")}, "no hand 'paw'"),
+        ({"objects": ObjectsConfig(families=("unicorn",))}, "unicorn"),
+        ({"objects": ObjectsConfig(count=0)}, "pool of 0 objects"),
+        ({"environments": 0}, "empty"),
+    ],
+)
+def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, change, words):
+    with pytest.raises(CongraspError, match=words):
+        quickstart.run_training(
+            dataclasses.replace(CONFIG, **change),
+            tmp_path / "run",
+            actors=1,
+            resume=False,
+            in_process=False,
+            evaluation=0,
+        )
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_path):

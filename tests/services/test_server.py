@@ -76,6 +76,26 @@ def test_bad_queries_are_refused_in_words_and_nobody_else_suffers(served, change
         assert client.act(episode["state"]).version == 0
 
 
+def test_constraints_that_contradict_each_other_are_refused_alone(served):
+    """A trajectory that ends on the part that must not be touched; one that ends on the other part is answered."""
+    _, endpoint, episode = served
+    points = np.asarray(episode["reset"]["surface"])
+    minus = points[:, 0] > np.median(points[:, 0])
+    count = CONFIG.task.trajectory_points
+    asked = {
+        **episode["reset"],
+        "constraints": ["trajectory", "affordance"],
+        "surface_minus": minus,
+        "trajectory_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+    }
+    with PolicyClient(endpoint) as client:
+        client.reset(**asked, trajectory_position=np.tile(points[points[:, 0].argmax()], (count, 1)))
+        with pytest.raises(TransportError, match=r"contradict each other: the trajectory ends nearer to O-"):
+            client.act(episode["state"])
+        client.reset(**asked, trajectory_position=np.tile(points[points[:, 0].argmin()], (count, 1)))
+        assert "The affordance keeps the fingers off O-." in client.act(episode["state"]).active
+
+
 def test_many_clients_and_a_swap_of_weights_without_a_failed_query(served):
     path, endpoint, episode = served
     newer = dataclasses.replace(untrained(CONFIG), version=7)
