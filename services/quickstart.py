@@ -259,7 +259,8 @@ def _shipped_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
         grasps = showcase(bundles.load(policy), run_dir / SHIPPED, lambda text: status.update(f"{text} …"))
     console.print(
         f"The policy that comes with congrasp, trained on the full task: {grasps} of {len(CONSTRAINTS)} grasps, "
-        f"one under each constraint ({', '.join(CONSTRAINTS)})."
+        f"one under each constraint ({', '.join(CONSTRAINTS)}).",
+        soft_wrap=True,
     )
 
 
