@@ -3,7 +3,7 @@
 Physics stands between `targets` and `score`; who steps it is `actors.rollout`'s business.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -164,14 +164,19 @@ def restart(
 ) -> EnvironmentState:
     """New episodes in the masked worlds (B,); the others are untouched."""
     fresh = start(hand, task, taskset, env.key, mask.shape[0], stationary)
-
-    def pick(new: Array, old: Array) -> Array:
-        return jnp.where(mask.reshape(-1, *([1] * (new.ndim - 1))), new, old)
-
     # What is not of the episode stays.
     kept = {name: getattr(env, name) for name in ("grasps", "finished", "has_finished")}
-    merged = jax.tree.map(pick, fresh._replace(key=mask, **kept), env._replace(key=mask))
+    merged = where_worlds(mask, fresh._replace(key=mask, **kept), env._replace(key=mask))
     return merged._replace(key=fresh.key)
+
+
+def where_worlds(mask: Array, new: Any, old: Any) -> Any:
+    """Arrays (B, ...) of `new` in the masked worlds (B,), those of `old` elsewhere, for any pytree."""
+
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(mask.reshape(-1, *([1] * (a.ndim - 1))), a, b)
+
+    return jax.tree.map(pick, new, old)
 
 
 def sample_episodes(
@@ -227,7 +232,9 @@ def sample_episodes(
         object_quaternion=rest[:, 3:],
         stationary=jnp.broadcast_to(stationary, (batch,)),
     )
-    hold = jax.random.randint(next(keys), (batch,), task.hold_steps, task.hold_steps_max + 1)
+    # Squared, so that short holds, whose beginning every episode shares, stay the rule.
+    longer = jnp.floor(uniform() ** 2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
+    hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
     return world, goal, surface, variant, hold
 
 
@@ -331,10 +338,7 @@ def _grasps(
         scene.object_position, scene.object_quaternion, seen.wrist_position, seen.wrist_quaternion
     )
     fresh = Grasps(now, env.world.object_index, env.variant, scene.q, position, quaternion)
-    taken = [
-        jnp.where(now.reshape(-1, *([1] * (new.ndim - 1))), new, old)
-        for new, old in zip(fresh[1:], env.grasps[1:], strict=True)
-    ]
+    taken = where_worlds(now, fresh[1:], env.grasps[1:])
     return Grasps(env.grasps.found | now, *taken)
 
 

@@ -193,9 +193,12 @@ class RolloutWorker:
         return Rollout(*(*columns, last, self.env.finished, self.env.has_finished, trace, probed))
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
-        carry = (self.env, self.state, self._moment)
+        # Committed to the device, whether they were there already or not: anything else would compile once more.
+        parameters, taskset, carry = jax.device_put(
+            (parameters, self._taskset, (self.env, self.state, self._moment)), jax.local_devices()[0]
+        )
         carry, rollout = self._scan_jit(
-            parameters, self._weights, self._control, self._stationary, self._taskset, carry, key, steps=steps
+            parameters, self._weights, self._control, self._stationary, taskset, carry, key, steps=steps
         )
         self.env, self.state, self._moment = carry
         return rollout
@@ -222,10 +225,12 @@ class RolloutWorker:
             env, score, scene, seen, kept = self._score(weights, env, readout, target, action)
 
             def renew(operand: Any) -> Any:
-                env, state, _ = operand
+                env, state, ended = operand
                 env = environment.restart(self._hand, self._task, taskset, env, score.terminal, stationary)
                 state = physics.reset(state, score.terminal, env.world)
-                return env, state, environment.moment(self._hand, self._task, env, physics.read(state))
+                # The worlds that go on keep their contacts, which `read` does not know.
+                fresh = environment.moment(self._hand, self._task, env, physics.read(state))
+                return env, state, environment.where_worlds(score.terminal, fresh, ended)
 
             carry = jax.lax.cond(jnp.any(score.terminal), renew, lambda x: x, (env, state, (scene, seen)))
             return carry, (observation, action, log_probability, score.reward, score.terminal, readout.usage, kept)

@@ -97,7 +97,7 @@ class TaskConfig:
     hold_steps: int = 25
     """Control steps without the table that count for success (and the least in training)."""
     hold_steps_max: int = 25
-    """Training draws the hold's length between `hold_steps` and this."""
+    """Training draws the hold's length between `hold_steps` and this, short ones more often."""
     dynamic_center: bool = True
     """Hand centre from the live fingertips; false is the paper's ablation with a centre fixed in the wrist frame."""
     hand_table_collision: bool = False

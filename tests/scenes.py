@@ -69,6 +69,30 @@ def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
     return state, surface, goal
 
 
+def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:
+    """The goal with every wrist target within some centimetres and a third of a radian of where the wrist is."""
+    rng = np.random.default_rng(seed)
+    world = Rotation.from_quat(state.base_quaternion, scalar_first=True)
+    body = Rotation.from_quat(state.object_quaternion, scalar_first=True).inv()
+    wrist = body * world * Rotation.from_euler("XYZ", state.u[:, 3:])
+    position = body.apply(world.apply(state.u[:, :3]) + state.base_position - state.object_position)
+
+    def near(count: int) -> tuple[np.ndarray, np.ndarray]:
+        turns = [wrist * Rotation.from_rotvec(rng.normal(scale=0.1, size=position.shape)) for _ in range(count)]
+        points = position[:, None] + rng.normal(scale=0.03, size=(len(position), count, 3))
+        quaternions = np.stack([turn.as_quat(scalar_first=True) for turn in turns], 1)
+        return points.astype(np.float32), quaternions.astype(np.float32)
+
+    (pose, pose_turn), (way, way_turn) = near(1), near(K)
+    return goal._replace(
+        heading_position=pose[:, 0],
+        pose_position=pose[:, 0],
+        pose_quaternion=pose_turn[:, 0],
+        trajectory_position=way,
+        trajectory_quaternion=way_turn,
+    )
+
+
 def moved(state: SceneState, position: np.ndarray, turn: Rotation) -> SceneState:
     """The whole scene carried by a rigid motion of the world: first turned about the origin, then shifted."""
 

@@ -2,7 +2,7 @@
 
 Primitive pieces of every object share a fixed number of geom slots, whose sizes and poses are swapped; a slot that an
 object does not use shrinks to 0.4 mm inside it. Mesh pieces cannot be swapped: each mesh object owns its geoms, and
-those of the other objects are put out of reach.
+those of the other objects get a margin that no contact is deep enough for.
 """
 
 import dataclasses
@@ -19,8 +19,8 @@ from common.objects.mjcf import GEOM_TYPES, add_object
 from common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
 
 _UNUSED = 0.0004
-_OUT_OF_REACH = (0.0, 0.0, 500.0)
-"""Offset of other objects' meshes: far from everything, table included, in any orientation of the object."""
+_NO_CONTACT = -1000.0
+"""Margin (m) of other objects' meshes: they would have to be a kilometre deep in something to touch it."""
 
 LEAVES = (
     "geom_size",
@@ -28,6 +28,7 @@ LEAVES = (
     "geom_quat",
     "geom_rbound",
     "geom_aabb",
+    "geom_margin",
     "body_mass",
     "body_inertia",
     "body_iquat",
@@ -91,7 +92,7 @@ class Pool:
             )
         for geom, owner in zip(self._meshes, self._owners, strict=True):
             if owner != index:
-                model.geom_pos[geom] = _OUT_OF_REACH
+                model.geom_margin[geom] = _NO_CONTACT
         free = {kind: [g for g in self._slots if model.geom_type[g] == GEOM_TYPES[kind]] for kind in PRIMITIVE_SLOTS}
         for piece in obj.pieces:
             if piece.kind == "mesh":

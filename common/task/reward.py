@@ -21,6 +21,8 @@ AFFORDANCE_MARGIN = 0.01
 """m, metres the fingers should keep from O-."""
 AFFORDANCE_SHARPNESS = 0.002
 """tau, metres."""
+_FAR, _TURNED = 0.15, 0.5
+"""Errors (m, rad) beyond which tracking costs no more: what a fallen object carries away must not drown all else."""
 _GATE_FAR, _GATE_NEAR = 0.10, 0.03
 _AFFORDANCE, _FINGER, _WRIST, _TRAJECTORY = range(len(MASKS))
 
@@ -81,13 +83,15 @@ def reward_terms(
         "finger_deviation": -_square(state.q - state.q_initial),
         "drop": -fallen(task, state).astype(jnp.float32),
         "heading_direction": jnp.sum(own_heading * features.heading_direction, -1),
-        "heading_position": -jnp.linalg.norm(features.center - features.heading_position, axis=-1),
+        "heading_position": -jnp.minimum(jnp.linalg.norm(features.center - features.heading_position, axis=-1), _FAR),
         "pose_finger": -gate * _square(state.q - goal.pose_q),
         "pose_link": -gate * jnp.sum(_square(features.reference_keypoints - features.keypoints), -1),
-        "pose_wrist_position": -mask[..., _WRIST] * jnp.minimum(_square(position - pose_position), 1.0),
-        "pose_wrist_rotation": -mask[..., _WRIST] * rotations.angle(quaternion, pose_quaternion) ** 2,
-        "trajectory_position": -mask[..., _TRAJECTORY] * jnp.minimum(_square(position - waypoint[0]), 1.0),
-        "trajectory_rotation": -mask[..., _TRAJECTORY] * rotations.angle(quaternion, waypoint[1]) ** 2,
+        "pose_wrist_position": -mask[..., _WRIST] * jnp.minimum(_square(position - pose_position), _FAR**2),
+        "pose_wrist_rotation": -mask[..., _WRIST]
+        * jnp.minimum(rotations.angle(quaternion, pose_quaternion), _TURNED) ** 2,
+        "trajectory_position": -mask[..., _TRAJECTORY] * jnp.minimum(_square(position - waypoint[0]), _FAR**2),
+        "trajectory_rotation": -mask[..., _TRAJECTORY]
+        * jnp.minimum(rotations.angle(quaternion, waypoint[1]), _TURNED) ** 2,
         "affordance_distance": -mask[..., _AFFORDANCE]
         * jax.nn.softplus((AFFORDANCE_MARGIN - features.distance_minus) / AFFORDANCE_SHARPNESS),
         "affordance_force": -mask[..., _AFFORDANCE] * jnp.sum(jnp.minimum(minus_force, 10.0), -1),

@@ -18,7 +18,7 @@ from common.task.metrics import errors
 from common.task.observation import layout, observe, squash
 from common.task.reward import TERMS, pose_gate, reward_terms
 from common.task.types import MASKS
-from tests.scenes import HAND, F, K, L, moved, scene
+from tests.scenes import HAND, F, K, L, moved, near_targets, scene
 
 TASK = TaskConfig()
 FEATURES = jax.jit(functools.partial(features, HAND, TASK))
@@ -144,8 +144,11 @@ def test_observation_blocks_by_hand():
     np.testing.assert_allclose(squash(np.array([[5.0, 0.0, 0.0]])), [[0.5, 0.0, 0.0]])
 
 
-def test_reward_terms_against_numpy():
+@pytest.mark.parametrize("near", [False, True])
+def test_reward_terms_against_numpy(near):
+    """Far from its targets a hand pays the most that tracking can cost: 15 cm and half a radian."""
     state, surface, goal = scene(11)
+    goal = near_targets(state, goal, 12) if near else goal
     seen = FEATURES(state, surface, goal)
     terms = {name: np.asarray(value) for name, value in REWARD(UNIT, state, seen, goal).items()}
     b = 3
@@ -173,7 +176,7 @@ def test_reward_terms_against_numpy():
     points = np.asarray(keypoints(HAND, link_transforms(HAND, state.q[b])))
     center = wrist.apply(np.asarray(hand_center(HAND, points))) + wrist_position
     target = body.apply(goal.heading_position[b]) + state.object_position[b]
-    np.testing.assert_allclose(terms["heading_position"][b], -np.linalg.norm(center - target), rtol=1e-4)
+    np.testing.assert_allclose(terms["heading_position"][b], -min(np.linalg.norm(center - target), 0.15), rtol=1e-3)
     gate = np.clip((0.10 - d.min()) / 0.07, 0, 1)
     np.testing.assert_allclose(
         terms["pose_finger"][b], -gate * ((state.q[b] - goal.pose_q[b]) ** 2).sum(), rtol=1e-3, atol=1e-5
@@ -184,19 +187,19 @@ def test_reward_terms_against_numpy():
     reference = wrist.inv().apply(pose_turn.apply(reference) + pose_position - wrist_position)
     np.testing.assert_allclose(terms["pose_link"][b], -gate * ((reference - points) ** 2).sum(), rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(
-        terms["pose_wrist_position"][b], -min(((wrist_position - pose_position) ** 2).sum(), 1.0), rtol=1e-3
+        terms["pose_wrist_position"][b], -min(((wrist_position - pose_position) ** 2).sum(), 0.15**2), rtol=1e-3
     )
     np.testing.assert_allclose(
-        terms["pose_wrist_rotation"][b], -((wrist.inv() * pose_turn).magnitude() ** 2), rtol=1e-3, atol=1e-4
+        terms["pose_wrist_rotation"][b], -(min((wrist.inv() * pose_turn).magnitude(), 0.5) ** 2), rtol=1e-3, atol=1e-4
     )
     way = body.apply(goal.trajectory_position[b]) + state.object_position[b]
     k = min(np.linalg.norm(way - wrist_position, axis=-1).argmin() + 1, K - 1)
     np.testing.assert_allclose(
-        terms["trajectory_position"][b], -min(((way[k] - wrist_position) ** 2).sum(), 1.0), rtol=1e-3
+        terms["trajectory_position"][b], -min(((way[k] - wrist_position) ** 2).sum(), 0.15**2), rtol=1e-3
     )
     way_turn = body * _rotation(goal.trajectory_quaternion[b, k])
     np.testing.assert_allclose(
-        terms["trajectory_rotation"][b], -((wrist.inv() * way_turn).magnitude() ** 2), rtol=1e-3, atol=1e-4
+        terms["trajectory_rotation"][b], -(min((wrist.inv() * way_turn).magnitude(), 0.5) ** 2), rtol=1e-3, atol=1e-4
     )
     barrier = np.logaddexp(0.0, (0.01 - float(seen.distance_minus[b])) / 0.002)
     np.testing.assert_allclose(terms["affordance_distance"][b], -barrier, rtol=1e-3)
