@@ -141,6 +141,16 @@ class RolloutWorker:
         self.state = self.physics.reset(self.state, everywhere, self.env.world)
         self._moment = self._moment_jit(self.env, self.physics.read(self.state))
 
+    @property
+    def taskset(self) -> TaskSet:
+        """What episodes are drawn from at present."""
+        return self._taskset
+
+    def forget_references(self) -> None:
+        """Episodes that start from now on have no reference pose or trajectory, until there are renewed ones."""
+        none = jnp.zeros_like(self._taskset.pose_valid)
+        self._taskset = self._taskset._replace(pose_valid=none)
+
     def renew_references(self) -> None:
         """Puts the grasps that succeeded since the last call into the task set as reference poses."""
         self._key, key = jax.random.split(self._key)

@@ -199,25 +199,27 @@ class CurriculumConfig:
 
     stationary_updates: int = 0
     """Updates for which objects are held in place and the table stays."""
-    constraint_updates: int = 0
-    """Updates after which the constraint weights are multiplied by `constraint_factor`."""
-    constraint_factor: float = 1.0
-    """Factor on the weights of heading, pose, trajectory and affordance."""
+    ramp: tuple[int, int] = (0, 0)
+    """Updates between which the weights go from those of the task to `reward`; none if the two are equal."""
+    reward: RewardWeights = RewardWeights()
+    """The reward's weights at the end of the ramp."""
 
     def stationary(self, version: int) -> bool:
         """Whether objects are held in place under the policy of this version."""
         return version < self.stationary_updates
 
-    def weights(self, weights: RewardWeights, version: int) -> RewardWeights:
-        """The reward's weights under the policy of this version."""
-        if version < self.constraint_updates or self.constraint_factor == 1.0:
-            return weights
-        scaled = {
-            field.name: self.constraint_factor * getattr(weights, field.name)
-            for field in dataclasses.fields(weights)
-            if field.name.startswith(("heading", "pose", "trajectory", "affordance"))
-        }
-        return dataclasses.replace(weights, **scaled)
+    def weights(self, first: RewardWeights, version: int) -> RewardWeights:
+        """The reward's weights under the policy of this version; `first` are those of the task."""
+        begin, end = self.ramp
+        if end <= begin:
+            return first
+        share = min(max((version - begin) / (end - begin), 0.0), 1.0)
+        return RewardWeights(
+            **{
+                field.name: (1 - share) * getattr(first, field.name) + share * getattr(self.reward, field.name)
+                for field in dataclasses.fields(RewardWeights)
+            }
+        )
 
 
 @dataclasses.dataclass(frozen=True)

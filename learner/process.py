@@ -1,8 +1,8 @@
 """The learner process: rollouts in, policy bundles out, and a run directory from which it can be resumed.
 
-A run directory holds `config.json`, `checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`,
-`version` (the newest version that was ever published, so that versions rise over a crash, too) and, after an update
-that was not finite, `failure/`.
+A run directory holds `config.json`, `initial.safetensors` where training does not begin with random weights,
+`checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `version` (the newest version that was
+ever published, so that versions rise over a crash, too) and, after an update that was not finite, `failure/`.
 """
 
 import contextlib
@@ -34,6 +34,7 @@ from learner.statistics import Pace, episode_means, staleness
 from learner.update import NonFiniteUpdate
 
 POLICY_FILE = "policy.safetensors"
+INITIAL_FILE = "initial.safetensors"
 CONFIG_FILE = "config.json"
 LOGS = "logs"
 _VERSION_FILE = "version"
@@ -45,12 +46,25 @@ Notify = Callable[[str, str], None]
 """(level, text) of an event."""
 
 
-def create_run(run_dir: pathlib.Path, config: RunConfig) -> None:
-    """Makes a run directory; a CongraspError if there is a run in it already."""
+def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle | None = None) -> None:
+    """Makes a run directory.
+
+    Args:
+      run_dir: where.
+      config: the run.
+      initial: a policy to begin with instead of random weights: its networks and normalisers.
+
+    Raises:
+      CongraspError: there is a run in it already, or the initial policy does not fit the run.
+    """
     if (run_dir / CONFIG_FILE).exists():
         raise CongraspError(
             f"{run_dir} holds a run already.", "Choose another --run-dir, or continue it with --resume."
         )
+    if initial is not None:
+        bundles.policy_spec(config.task, config.network).require(initial.spec, "to begin with")
+        run_dir.mkdir(parents=True, exist_ok=True)
+        bundles.save(initial, run_dir / INITIAL_FILE)
     write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
     (run_dir / LOGS).mkdir(exist_ok=True)
 
@@ -73,7 +87,6 @@ def run_learner(
     *,
     stop_event: threading.Event,
     resume: bool = False,
-    initial: PolicyBundle | None = None,
     name: str = "0",
     recorder: contextlib.AbstractContextManager[object] | None = None,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
@@ -89,20 +102,19 @@ def run_learner(
       transport: the learner's endpoint; it stays the caller's.
       stop_event: ends training after the update that is under way.
       resume: go on from the latest checkpoint.
-      initial: a policy to begin with instead of random weights (not when resuming).
       name: the learner's name on the wire.
       recorder: entered while the learner runs, for example one that writes the run's logs.
       on_update: given the figures of every update.
       on_event: given what is worth a line.
 
     Raises:
-      CongraspError: the directory is not a run's; the checkpoint or the initial policy does not fit; the disk is full;
-        a thread of this process died.
+      CongraspError: the directory is not a run's; the checkpoint does not fit; the disk is full; a thread of this
+        process died.
       PhysicsError: a value was not finite; state and batch are in `failure/`.
     """
     open_run(run_dir)
     with _watch_threads() as deaths, recorder or contextlib.nullcontext():
-        learner = _Learner(run_dir, config, transport, name, resume, initial, on_event)
+        learner = _Learner(run_dir, config, transport, name, resume, on_event)
         learner.train(stop_event, deaths, on_update)
         return learner.bundle()
 
@@ -135,7 +147,6 @@ class _Learner:
         transport: Transport,
         name: str,
         resume: bool,
-        initial: PolicyBundle | None,
         on_event: Notify,
     ):
         self._run_dir, self._config, self._transport, self._name = run_dir, config, transport, name
@@ -151,8 +162,8 @@ class _Learner:
             self._epoch, self._skipped, hub_state = meta["epoch"], meta["skipped"], meta["hub"]
             self._skip_lost_versions()
             write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
-        elif initial is not None:
-            self._spec.require(initial.spec, f"to begin with (version {initial.version})")
+        elif (run_dir / INITIAL_FILE).exists():
+            initial = bundles.load(run_dir / INITIAL_FILE)
             params = jax.tree.map(jnp.asarray, initial.params)
             self._state = self._state._replace(params=params, observation=initial.observation, value=initial.value)
         self._hub = LearnerHub(

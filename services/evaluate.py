@@ -29,6 +29,8 @@ HOLD_SECONDS = 2.0
 """How long a grasp should last without the table, beyond the paper's quarter of a second."""
 _BATCH = {"native": 64, "warp": 4096, "jax": 256}
 _PATIENCE = 100
+_REFERENCES = 4
+"""References that an object needs, on average."""
 
 
 def mixture(task: TaskConfig, constraints: Sequence[str]) -> TaskConfig:
@@ -109,6 +111,8 @@ class Evaluator:
           CongraspError: no object of the pool allows a row's constraints, or too few resting poses do.
         """
         with self._worker(mixture(self.task, constraints), episodes) as worker:
+            if self.task.own_references and any(any(active_mask(name)[1:]) for name in constraints):
+                self._make_references(worker)
             return self._gather(worker, constraints, episodes, progress)
 
     def samples_of_pools(
@@ -134,6 +138,21 @@ class Evaluator:
                 worker.replace_objects(objects, self._taskset)
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
+
+    def _make_references(self, worker: RolloutWorker) -> None:
+        """References from the policy's own grasps under headings, as the paper makes them for its hands."""
+        worker.forget_references()
+        wanted = _REFERENCES * len(self.objects)
+        for _ in range(0, 2 * wanted, self._batch):
+            worker.restart()
+            worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
+            worker.renew_references()
+        made = int(np.asarray(worker.taskset.pose_valid).any(2).sum())
+        if made < wanted // 4:  # a policy that hardly grasps: those that closing the hand gave are all there is
+            worker.replace_objects(self.objects, self._taskset)
+        else:
+            self._taskset = worker.taskset
+        worker.restart()
 
     def _gather(
         self, worker: RolloutWorker, constraints: Sequence[str], episodes: int, progress: Callable[[int], None]

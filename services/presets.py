@@ -1,7 +1,16 @@
 """Named configurations to start from; every field can be overridden on the command line."""
 
-from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig
+from common.config import (
+    CurriculumConfig,
+    NetworkConfig,
+    ObjectsConfig,
+    PPOConfig,
+    RewardWeights,
+    RunConfig,
+    TaskConfig,
+)
 from common.errors import CongraspError
+from common.objects.procedural import PRIMITIVE_FAMILIES
 
 PRESETS = {
     # Minutes on two CPU cores; `easier` says what that takes.
@@ -15,8 +24,31 @@ PRESETS = {
         network=NetworkConfig(hidden=(256, 128)),
         ppo=PPOConfig(minibatches=8),
     ),
-    # The full task of the paper for the human hand, sized for a GPU.
-    "human": RunConfig(name="human", environments=4096, updates=400, objects=ObjectsConfig(count=64)),
+    # The full task of the paper for the human hand, sized for a GPU. Only primitive objects: any number of them costs
+    # no more than one, whereas every mesh of a pool is in the model of every world.
+    "human": RunConfig(
+        name="human",
+        environments=4096,
+        updates=400,
+        task=TaskConfig(hold_steps_max=150, mass_range=(0.8, 1.25), friction_range=(0.8, 1.2)),
+        # Grasps first, then the precision with which constraints are met.
+        curriculum=CurriculumConfig(
+            ramp=(150, 250),
+            reward=RewardWeights(
+                force_excess=0.02,
+                object_position=60.0,
+                object_rotation=1.0,
+                heading_direction=1.0,
+                heading_position=6.0,
+                pose_wrist_position=100.0,
+                pose_wrist_rotation=2.0,
+                trajectory_position=200.0,
+                trajectory_rotation=5.0,
+            ),
+        ),
+        objects=ObjectsConfig(families=PRIMITIVE_FAMILIES, count=768),
+        ppo=PPOConfig(rollouts_per_update=1),
+    ),
 }
 
 

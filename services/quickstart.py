@@ -42,12 +42,20 @@ console = Console(highlight=False)
 
 
 def run_training(
-    config: RunConfig, run_dir: pathlib.Path, *, actors: int, resume: bool, in_process: bool, evaluation: int
+    config: RunConfig,
+    run_dir: pathlib.Path,
+    *,
+    actors: int | None,
+    resume: bool,
+    evaluation: int,
+    initial: pathlib.Path | None = None,
 ) -> int:
-    """Trains, evaluates and shows; returns the exit code."""
-    if actors < 1:
-        raise CongraspError(f"--actors is {actors}.", "A run needs at least one actor.")
+    """Trains, evaluates and shows; returns the exit code. With no actor processes everything is in this one."""
+    if actors is not None and actors < 0:
+        raise CongraspError(f"--actors is {actors}.", "Name a number of actor processes, or 0 for none of their own.")
     physics = resolve_physics(config.physics)
+    if actors is None:
+        actors = 0 if physics == "warp" else 2
     if resume:
         config = open_run(run_dir)
         if not (run_dir / "checkpoints" / "latest").exists():
@@ -56,10 +64,11 @@ def run_training(
         if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / "config.json").exists():
             raise CongraspError(f"{run_dir} is not empty and is no run.", "Choose another --run-dir.")
         _check(config)
-        create_run(run_dir, config)
+        start = None if initial is None else bundles.load(initial)
+        create_run(run_dir, config, start)
     console.print(
         f"[bold]{config.name}[/]: {config.updates} updates of {_steps_per_update(config)} steps, "
-        f"{1 if in_process else actors} actor(s) with {config.environments} hands each on '{physics}' in {run_dir}",
+        f"{actors or 1} actor(s) with {config.environments} hands each on '{physics}' in {run_dir}",
         soft_wrap=True,
     )
     if words := easier(config):
@@ -71,7 +80,7 @@ def run_training(
         before = _evaluate(untrained(config), config, evaluation, "before training") if evaluation else []
         began = time.monotonic()
         with _Progress(config) as progress:
-            if in_process:
+            if actors == 0:
                 train_in_process(
                     run_dir,
                     config,

@@ -176,11 +176,16 @@ def train_in_process(
     resume: bool,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
 ) -> None:
-    """The same learner and one actor in this process, over the in-memory transport."""
+    """The same learner and one actor in this process, over the in-memory transport.
+
+    The two share their processors: to act under old weights while the learner updates would gain nothing. So updates
+    are on-policy, whatever `max_staleness` says.
+    """
     from actors.process import run_actor
     from common.logs.recorder import Recorder
     from learner.process import LOGS, run_learner
 
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, max_staleness=0))
     broker = MemoryHub()
     failures: list[BaseException] = []
     ended = threading.Event()

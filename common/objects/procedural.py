@@ -14,6 +14,8 @@ from common.objects.surface import halves, mass_properties, sample_union
 from common.parallel import parallel_map
 
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)
+PRIMITIVE_FAMILIES = tuple(family for family in FAMILIES if family not in ("ring", "bowl", "cup"))
+"""Families whose objects have no mesh pieces."""
 MASS_RANGE = (0.05, 0.5)
 """Kilograms."""
 _SIZE_RANGE = (0.03, 0.25)

@@ -20,7 +20,7 @@ Track = Callable[[str, int | None], Callable[[int], None]]
 
 
 def evaluate(
-    policy: pathlib.Path,
+    policy: pathlib.Path | None = None,
     table: tuple[Table, ...] = ("single",),
     objects: pathlib.Path | None = None,
     episodes: int = 1000,
@@ -34,10 +34,11 @@ def evaluate(
 
     An episode has 50 control steps with the table and 2 s without it. Success is counted after the paper's 25 steps
     without the table, and again after the 2 s (held). Rates come with 95 % Wilson intervals; errors and forces are
-    those of successful episodes in the paper's window of 25 steps. The policy acts by its mean.
+    those of successful episodes in the paper's window of 25 steps. The policy acts by its mean. Reference poses and
+    trajectories are made from its own grasps under headings, as the paper makes them for its hands.
 
     Args:
-      policy: A policy file (policy.safetensors of a run).
+      policy: A policy file (policy.safetensors of a run); by default the one that comes with the package.
       table: single: one constraint a row; composed: two; objects: the heading alone on many objects, by size, mass and
         family; all: everything. Several may be named.
       objects: Objects to grasp: a folder as 'congrasp objects import' takes it, or one that it made. By default
@@ -57,12 +58,14 @@ def evaluate(
     from actors.physics import resolve_physics
     from common.objects.pool import HELD_OUT_SEED
     from common.policy import bundle as bundles
+    from common.policy.shipped import policy_file
     from services.objects import objects_of
     from services.scores import TABLES, tables_of, write_json
 
     for name, value, least in (("episodes", episodes, 1), ("pool", pool, 0), ("batch", batch, 0), ("seed", seed, 0)):
         if value < least:
             raise CongraspError(f"--{name} is {value}.", f"It must be at least {least}.")
+    policy = policy_file(policy)
     loaded = bundles.load(policy)
     engine = resolve_physics(physics)
     rows = []

@@ -26,12 +26,15 @@ class Learner:
     """Named configuration to start from."""
     listen: str = "tcp/127.0.0.1:7447"
     """Endpoint for the actors; bulk messages use the next port. Other machines need tcp/0.0.0.0:PORT."""
+    initial: pathlib.Path | None = None
+    """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
     resume: bool = False
     """Go on with the run in --run-dir, from its latest checkpoint if it has one."""
 
     def run(self) -> int:
         """Runs the command."""
         from common.logs.recorder import Recorder
+        from common.policy import bundle as bundles
         from common.transport.zenoh_transport import ZenohTransport
         from learner.process import LOGS, create_run, open_run, run_learner
         from services.shutdown import on_signal
@@ -40,7 +43,7 @@ class Learner:
         config = open_run(self.run_dir) if self.resume else self.config
         with on_signal() as stop, ZenohTransport(listen=[self.listen]) as transport:
             if not self.resume:
-                create_run(self.run_dir, config)
+                create_run(self.run_dir, config, None if self.initial is None else bundles.load(self.initial))
             run_learner(
                 self.run_dir,
                 config,

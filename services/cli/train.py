@@ -24,12 +24,13 @@ class Train:
     """Named configuration to start from."""
     run_dir: pathlib.Path | None = None
     """Where the run is kept; runs/NAME-DATE by default."""
-    actors: int = 2
-    """Actor processes."""
+    actors: int | None = None
+    """Actor processes. By default two; on a GPU none: a single actor then lives in the learner's process, and rollouts
+    never leave the device."""
+    initial: pathlib.Path | None = None
+    """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
     resume: bool = False
     """Go on from the latest checkpoint in --run-dir."""
-    in_process: bool = False
-    """One process without a network: the learner and one actor over the in-memory transport."""
     evaluation: int = 64
     """Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out."""
 
@@ -43,7 +44,7 @@ class Train:
             run_dir,
             actors=self.actors,
             resume=self.resume,
-            in_process=self.in_process,
+            initial=self.initial,
             evaluation=self.evaluation,
         )
 

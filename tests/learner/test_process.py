@@ -247,17 +247,17 @@ def _started(thread: threading.Thread):
 @pytest.mark.timeout(120)
 def test_training_goes_on_from_a_given_policy(tmp_path, hub):
     create_run(tmp_path / "one", CONFIG)
-    create_run(tmp_path / "two", CONFIG)
     stopped = threading.Event()
     stopped.set()
     given = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
-    begun = learn(tmp_path / "two", hub, CONFIG, stopped, initial=given)
+    create_run(tmp_path / "two", CONFIG, given)
+    begun = learn(tmp_path / "two", hub, CONFIG, stopped)
     assert begun.version == 0 and begun.epoch != given.epoch
     jax.tree.map(np.testing.assert_array_equal, begun.params, given.params)
     other = dataclasses.replace(given, spec=dataclasses.replace(given.spec, hand="claw"))
-    create_run(tmp_path / "three", CONFIG)
     with pytest.raises(CongraspError, match=r"'claw'.*'human'"):
-        learn(tmp_path / "three", hub, CONFIG, stopped, initial=other)
+        create_run(tmp_path / "three", CONFIG, other)
+    assert not (tmp_path / "three").exists()
 
 
 def test_directories_that_are_no_runs_or_runs_already(tmp_path, hub):

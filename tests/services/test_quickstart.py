@@ -10,6 +10,7 @@ from rich.console import Console
 from common.config import NetworkConfig, ObjectsConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
 from services import quickstart
+from services.presets import get_preset
 from services.quickstart import EPISODE, SHIPPED, _compare, _minutes, _next_steps, _Progress
 
 CONFIG = RunConfig(updates=10, environments=4, rollout_steps=5)  # 40 steps an update
@@ -121,7 +122,7 @@ def test_a_run_that_dies_of_a_full_disk_says_so(said, monkeypatch, tmp_path, fre
     monkeypatch.setattr(quickstart, "train", die)
     monkeypatch.setattr(quickstart.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
     with pytest.raises(CongraspError, match=words):
-        quickstart.run_training(CONFIG, tmp_path, actors=1, resume=False, in_process=False, evaluation=0)
+        quickstart.run_training(CONFIG, tmp_path, actors=1, resume=False, evaluation=0)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +141,6 @@ def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, ch
             tmp_path / "run",
             actors=1,
             resume=False,
-            in_process=False,
             evaluation=0,
         )
     assert not (tmp_path / "run").exists()
@@ -153,5 +153,8 @@ def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_pat
     monkeypatch.setattr(quickstart, "train", stop)
     config = RunConfig(objects=ObjectsConfig(count=8), network=NetworkConfig(hidden=(32,)), physics="native")
     with pytest.raises(KeyboardInterrupt):
-        quickstart.run_training(config, tmp_path, actors=1, resume=False, in_process=False, evaluation=0)
-    assert "Easier than the full task: an actor has 8 objects, not 64; networks have layers of 32 units" in said()[1]
+        quickstart.run_training(config, tmp_path, actors=1, resume=False, evaluation=0)
+    full = get_preset("human").objects.count
+    assert (
+        f"Easier than the full task: an actor has 8 objects, not {full}; networks have layers of 32 units" in said()[1]
+    )
