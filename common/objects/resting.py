@@ -15,6 +15,8 @@ _SAME_KIND = 0.03  # poses whose heights differ by less than this share are turn
 _PER_KIND = 4
 _LEAST_LIKELY = 0.02
 _STILL = 1e-3  # m/s
+_SPEED_SECONDS = 0.025
+_FREE_SECONDS = 0.5  # after which an object that is not stable betrays itself by its speed
 _DROPS = ((0.03, 1.5e-6), (0.06, 5e-6))  # rad, m; a pose whose centre of mass a tilt lowers by more is not stable
 _ROUNDS = 4
 
@@ -25,7 +27,8 @@ class Settled(NamedTuple):
     pose: np.ndarray
     """(7,) position and quaternion in the world."""
     speed: float
-    """Bound of its fastest point's speed at the end, m/s: linear plus angular speed times the object's radius."""
+    """Bound of its fastest point's mean speed over the last 25 ms, m/s: linear plus angular speed times the object's
+    radius. A mean, because a contact that comes or goes makes a resting object's velocity jump for a single step."""
     moved: float
     """Distance of the centre of mass from its start, m."""
 
@@ -66,9 +69,16 @@ class TableScene:
             # A good part of the critical damping of a pendulum with the object's weight, size and inertia.
             inertia = self.model.body_inertia[1].max()
             self.model.dof_damping[3:] += 0.25 * np.sqrt(self.model.body_mass[1] * 9.81 * self.radius * inertia)
-        mujoco.mj_step(self.model, self.data, nstep=max(1, round(seconds / CONTACT.timestep)))
+        steps = max(1, round(seconds / CONTACT.timestep))
+        last = min(steps, round(_SPEED_SECONDS / CONTACT.timestep))
+        if steps > last:
+            mujoco.mj_step(self.model, self.data, nstep=steps - last)
+        before = self.data.qpos.copy()
+        mujoco.mj_step(self.model, self.data, nstep=last)
         self.model.dof_damping[:] = damping
-        linear, angular = np.linalg.norm(self.data.qvel.reshape(2, 3), axis=-1)
+        turn = np.zeros(3)
+        mujoco.mju_subQuat(turn, self.data.qpos[3:], before[3:])
+        linear, angular = np.linalg.norm([self.data.qpos[:3] - before[:3], turn], axis=-1) / (last * CONTACT.timestep)
         moved = np.linalg.norm(self.data.qpos[:3] - pose[:3])
         return Settled(self.data.qpos.copy(), float(linear + self.radius * angular), float(moved))
 
@@ -96,7 +106,8 @@ def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
             down = -shapes.matrix(pose[3:])[2]
             if any(down @ other > _SAME_NORMAL for other in downs):
                 break
-            if settled.speed < _STILL and _stable(obj.pieces, down):
+            still = settled.speed < _STILL and _stable(obj.pieces, down)
+            if still and scene.settle(pose, _FREE_SECONDS).speed < _STILL:
                 found.append(pose)
                 downs.append(down)
                 break
