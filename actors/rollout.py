@@ -116,10 +116,9 @@ class RolloutWorker:
         )
         self.state = physics.start(self.env.world)
         self._act_jit = jax.jit(self._act)
-        self._score_jit = jax.jit(self._score)
+        self._advance_jit = jax.jit(self._advance)
         self._restart_jit = jax.jit(functools.partial(environment.restart, hand, task))
         self._moment_jit = jax.jit(functools.partial(environment.moment, hand, task))
-        self._observe_jit = jax.jit(lambda scene, seen, goal: observe(task, scene, seen, goal).astype(self._dtype))
         self._scan_jit = jax.jit(self._scan, static_argnames="steps")
         self._moment: tuple[SceneState, Features] = self._moment_jit(self.env, physics.read(self.state))
 
@@ -180,26 +179,53 @@ class RolloutWorker:
         env, score, scene, seen = environment.score(self._hand, self._task, weights, env, readout, target)
         return env, score, scene, seen, (_trace(scene, seen, action, score), self._probe(scene, seen))
 
+    def _advance(
+        self,
+        parameters: Any,
+        weights: Any,
+        control: Any,
+        env: EnvironmentState,
+        readout: Readout,
+        decision: Any,
+        keys: Array,
+        step: Array,
+    ) -> tuple[dict[str, Any], environment.Score, tuple[Trace, Any], Any]:
+        """Scores a control step and decides on the next one: one call between two physics steps.
+
+        Of the environment only what changed is returned, because every array that passes through a call has its price.
+        """
+        _, action, _, target, _, _ = decision
+        after, score, scene, seen, kept = self._score(weights, env, readout, target, action)
+        changed = {name: new for name, new in after._asdict().items() if new is not getattr(env, name)}
+        key = jax.random.wrap_key_data(keys[step])
+        return changed, score, kept, self._act(parameters, control, after, scene, seen, key)
+
     def _collect_stepwise(self, parameters: Any, key: Array, steps: int) -> Rollout:
-        scene, seen = self._moment
+        # One key more than there are steps: what is decided after the last one only yields `last_observation`.
+        keys = jax.random.split(key, steps + 1)
+        key_data = jax.random.key_data(keys)
+        settings = jax.device_put((self._weights, self._control))
+        decision = self._act_jit(parameters, self._control, self.env, *self._moment, keys[0])
         rows, extras = [], []
-        for step_key in jax.random.split(key, steps):
-            env = self.env
-            observation, action, log_probability, target, joints, table = self._act_jit(
-                parameters, self._control, env, scene, seen, step_key
-            )
+        for step in range(1, steps + 1):
+            observation, action, log_probability, _, joints, table = decision
             self.state, readout = self.physics.step(self.state, np.asarray(joints), np.asarray(table))
-            self.env, score, scene, seen, kept = self._score_jit(self._weights, env, readout, target, action)
+            changed, score, kept, decision = self._advance_jit(
+                parameters, *settings, self.env, readout, decision, key_data, step
+            )
+            self.env = self.env._replace(**changed)
             rows.append((observation, action, log_probability, score.reward, score.terminal, readout.usage))
             extras.append(kept)
-            if bool(np.any(score.terminal)):
+            if np.asarray(score.terminal).any():
                 self.env = self._restart_jit(self._taskset, self.env, score.terminal, self._stationary)
                 self.state = self.physics.reset(self.state, score.terminal, self.env.world)
-                scene, seen = self._moment_jit(self.env, self.physics.read(self.state))
-        self._moment = scene, seen
+                readout = self.physics.read(self.state)
+                self._moment = self._moment_jit(self.env, readout)
+                decision = self._act_jit(parameters, self._control, self.env, *self._moment, keys[step])
+        self._moment = self._moment_jit(self.env, readout)
         columns = [np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)]
         trace, probed = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(extras))
-        last = self._observe_jit(scene, seen, self.env.goal)
+        last, *_ = decision
         return Rollout(*(*columns, last, self.env.finished, self.env.has_finished, trace, probed))
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:

@@ -1,6 +1,5 @@
 """Rotations: unit quaternions (w, x, y, z), matrices and intrinsic x-y-z angles, over any leading axes."""
 
-import jax
 import jax.numpy as jnp
 
 from common.task.types import Array
@@ -124,17 +123,22 @@ def frame_from_axes(primary: Array, secondary: Array) -> Array:
     return from_matrix(jnp.stack([first, second, jnp.cross(first, second)], -1))
 
 
+def apply(matrix: Array, points: Array) -> Array:
+    """Points (..., N, 3) turned by matrices (..., 3, 3).
+
+    Written out, because calling a matrix product of this size costs more than its arithmetic.
+    """
+    return sum(matrix[..., None, :, i] * points[..., i, None] for i in range(3))
+
+
 def transform(position: Array, quaternion: Array, points: Array) -> Array:
     """Points (..., N, 3) of a body's frame into the frame in which the body's pose (..., 3), (..., 4) is given."""
-    return (
-        jnp.matmul(points, jnp.swapaxes(to_matrix(quaternion), -1, -2), precision=jax.lax.Precision.HIGHEST)
-        + (position[..., None, :])
-    )
+    return apply(to_matrix(quaternion), points) + position[..., None, :]
 
 
 def inverse_transform(position: Array, quaternion: Array, points: Array) -> Array:
     """The inverse of `transform`: points (..., N, 3) into the body's frame."""
-    return jnp.matmul(points - position[..., None, :], to_matrix(quaternion), precision=jax.lax.Precision.HIGHEST)
+    return apply(jnp.swapaxes(to_matrix(quaternion), -1, -2), points - position[..., None, :])
 
 
 def relative_pose(

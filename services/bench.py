@@ -1,9 +1,12 @@
 """Benchmarks that print ratios against a reference measured in the same run."""
 
+import concurrent.futures
 import functools
+import itertools
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import mujoco
@@ -12,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from actors.physics import make_physics
+from actors.physics.engine import Physics, Readout
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker
 from actors.taskset import build_taskset
@@ -23,6 +27,12 @@ from services.presets import get_preset
 from services.quickstart import untrained
 
 _STEPS = 75
+"""One whole episode: every repeat begins with fresh episodes and ends with their reset."""
+_DEFINITION = (
+    "Actor: policy, observation, physics, reward and reset of whole episodes. Engine alone: for native, mj_step on "
+    "the same models, start states and control targets, hence the same contacts, with as many threads; for others, steps "
+    "that hold the actor's last targets. Ratio: the actor's control steps/s over the engine's."
+)
 
 
 def engines() -> list[PhysicsName]:
@@ -30,24 +40,55 @@ def engines() -> list[PhysicsName]:
     return ["native"] if jax.default_backend() == "cpu" else ["native", "warp", "jax"]
 
 
-def bench_physics(environments: int, threads: int, repeats: int, names: list[PhysicsName]) -> None:
-    """Control steps a second of actors (policy, observation, reward, reset) beside engines that only step.
+class Recorder(NativePhysics):
+    """A native engine that keeps what it is told, so that another can go through the same states."""
 
-    The bare engine steps the same models with the same controls as the actor just did, on as many threads.
-    """
+    def __init__(self, *args: Any, **kwargs: Any):
+        """As `NativePhysics`."""
+        super().__init__(*args, **kwargs)
+        self.commands: list[tuple[np.ndarray, np.ndarray]] = []
+        """Targets (B, 6 + F) and tables (B,) of every control step."""
+
+    def step(self, state: Any, target: Any, table: Any) -> tuple[NativePhysics, Readout]:
+        """One control step, written down."""
+        self.commands.append((np.array(target), np.array(table)))
+        return super().step(state, target, table)
+
+
+def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> None:
+    """Goes through recorded control steps with nothing but `mj_step`; threads share the worlds and never wait."""
+
+    def run(worlds: np.ndarray, targets: Sequence[np.ndarray]) -> None:
+        for target in targets:
+            for i in worlds:
+                cell = physics.cells[i]
+                cell.ctrl[:] = target[i]
+                mujoco.mj_step(cell.model, cell.data, substeps)
+
+    shares = np.array_split(np.arange(len(physics.cells)), physics.threads)
+    with concurrent.futures.ThreadPoolExecutor(physics.threads) as pool:
+        for _, group in itertools.groupby(commands, key=lambda command: command[1].tobytes()):
+            targets, tables = zip(*group, strict=True)
+            physics.place_tables(tables[0])
+            list(pool.map(run, shares, itertools.repeat(targets)))
+
+
+def bench_physics(environments: int, threads: int, repeats: int, names: list[PhysicsName]) -> None:
+    """Control steps a second of actors (policy, observation, reward, reset) beside engines that only step."""
     console = Console()
     config = get_preset("quickstart")
     hand = get_hand(config.task.hand)
     objects = load_pool(config.objects)
     taskset = build_taskset(hand, config.task, objects, 0)
     policy = untrained(config)
-    table = Table(
-        title=f"{environments} environments, {threads} thread(s), {_STEPS} control steps, median of {repeats}"
-    )
-    for column in ("engine", "actor, control steps/s", "engine alone, control steps/s", "ratio"):
+    table = Table(title=f"{environments} environments, {threads} thread(s), {_STEPS} control steps, {repeats} repeats")
+    for column in ("engine", "actor, control steps/s", "engine alone, control steps/s", "ratio of medians", "of bests"):
         table.add_column(column, justify="left" if column == "engine" else "right")
     for name in names:
-        physics = make_physics(name, hand, config.task, objects, threads=threads)
+        if name == "native":
+            physics: Physics = Recorder(hand, config.task, objects, threads)
+        else:
+            physics = make_physics(name, hand, config.task, objects, threads=threads)
         worker = RolloutWorker(
             hand,
             config.task,
@@ -59,20 +100,30 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
             half=True,
         )
         _collect(worker, policy)
-        actor, bare = [], []
+        twin = NativePhysics(hand, config.task, objects, threads) if isinstance(physics, Recorder) else None
+        bare: Callable[[], object]
+        actor_seconds, bare_seconds = [], []
         for _ in range(repeats):
-            actor.append(environments * _STEPS / _timed(functools.partial(_collect, worker, policy)))
-            run: Callable[[], object]
-            if isinstance(physics, NativePhysics):
-                run = functools.partial(_bare_native, physics, config.task.substeps, threads)
+            if isinstance(physics, Recorder) and twin is not None:
+                twin.start(worker.env.world)
+                physics.commands.clear()
+                bare = functools.partial(replay, twin, physics.commands, config.task.substeps)
             else:
-                run = functools.partial(_bare_compiled, worker)
-                run()
-            bare.append(environments * _STEPS / _timed(run))
-        a, b = float(np.median(actor)), float(np.median(bare))
-        table.add_row(name, f"{a:,.0f}", f"{b:,.0f}", f"{a / b:.2f}")
+                bare = _compiled_loop(worker)
+            actor_seconds.append(_timed(functools.partial(_collect, worker, policy)))
+            bare_seconds.append(_timed(bare))
+        table.add_row(name, *_row(environments * _STEPS, np.array(actor_seconds), np.array(bare_seconds)))
         physics.close()
+        if twin is not None:
+            twin.close()
     console.print(table)
+    console.print(_DEFINITION)
+
+
+def _row(steps: int, actor: np.ndarray, bare: np.ndarray) -> list[str]:
+    """The table's cells, from seconds of every repeat."""
+    a, b = np.median(actor), np.median(bare)
+    return [f"{steps / a:,.0f}", f"{steps / b:,.0f}", f"{b / a:.2f}", f"{bare.min() / actor.min():.2f}"]
 
 
 def _timed(run: Callable[[], object]) -> float:
@@ -83,21 +134,6 @@ def _timed(run: Callable[[], object]) -> float:
 
 def _collect(worker: RolloutWorker, policy: PolicyBundle) -> None:
     jax.block_until_ready(worker.collect(policy.acting, _STEPS).reward)
-
-
-def _bare_native(physics: NativePhysics, substeps: int, threads: int) -> None:
-    """Nothing but `mj_step` on the actor's own worlds, from where they are, on as many threads."""
-    import concurrent.futures
-
-    cells = physics.cells
-
-    def run(chunk: np.ndarray) -> None:
-        for _ in range(_STEPS):
-            for i in chunk:
-                mujoco.mj_step(cells[i].model, cells[i].data, substeps)
-
-    with concurrent.futures.ThreadPoolExecutor(threads) as pool:
-        list(pool.map(run, np.array_split(np.arange(len(cells)), threads)))
 
 
 @functools.lru_cache(maxsize=1)
@@ -113,11 +149,12 @@ def _compiled_loop(worker: RolloutWorker) -> Callable[[], object]:
     compiled = jax.jit(loop)
     target = jax.numpy.concatenate([worker.env.u_target, worker.env.q_target], -1)
     table = jax.numpy.ones(len(target), bool)
-    return lambda: jax.block_until_ready(compiled(worker.state, target, table))
 
+    def run() -> object:
+        return jax.block_until_ready(compiled(worker.state, target, table))
 
-def _bare_compiled(worker: RolloutWorker) -> object:
-    return _compiled_loop(worker)()
+    run()
+    return run
 
 
 def cores() -> int:

@@ -69,8 +69,8 @@ def link_transforms(hand: Hand, q: Array) -> tuple[Array, Array]:
     chain = _chain(hand)
     axes = jnp.array([joint.axis for joint in hand.joints])
     anchors = jnp.array([joint.anchor for joint in hand.joints])
-    local = rotations.axis_rotation(jnp.broadcast_to(axes, (*q.shape, 3)), q)
-    offset = anchors - jnp.einsum("...ij,...j->...i", local, anchors, precision=_EXACT)
+    local = rotations.axis_rotation(axes, q)
+    offset = anchors - rotations.apply(local, anchors[:, None])[..., 0, :]
     batch = q.shape[:-1]
     done_r = jnp.broadcast_to(jnp.eye(3), (*batch, 1, 3, 3))
     done_t = jnp.zeros((*batch, 1, 3))
@@ -80,7 +80,7 @@ def link_transforms(hand: Hand, q: Array) -> tuple[Array, Array]:
         parent_r, parent_t = done_r[..., above, :, :], done_t[..., above, :]
         here = np.array(level)
         r = jnp.matmul(parent_r, local[..., here, :, :], precision=_EXACT)
-        t = parent_t + jnp.einsum("...ij,...j->...i", parent_r, offset[..., here, :], precision=_EXACT)
+        t = parent_t + rotations.apply(parent_r, offset[..., here, None, :])[..., 0, :]
         place.update({j: done_t.shape[-2] + k for k, j in enumerate(level)})
         done_r = jnp.concatenate([done_r, r], -3)
         done_t = jnp.concatenate([done_t, t], -2)
@@ -92,10 +92,8 @@ def keypoints(hand: Hand, transforms: tuple[Array, Array]) -> Array:
     """(..., P, 3) link origins and fingertips, from `link_transforms`."""
     rotation, translation = transforms
     carrier = hand.keypoint_links
-    return (
-        jnp.einsum("...pij,pj->...pi", rotation[..., carrier, :, :], jnp.array(hand.keypoints), precision=_EXACT)
-        + translation[..., carrier, :]
-    )
+    points = rotations.apply(rotation[..., carrier, :, :], jnp.array(hand.keypoints)[:, None])[..., 0, :]
+    return points + translation[..., carrier, :]
 
 
 def link_poses(hand: Hand, q: Array) -> tuple[Array, Array]:
@@ -103,7 +101,7 @@ def link_poses(hand: Hand, q: Array) -> tuple[Array, Array]:
     rotation, translation = link_transforms(hand, q)
     origins = jnp.array([link_origin(link) for link in hand.links])
     return (
-        jnp.einsum("...lij,lj->...li", rotation, origins, precision=_EXACT) + translation,
+        rotations.apply(rotation, origins[:, None])[..., 0, :] + translation,
         rotations.from_matrix(rotation),
     )
 

@@ -175,6 +175,26 @@ def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp
     physics.close()
 
 
+def test_a_world_that_was_used_before_is_as_good_as_new(env):
+    """Worlds are recycled: neither state nor mass of an earlier episode may be left in them."""
+    physics, fresh = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, OBJECTS, 1)
+    world = _above(env.world, 0.19)
+    everywhere = np.ones(WORLDS, bool)
+    state = physics.start(world._replace(mass_scale=np.full(WORLDS, 3.0), stationary=everywhere))
+    for step in range(30):
+        physics.step(state, _grasp(world, step), ~everywhere)
+    swapped = world._replace(object_index=np.array([2, 0, 0]))
+    state, new = physics.reset(state, everywhere, swapped), fresh.start(swapped)
+    for step in range(30):
+        state, seen = physics.step(state, _grasp(world, step), everywhere)
+        new, expected = fresh.step(new, _grasp(world, step), everywhere)
+    assert seen.contact_found.any()
+    for a, b in zip(seen, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+    physics.close()
+    fresh.close()
+
+
 def test_reset_changes_only_the_masked_worlds(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     world = _above(env.world, 0.3)
