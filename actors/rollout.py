@@ -204,14 +204,14 @@ class RolloutWorker:
         # One key more than there are steps: what is decided after the last one only yields `last_observation`.
         keys = jax.random.split(key, steps + 1)
         key_data = jax.random.key_data(keys)
-        settings = jax.device_put((self._weights, self._control))
-        decision = self._act_jit(parameters, self._control, self.env, *self._moment, keys[0])
+        weights, control = jax.device_put((self._weights, self._control))
+        decision = self._act_jit(parameters, control, self.env, *self._moment, keys[0])
         rows, extras = [], []
         for step in range(1, steps + 1):
             observation, action, log_probability, _, joints, table = decision
             self.state, readout = self.physics.step(self.state, np.asarray(joints), np.asarray(table))
             changed, score, kept, decision = self._advance_jit(
-                parameters, *settings, self.env, readout, decision, key_data, step
+                parameters, weights, control, self.env, readout, decision, key_data, step
             )
             self.env = self.env._replace(**changed)
             rows.append((observation, action, log_probability, score.reward, score.terminal, readout.usage))
@@ -220,11 +220,11 @@ class RolloutWorker:
                 self.env = self._restart_jit(self._taskset, self.env, score.terminal, self._stationary)
                 self.state = self.physics.reset(self.state, score.terminal, self.env.world)
                 readout = self.physics.read(self.state)
-                self._moment = self._moment_jit(self.env, readout)
-                decision = self._act_jit(parameters, self._control, self.env, *self._moment, keys[step])
+                moment = self._moment_jit(self.env, readout)
+                decision = self._act_jit(parameters, control, self.env, *moment, keys[step])
         self._moment = self._moment_jit(self.env, readout)
-        columns = [np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)]
-        trace, probed = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(extras))
+        columns = [np.stack(column) for column in zip(*rows, strict=True)]
+        trace, probed = jax.tree.map(lambda *x: np.stack(x), *extras)
         last, *_ = decision
         return Rollout(*(*columns, last, self.env.finished, self.env.has_finished, trace, probed))
 
