@@ -30,8 +30,8 @@ _STEPS = 75
 """One whole episode: every repeat begins with fresh episodes and ends with their reset."""
 _DEFINITION = (
     "Actor: policy, observation, physics, reward and reset of whole episodes. Engine alone: for native, mj_step on "
-    "the same models, start states and control targets, hence the same contacts, with as many threads; for others, steps "
-    "that hold the actor's last targets. Ratio: the actor's control steps/s over the engine's."
+    "the same models, start states and control targets, hence the same contacts, with as many threads; for others, "
+    "steps that hold the actor's last targets. Ratio: the actor's control steps/s over the engine's."
 )
 
 

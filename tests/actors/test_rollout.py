@@ -9,6 +9,7 @@ import pytest
 
 from actors import environment
 from actors.environment import EPISODE_FIELDS, METRICS
+from actors.physics.engine import Readout
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker, finished_episodes
 from actors.taskset import build_taskset
@@ -18,7 +19,7 @@ from common.hands import get_hand
 from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
 from common.objects import procedural
 from common.task.observation import layout
-from common.task.types import MASKS, Action
+from common.task.types import CONTACTS_PER_LINK, MASKS, Action
 
 HAND = get_hand("human")
 TASK = TaskConfig()
@@ -168,3 +169,55 @@ def test_workers_with_the_same_seed_agree_bit_for_bit(taskset):
     a, b = (_worker(taskset, seed=5, batch=3).collect(None, 20) for _ in range(2))
     np.testing.assert_array_equal(a.reward, b.reward)
     np.testing.assert_array_equal(a.observation, b.observation)
+
+
+class _Touching:
+    """A compiled engine in which every hand touches always, and whose `read` knows no contacts, as that of MJX."""
+
+    name, compiled = "touching", True
+
+    def start(self, world):
+        return world
+
+    def reset(self, state, mask, world):
+        return environment.where_worlds(mask, world, state)
+
+    def step(self, state, target, table):
+        return state, self._readout(state, True)
+
+    def read(self, state):
+        return self._readout(state, False)
+
+    def close(self):
+        pass
+
+    def _readout(self, world, touching):
+        batch, links = world.q.shape[0], len(HAND.links)
+        none = jnp.zeros((batch, 6))
+        return Readout(
+            q=world.q,
+            u=none,
+            q_velocity=jnp.zeros_like(world.q),
+            u_velocity=none,
+            object_position=world.object_position,
+            object_quaternion=world.object_quaternion,
+            object_velocity=none[:, :3],
+            object_angular_velocity=none[:, :3],
+            contact_force=jnp.ones((batch, links, CONTACTS_PER_LINK, 3)),
+            contact_position=jnp.zeros((batch, links, CONTACTS_PER_LINK, 3)),
+            contact_found=jnp.full((batch, links, CONTACTS_PER_LINK), touching),
+            bad=jnp.zeros(batch, bool),
+            usage=jnp.zeros(2),
+        )
+
+
+def test_a_world_that_goes_on_keeps_its_contacts_when_another_restarts(taskset):
+    worker = RolloutWorker(HAND, TASK, _Touching(), taskset, _noise, batch=2, seed=0, half=False)
+    worker.env = worker.env._replace(time=jnp.array([70, 70]), hold=jnp.array([25, 100]))
+    rollout = worker.collect(None, 7)
+    flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation
+    touching = np.asarray(rollout.observation)[..., flags : flags + len(HAND.links)].all(-1)
+    assert np.asarray(rollout.terminal)[:, 0].tolist() == [False] * 4 + [True, False, False]
+    # World 0 begins anew at step 5 and has not touched yet; in the very first step nobody has.
+    assert touching[:, 0].tolist() == [False, True, True, True, True, False, True]
+    assert touching[:, 1].tolist() == [False] + [True] * 6

@@ -1,0 +1,104 @@
+"""Task sets: references that the table allows, and references renewed by the policy's own grasps."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from actors import environment
+from actors.references import Grasps, renew
+from actors.taskset import POSES, build_taskset, make_references
+from common import rotations
+from common.config import TaskConfig
+from common.constraints.poses import Poses
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.hands.kinematics import grasp_frame
+from common.objects import procedural
+
+HAND = get_hand("human")
+TASK = TaskConfig()
+OBJECTS = [procedural.generate(1, family) for family in ("hammer", "box")]
+F = len(HAND.joints)
+
+
+@pytest.fixture(scope="module")
+def taskset():
+    return build_taskset(HAND, TASK, OBJECTS, 0)
+
+
+def test_headings_of_a_flat_object_stay_above_the_table(taskset):
+    rest = np.asarray(taskset.rest)
+    for n in range(len(OBJECTS)):
+        for r in range(rest.shape[1]):
+            index = np.asarray(taskset.heading_index)[n, 0, r]
+            position = np.asarray(taskset.heading_position)[n, 0, index]
+            direction = np.asarray(taskset.heading_direction)[n, 0, index]
+            position = position - np.asarray(taskset.heading_back)[n, 0, r][:, None] * direction
+            quaternion = np.broadcast_to(rest[n, r, 3:], (len(index), 4))
+            height = np.asarray(rotations.rotate(quaternion, position))[:, 2] + rest[n, r, 2]
+            assert height.min() >= 0.01 - 1e-5
+            assert np.asarray(rotations.rotate(quaternion, direction))[:, 2].max() <= 0.1 + 1e-5
+    assert (np.asarray(taskset.heading_back) > 0).any()  # the hammer is thinner than twice two centimetres
+    assert (np.asarray(taskset.heading_back) <= 0.02 + 1e-5).all()
+
+
+def _pointing(z: float) -> jax.Array:
+    """(4,) wrist orientation whose heading axis points up (1) or down (-1)."""
+    frame = grasp_frame(HAND)
+    own = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
+    target = rotations.frame_from_axes(jnp.array([0.0, 0.0, z]), jnp.array([1.0, 0.0, 0.0]))
+    return rotations.multiply(target, rotations.conjugate(own))
+
+
+def test_references_below_the_table_are_not_valid():
+    """One pose from above, one from below; the object lies as it is, or upside down."""
+    positions = jnp.array([[0.0, 0.0, 0.15], [0.0, 0.0, -0.15]])
+    poses = Poses(jnp.zeros((2, F)), positions, jnp.stack([_pointing(-1.0), _pointing(1.0)]))
+    upright, upside_down = [0, 0, 0.05, 1, 0, 0, 0], [0, 0, 0.05, 0, 1, 0, 0]
+    rest = jnp.array([[upright, upside_down]] * 2, jnp.float32)
+    path, turns, valid = make_references(HAND, poses, rest, jax.random.key(0), TASK.trajectory_points)
+    assert path.shape == (2, TASK.trajectory_points, 3) and turns.shape == (2, TASK.trajectory_points, 4)
+    np.testing.assert_array_equal(valid, [[True, False], [False, True]])
+
+
+def test_an_object_that_cannot_be_approached_is_named():
+    wide = dataclasses.replace(OBJECTS[1], name="wide", points=OBJECTS[1].points * 10)
+    lifted = dataclasses.replace(wide, rest_poses=np.array([[0, 0, -5.0, 1, 0, 0, 0]]))
+    with pytest.raises(CongraspError, match="'wide' cannot be approached"):
+        build_taskset(HAND, TASK, [lifted], 0)
+
+
+def test_a_grasp_replaces_one_reference_of_its_object_and_variant(taskset):
+    found = jnp.array([True, False])
+    grasps = Grasps(
+        found,
+        jnp.array([1, 0]),
+        jnp.array([1, 0]),
+        jnp.full((2, F), 0.123),
+        jnp.array([[0.0, 0.0, 0.2]] * 2),
+        jnp.stack([_pointing(-1.0)] * 2),
+    )
+    # A grasp from straight above is possible where the object is not turned.
+    flat = taskset._replace(rest=taskset.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
+    new = renew(HAND, TASK, flat, grasps, jax.random.key(1))
+    changed = np.asarray((new.pose_q != flat.pose_q).any(-1))
+    assert changed[1, 1].sum() == 1 and changed.sum() == 1
+    (slot,) = np.flatnonzero(changed[1, 1])
+    np.testing.assert_allclose(new.pose_q[1, 1, slot], 0.123)
+    np.testing.assert_allclose(new.trajectory_position[1, 1, slot, -1], [0, 0, 0.2], atol=2e-3)
+    others = np.delete(np.arange(POSES), slot)
+    np.testing.assert_array_equal(new.trajectory_position[1, 1, others], flat.trajectory_position[1, 1, others])
+    np.testing.assert_array_equal(new.pose_valid[0], flat.pose_valid[0])
+    nothing = renew(HAND, TASK, flat, grasps._replace(found=jnp.zeros(2, bool)), jax.random.key(1))
+    jax.tree.map(np.testing.assert_array_equal, nothing, flat)
+
+
+def test_only_masked_worlds_are_exchanged():
+    mask = jnp.array([True, False])
+    new, old = {"a": jnp.ones((2, 3)), "b": jnp.array([True, True])}, {"a": jnp.zeros((2, 3)), "b": jnp.zeros(2, bool)}
+    merged = environment.where_worlds(mask, new, old)
+    np.testing.assert_array_equal(merged["a"], [[1, 1, 1], [0, 0, 0]])
+    np.testing.assert_array_equal(merged["b"], [True, False])

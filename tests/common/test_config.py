@@ -1,0 +1,35 @@
+"""The run's configuration: JSON and back, and the curriculum."""
+
+import dataclasses
+
+import pytest
+
+from common.config import CurriculumConfig, RewardWeights, RunConfig, run_config_from_json, to_json
+from common.errors import CongraspError
+from services.presets import PRESETS
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_configurations_survive_the_wire(name):
+    assert run_config_from_json(to_json(PRESETS[name])) == PRESETS[name]
+
+
+def test_unknown_keys_are_named():
+    with pytest.raises(CongraspError, match="colour"):
+        run_config_from_json('{"colour": 3}')
+
+
+def test_weights_go_along_the_ramp():
+    first = RewardWeights(contact=1.0, heading_position=2.0)
+    last = dataclasses.replace(first, heading_position=6.0)
+    curriculum = CurriculumConfig(stationary_updates=5, ramp=(10, 20), reward=last)
+    assert curriculum.weights(first, 3) == first
+    assert curriculum.weights(first, 15).heading_position == pytest.approx(4.0)
+    assert curriculum.weights(first, 15).contact == pytest.approx(1.0)
+    assert curriculum.weights(first, 100) == last
+    assert [curriculum.stationary(version) for version in (4, 5)] == [True, False]
+    assert CurriculumConfig(reward=last).weights(first, 100) == first  # no ramp
+
+
+def test_objects_are_free_by_default():
+    assert not RunConfig().curriculum.stationary(0)
