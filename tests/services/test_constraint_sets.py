@@ -76,7 +76,7 @@ def test_files_come_back_whole_and_others_are_refused(sets, file, tmp_path):
 def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("services.constraint_sheet._SIZE", (48, 36))
     picture = tmp_path / "sheet.png"
-    assert load("constraints")(["show", str(file), "--png", str(picture)]) == 0
+    assert load("constraints")(["show", str(file), "--png", str(picture)])() == 0
     words = capsys.readouterr().out
     assert "human, 20 finger joints" in words and "mug_7" in words and "resting pose 1" in words
     colours = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3).astype(int)
@@ -84,7 +84,7 @@ def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypat
     assert (blue - red > 60).sum() > 20  # arrows
     assert (red - blue > 100).sum() > 100  # the object
     with pytest.raises(CongraspError, match="--rest is 99"):
-        load("constraints")(["show", str(file), "--rest", "99"])
+        load("constraints")(["show", str(file), "--rest", "99"])()
 
 
 def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
@@ -96,9 +96,9 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]
     file = tmp_path / "objects" / "box_0.safetensors"
     arguments = ["box_0", "mug:7", str(file), "--count", "1", "--families", "ball"]
-    assert load("constraints")(["generate", *arguments, *folder]) == 0
+    assert load("constraints")(["generate", *arguments, *folder])() == 0
     assert made == ["box_0", "mug_7", "box_0", "ball_0"]
     with pytest.raises(CongraspError, match="no object to make constraints for"):
-        load("constraints")(["generate"])
+        load("constraints")(["generate"])()
     with pytest.raises(CongraspError, match="no object 'nothing'"):
-        load("constraints")(["generate", "nothing", *folder])
+        load("constraints")(["generate", "nothing", *folder])()

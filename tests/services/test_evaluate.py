@@ -44,7 +44,7 @@ def test_the_command_measures_rows_by_the_protocol(policy, tmp_path, capsys, mon
     row = Evaluator.row
     monkeypatch.setattr(Evaluator, "row", lambda self, name, sample: row(self, name, samples.setdefault(name, sample)))
     arguments = ["--policy", str(policy), "--objects", str(folder), "--table", "composed"]
-    assert load("evaluate")([*arguments, "--episodes", "3", "--batch", "8", "--json", str(out)]) == 0
+    assert load("evaluate")([*arguments, "--episodes", "3", "--batch", "8", "--json", str(out)])() == 0
     read = json.loads(out.read_text())
     assert [row["constraint"] for row in read["rows"]] == ["pose+trajectory", "trajectory+affordance"]
     assert all(row["hand"] == "human" and 0 <= row["held_2s"] <= row["success"] <= 1 for row in read["rows"])
@@ -129,7 +129,7 @@ def test_a_pool_that_never_allows_a_constraint_is_an_error(evaluator, monkeypatc
 @pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--pool", "-1"]])
 def test_numbers_out_of_range_are_refused(policy, arguments):
     with pytest.raises(CongraspError, match="at least"):
-        load("evaluate")(["--policy", str(policy), *arguments])
+        load("evaluate")(["--policy", str(policy), *arguments])()
 
 
 def test_nominal_mass_and_friction(monkeypatch):
