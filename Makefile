@@ -18,7 +18,7 @@ quickstart: install
 	$(VENV)/bin/congrasp train --preset quickstart
 
 test: install
-	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -m "not gpu" --cov --cov-report=term $(ARGS)
+	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 2 --dist loadfile -m "not gpu" --cov --cov-report=term $(ARGS)
 
 lint: install
 	$(VENV)/bin/ruff check .
