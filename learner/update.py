@@ -189,7 +189,8 @@ def _optimise(
         reward, value, last_value, batch["terminal"], hyper["gamma"], hyper["gae_lambda"]
     )
     samples = losses.Sample(
-        observation,
+        # Normalised in each minibatch: gathering its rows in half precision is cheaper.
+        batch["observation"],
         batch["action"],
         log_proximal,
         mean,
@@ -208,6 +209,7 @@ def _optimise(
         jax.random.split(epochs_key, epochs),
         failure,
         flat,
+        normalization,
         log_std,
         hyper,
         layout,
@@ -243,12 +245,16 @@ def _epochs(
     keys: Array,
     failure: Array,
     samples: losses.Sample,
+    normalization: Affine,
     log_std_proximal: Array,
     hyper: dict[str, Array],
     layout: Layout,
     minibatches: int,
 ) -> tuple[Params, optax.OptState, Array, tuple[losses.Terms, dict[str, Array]]]:
-    """Shuffled minibatches, each sample at most once an epoch; the remainder of the division sits an epoch out."""
+    """Shuffled minibatches, each sample at most once an epoch; the remainder of the division sits an epoch out.
+
+    The observations of `samples` are not normalised yet.
+    """
     count = samples.advantage.shape[0]
     size = count // minibatches
     coefficients = losses.Coefficients(hyper["clip"], hyper["entropy"], hyper["value_coefficient"])
@@ -257,6 +263,7 @@ def _epochs(
     def step(carry: tuple[Params, optax.OptState, Array], rows: Array):
         params, optimizer, failure = carry
         minibatch = jax.tree.map(lambda x: x[rows], samples)
+        minibatch = minibatch._replace(observation=normalizer.apply(normalization, minibatch.observation))
         (_, terms), gradients = gradient(params, layout, log_std_proximal, minibatch, coefficients)
         # The networks share no weight, so one's large gradient must not shrink the other's.
         norms = {name: optax.tree.norm(tree) for name, tree in gradients.items()}

@@ -49,8 +49,14 @@ class Viewer:
                 for channel in message["channels"]:
                     self._topics[channel["id"]] = channel["topic"]
                     self.advertised[channel["topic"]] = channel
-                wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in message["channels"]]
-                self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+                self._subscribe(message["channels"])
+            elif message["op"] == "status" and "Unknown channel" in message["message"]:
+                # The server tells viewers of a new channel a moment before it takes subscriptions to it.
+                self._subscribe(list(self.advertised.values()))
+
+    def _subscribe(self, channels: list[dict[str, str]]) -> None:
+        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
     def wait_for(self, topic: str, count: int) -> None:
         end = time.monotonic() + 20
