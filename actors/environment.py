@@ -322,6 +322,8 @@ def score(
         terms=env.terms + stacked,
     )
     terminal = env.time >= task.approach_steps + env.hold
+    if task.end_when_fallen:
+        terminal |= (env.time >= task.approach_steps + task.hold_steps) & ~up
     finished = jnp.where(terminal[:, None], _episode(task, env, up), env.finished)
     env = env._replace(finished=finished, has_finished=env.has_finished | terminal)
     return env, Score(reward, terminal, stacked), scene, seen

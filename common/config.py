@@ -21,7 +21,7 @@ class RewardWeights:
     """Weights of the reward's terms, all in units of reward per control step (paper, section Reward Function)."""
 
     distance: float = 0.3
-    """w_dis: per metre of the weighted distance from the hand's keypoints to the object's surface."""
+    """w_dis: per metre of the weighted distance from the hand's keypoints to the object's surface (0.3 m at most)."""
     contact: float = 1.0
     """w_c: for all links in contact (shared out by the links' contact weights, which sum to one)."""
     force: float = 0.5
@@ -98,6 +98,8 @@ class TaskConfig:
     """Control steps without the table that count for success (and the least in training)."""
     hold_steps_max: int = 25
     """Training draws the hold's length between `hold_steps` and this, short ones more often."""
+    end_when_fallen: bool = True
+    """Holds longer than `hold_steps` end as soon as the object has fallen."""
     dynamic_center: bool = True
     """Hand centre from the live fingertips; false is the paper's ablation with a centre fixed in the wrist frame."""
     hand_table_collision: bool = False

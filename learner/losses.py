@@ -24,9 +24,9 @@ class Sample(NamedTuple):
     action: Array
     """(M, A)."""
     log_proximal: Array
-    """(M,) log probability of the action under the proximal policy."""
+    """(M,) log probability of the action under the proximal policy, computed as `objective` does."""
     mean_proximal: Array
-    """(M, A) the proximal policy's mean."""
+    """(M, A) the proximal policy's mean, computed likewise."""
     weight: Array
     """(M,) truncated importance weight of the proximal against the behaviour policy."""
     advantage: Array
@@ -71,7 +71,7 @@ def objective(
     params: Params, layout: Layout, log_std_proximal: Array, sample: Sample, coefficients: Coefficients
 ) -> tuple[Array, Terms]:
     """The scalar to minimise and its terms: surrogate + c_v (V - target)^2 - c_e entropy, means over the minibatch."""
-    mean, log_std = network.policy(params, layout, sample.observation)
+    mean, log_std = network.policy(params, layout, sample.observation, exact=False)
     log_ratio = network.log_probability(mean, log_std, sample.action) - sample.log_proximal
     error = network.value(params, layout, sample.observation) - sample.target
     terms = Terms(

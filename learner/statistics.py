@@ -9,13 +9,16 @@ import numpy as np
 from common.wire.codec import Message
 
 _EPISODE = ("episode/", "term/")
+_CONSTRAINTS = {"affordance": "affordance", "pose": "pose_wrist", "trajectory": "trajectory"}
+"""Mask bit that says whether an episode had the constraint; without any of them it had the heading alone."""
 
 
 def episode_means(messages: Sequence[Message]) -> dict[str, float]:
-    """Mean of every `episode/…` metric and `term/…` sum over all episodes that ended in the batch, and their number.
+    """Means over all episodes that ended in the batch, and their number.
 
-    A rollout in which no episode ended contributes nothing; metrics that no episode has are absent. Episodes without a
-    value (NaN: the constraint was not active) are left out of that metric's mean.
+    `episode/…` metrics and `term/…` sums over all of them, but errors of a constraint over those that had it; and
+    `success/heading` over episodes with the heading alone, `success/pose` and so on over those with that constraint,
+    whatever others they had. A rollout in which no episode ended contributes nothing; what no episode has is absent.
     """
     columns: dict[str, list[np.ndarray]] = collections.defaultdict(list)
     for message in messages:
@@ -23,8 +26,17 @@ def episode_means(messages: Sequence[Message]) -> dict[str, float]:
             if name.startswith(_EPISODE):
                 columns[name].append(np.asarray(values, np.float64).ravel())
     joined = {name: np.concatenate(parts) for name, parts in columns.items()}
+    count = max((len(values) for values in joined.values()), default=0)
+    active = {name: joined.get(f"episode/mask_{bit}", np.zeros(count)) > 0 for name, bit in _CONSTRAINTS.items()}
+    active["heading"] = ~np.any(list(active.values()), 0)
+    success = joined.get("episode/success", np.full(count, np.nan))
+    joined |= {f"success/{name}": np.where(rows, success, np.nan) for name, rows in active.items()}
+    for name, values in joined.items():
+        constraint = name.removeprefix("episode/").partition("_")[0]
+        if constraint in active:
+            joined[name] = np.where(active[constraint], values, np.nan)
     means = {name: float(np.nanmean(values)) for name, values in joined.items() if not np.isnan(values).all()}
-    return {**means, "episodes": float(max((len(values) for values in joined.values()), default=0))}
+    return {**means, "episodes": float(count)}
 
 
 def staleness(messages: Sequence[Message], version: int) -> dict[str, float]:

@@ -175,9 +175,10 @@ def _optimise(
     """Epochs over the batch; returns the state's first entries, moments of the returns, the failed term and metrics."""
     log_std = params["actor"]["log_std"]
     observation = normalizer.apply(normalization, batch["observation"])
-    mean, _ = network.policy(params, layout, observation)
-    log_proximal = network.log_probability(mean, log_std, batch["action"])
-    weight = losses.importance_weight(log_proximal, batch["log_probability"], hyper["importance_max"])
+    exact, _ = network.policy(params, layout, observation)
+    log_exact = network.log_probability(exact, log_std, batch["action"])
+    weight = losses.importance_weight(log_exact, batch["log_probability"], hyper["importance_max"])
+    mean, _ = network.policy(params, layout, observation, exact=False)
 
     def values(normalised: Array) -> Array:
         return network.value(params, layout, normalised) / returns_normalization.scale + returns_normalization.shift
@@ -192,7 +193,7 @@ def _optimise(
         # Normalised in each minibatch: gathering its rows in half precision is cheaper.
         batch["observation"],
         batch["action"],
-        log_proximal,
+        network.log_probability(mean, log_std, batch["action"]),
         mean,
         weight,
         (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8),
@@ -219,7 +220,7 @@ def _optimise(
     kl = jnp.mean(terms.kl[-1])
     metrics = {name: jnp.mean(term) for name, term in terms._asdict().items()}
     metrics |= {f"{name}_grad_norm": jnp.mean(norm) for name, norm in norms.items()}
-    log_weight = log_proximal - batch["log_probability"]
+    log_weight = log_exact - batch["log_probability"]
     metrics |= {
         "kl": kl,
         "learning_rate": learning_rate,

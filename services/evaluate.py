@@ -88,6 +88,7 @@ class Evaluator:
             base,
             hold_steps=min(base.hold_steps, hold),
             hold_steps_max=hold,
+            end_when_fallen=False,
             mass_range=_nominal(base.mass_range),
             friction_range=_nominal(base.friction_range),
         )

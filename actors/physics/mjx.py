@@ -74,6 +74,8 @@ class MjxPhysics:
             # Warp's kernels print every overflow and iteration limit; thousands of worlds would flood the log.
             quiet = self._model.opt._impl.replace(warn_overflow=0)
             self._model = self._model.replace(opt=self._model.opt.replace(_impl=quiet))
+        blind = self._model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
+        self._blind = self._model.replace(opt=self._model.opt.replace(disableflags=blind))
         self._objects = self._leaves(objects)
         self._geoms = np.flatnonzero(pool.model.geom_bodyid == self._where.object_body)
         self._shared = {
@@ -114,14 +116,18 @@ class MjxPhysics:
         where = self._where
         height = jnp.where(table, 0.0, TABLE_AWAY[2])
         data = state.data.replace(ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height))
-        model = self._model.replace(**state.leaves)
-        step = jax.vmap(mjx.step, in_axes=(self._axes, 0))
 
-        def substep(data: Any, _: None) -> tuple[Any, Array]:
-            data = step(model, data)
+        def substep(model: Any, data: Any) -> tuple[Any, Array]:
+            axes = self._axes.replace(opt=jax.tree.map(lambda _: None, model.opt))
+            data = jax.vmap(mjx.step, in_axes=(axes, 0))(model.replace(**state.leaves), data)
             return data, self._usage(data)
 
-        data, usage = jax.lax.scan(substep, data, None, length=self._task.substeps)
+        # Nobody sees the contacts of all substeps but the last.
+        data, usage = jax.lax.scan(
+            lambda data, _: substep(self._blind, data), data, None, length=self._task.substeps - 1
+        )
+        data, last = substep(self._model, data)
+        usage = jnp.concatenate([usage, last[None]])
         bad = diverged(jnp, data.qpos, data.qvel)[:, None]
         data = data.replace(
             qpos=jnp.where(bad, state.qpos_start, data.qpos),

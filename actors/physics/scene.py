@@ -57,6 +57,9 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     spec.option.impratio = 10.0
     spec.option.iterations = 6
     spec.option.ls_iterations = 12
+    # A hundredth of a millimetre: in single precision the default of a micrometre is hardly ever reached.
+    spec.option.ccd_tolerance = 1e-5
+    spec.option.ccd_iterations = 16
     add_hand(spec, hand)
     table = spec.worldbody.add_body(name="table", mocap=True)
     table.add_geom(

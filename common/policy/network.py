@@ -6,9 +6,10 @@ whose output is multiplied by the constraint's mask bit, so that an inactive con
 Everything here is a pure function of its arguments. `params` is a nested dict with the entries `actor` and `critic`;
 observations are already normalised (`common.policy.normalizer`) and have any leading axes.
 
-The actor's matrix products are true float32 on every backend: an actor process and the learner must agree on a log
-probability, where an error of the mean is amplified by 1/std and then exponentiated. The critic, whose output is only
-regressed on, uses the backend's default (TF32 on NVIDIA GPUs), which halves the price.
+Where an actor process and the learner must agree on a log probability, the policy's matrix products are true float32
+on every backend: an error of the mean is amplified by 1/std and then exponentiated. The critic, whose output is only
+regressed on, and the ratios inside an update, both of whose policies are computed alike, use the backend's default
+(TF32 on NVIDIA GPUs) at half the price.
 """
 
 import itertools
@@ -82,11 +83,11 @@ class GatedNetwork(nn.Module):
         return nn.Dense(units, precision=self.precision, name=name)
 
 
-def _actor(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
+def _exact(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
     return GatedNetwork(layout, hidden, encoder, outputs, jax.lax.Precision.HIGHEST)
 
 
-def _critic(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
+def _fast(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
     return GatedNetwork(layout, hidden, encoder, outputs, None)
 
 
@@ -101,8 +102,8 @@ def shapes(layout: Layout, action_size: int, config: NetworkConfig) -> Params:
     """What `init` returns, with `jax.ShapeDtypeStruct` leaves; nothing is computed."""
     check_layout(layout)
     observation = jax.ShapeDtypeStruct((1, sum(size for _, size in layout)), jnp.float32)
-    actor = _actor(layout, config.hidden, config.encoder, action_size)
-    critic = _critic(layout, config.hidden, config.encoder, 1)
+    actor = _exact(layout, config.hidden, config.encoder, action_size)
+    critic = _fast(layout, config.hidden, config.encoder, 1)
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     return {
         "actor": {
@@ -144,16 +145,20 @@ def _orthogonal(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
     return q if q.shape == shape else q.T
 
 
-def policy(params: Params, layout: Layout, observation: Array) -> tuple[Array, Array]:
-    """Mean (..., A) and log standard deviation (A,), which does not depend on the observation, of the action."""
+def policy(params: Params, layout: Layout, observation: Array, *, exact: bool = True) -> tuple[Array, Array]:
+    """Mean (..., A) and log standard deviation (A,), which does not depend on the observation, of the action.
+
+    Without `exact` the matrix products are the backend's default, for means that are only compared with each other.
+    """
     actor = params["actor"]
-    return _actor(layout, *_sizes(actor["network"])).apply({"params": actor["network"]}, observation), actor["log_std"]
+    build = _exact if exact else _fast
+    return build(layout, *_sizes(actor["network"])).apply({"params": actor["network"]}, observation), actor["log_std"]
 
 
 def value(params: Params, layout: Layout, observation: Array) -> Array:
     """The critic's estimate (...,) of the normalised return."""
     critic = params["critic"]
-    output: Array = _critic(layout, *_sizes(critic)).apply({"params": critic}, observation)
+    output: Array = _fast(layout, *_sizes(critic)).apply({"params": critic}, observation)
     return output[..., 0]
 
 

@@ -10,7 +10,7 @@ from common.config import RewardWeights, TaskConfig
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
 from common.task.control import in_world, tracked_waypoint
-from common.task.features import Features
+from common.task.features import FAR, Features
 from common.task.types import MASKS, Array, Goal, SceneState
 
 jax.tree_util.register_dataclass(
@@ -71,7 +71,7 @@ def reward_terms(
     gate = pose_gate(near) * mask[..., _FINGER]
     own_heading = jnp.array(grasp_frame(hand).heading)
     terms = {
-        "distance": -jnp.sum(jnp.array(hand.keypoint_weights) * distances, -1),
+        "distance": -jnp.sum(jnp.array(hand.keypoint_weights) * jnp.minimum(distances, FAR), -1),
         "contact": jnp.sum(link_weights * rewarded, -1),
         "force": jnp.sum(
             link_weights * rewarded * jnp.minimum(rewarded_force, weights.force_max) / weights.force_max, -1

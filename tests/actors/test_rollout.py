@@ -140,9 +140,10 @@ def test_a_lifted_object_that_stays_is_a_success(taskset):
     physics.close()
 
 
-def test_a_longer_hold_changes_neither_success_nor_the_errors(taskset):
+@pytest.mark.parametrize(("end_when_fallen", "ends"), [(False, [90, 90]), (True, [90, 81])])
+def test_a_longer_hold_changes_neither_success_nor_the_errors(taskset, end_when_fallen, ends):
     """Errors and forces are those of the paper's 25 steps; only `held` looks at the end of the hold."""
-    task = dataclasses.replace(TASK, hold_steps_max=40)
+    task = dataclasses.replace(TASK, hold_steps_max=40, end_when_fallen=end_when_fallen)
     env = environment.start(HAND, task, taskset, jax.random.key(2), 2)
     env = env._replace(hold=jnp.full(2, 40))
     physics = NativePhysics(HAND, task, OBJECTS, 1)
@@ -150,15 +151,17 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(taskset):
     found, force = np.zeros(readout.contact_found.shape, bool), np.zeros(readout.contact_force.shape, np.float32)
     found[:, 0, 0] = True
     targets = Action(env.q_target, env.u_target)
-    score = jax.jit(lambda e, r: environment.score(HAND, task, task.reward, e, r, targets)[0])
+    score = jax.jit(lambda e, r: environment.score(HAND, task, task.reward, e, r, targets)[:2])
+    terminal = []
     for step in range(1, 91):
         position = np.array(readout.object_position)
         position[1, 2] -= 0.06 if step > 80 else 0.0
         pressed = force.copy()
         pressed[:, 0, 0, 0] = 3.0 if step <= 75 else 30.0
-        env = score(env, readout._replace(object_position=position, contact_found=found, contact_force=pressed))
+        env, scored = score(env, readout._replace(object_position=position, contact_found=found, contact_force=pressed))
+        terminal.append(np.asarray(scored.terminal))
     finished = dict(zip(EPISODE_FIELDS, np.asarray(env.finished).T, strict=True))
-    np.testing.assert_array_equal(finished["episode/length"], [90.0, 90.0])
+    np.testing.assert_array_equal(np.argmax(terminal, 0) + 1, ends)
     np.testing.assert_array_equal(finished["episode/success"], [1.0, 1.0])
     np.testing.assert_array_equal(finished["episode/held"], [1.0, 0.0])
     np.testing.assert_allclose(finished["episode/force_sum"], [3.0, 3.0], rtol=1e-5)
@@ -213,7 +216,9 @@ class _Touching:
 
 def test_a_world_that_goes_on_keeps_its_contacts_when_another_restarts(taskset):
     worker = RolloutWorker(HAND, TASK, _Touching(), taskset, _noise, batch=2, seed=0, half=False)
-    worker.env = worker.env._replace(time=jnp.array([70, 70]), hold=jnp.array([25, 100]))
+    worker.env = worker.env._replace(
+        time=jnp.array([70, 70]), hold=jnp.array([25, 100]), links_at_removal=jnp.ones(2)
+    )
     rollout = worker.collect(None, 7)
     flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation
     touching = np.asarray(rollout.observation)[..., flags : flags + len(HAND.links)].all(-1)

@@ -12,9 +12,9 @@ def rollout(version: int = 0, steps: int = 1, **episodes: list[float]) -> Messag
 
 def test_means_are_over_episodes_and_not_over_rollouts():
     means = episode_means(
-        [rollout(episode_success=[1, 0, 0], term_drop=[-1, -2, -3]), rollout(episode_success=[1], term_drop=[0])]
+        [rollout(episode_return=[1, 0, 0], term_drop=[-1, -2, -3]), rollout(episode_return=[1], term_drop=[0])]
     )
-    assert means == {"episode/success": 0.5, "term/drop": -1.5, "episodes": 4.0}
+    assert means == {"episode/return": 0.5, "term/drop": -1.5, "episodes": 4.0}
 
 
 def test_rollouts_without_a_finished_episode_add_nothing():
@@ -22,10 +22,31 @@ def test_rollouts_without_a_finished_episode_add_nothing():
     assert episode_means([rollout()]) == {"episodes": 0.0}
 
 
-def test_metrics_of_inactive_constraints_are_left_out():
-    means = episode_means([rollout(episode_pose_rad=[np.nan, 0.2, np.nan], episode_trajectory_m=[np.nan] * 3)])
-    assert means["episode/pose_rad"] == pytest.approx(0.2)
-    assert "episode/trajectory_m" not in means
+def test_errors_and_success_count_where_their_constraint_was_active():
+    means = episode_means(
+        [
+            rollout(
+                episode_success=[1, 0, 1, 0],
+                episode_heading_rad=[0.1, 0.3, 9.0, 9.0],
+                episode_pose_rad=[9.0, 9.0, 0.2, 0.4],
+                episode_trajectory_m=[9.0, 9.0, 9.0, 0.5],
+                episode_mask_affordance=[0, 0, 0, 0],
+                episode_mask_pose_wrist=[0, 0, 1, 1],
+                episode_mask_trajectory=[0, 0, 0, 1],
+            )
+        ]
+    )
+    expected = {
+        "success/heading": 0.5,
+        "success/pose": 0.5,
+        "success/trajectory": 0.0,
+        "episode/success": 0.5,
+        "episode/heading_rad": 0.2,
+        "episode/pose_rad": 0.3,
+        "episode/trajectory_m": 0.5,
+    }
+    assert {name: means[name] for name in expected} == pytest.approx(expected)
+    assert "success/affordance" not in means
 
 
 def test_staleness_weighs_transitions():
