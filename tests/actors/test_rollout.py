@@ -216,9 +216,7 @@ class _Touching:
 
 def test_a_world_that_goes_on_keeps_its_contacts_when_another_restarts(taskset):
     worker = RolloutWorker(HAND, TASK, _Touching(), taskset, _noise, batch=2, seed=0, half=False)
-    worker.env = worker.env._replace(
-        time=jnp.array([70, 70]), hold=jnp.array([25, 100]), links_at_removal=jnp.ones(2)
-    )
+    worker.env = worker.env._replace(time=jnp.array([70, 70]), hold=jnp.array([25, 100]), links_at_removal=jnp.ones(2))
     rollout = worker.collect(None, 7)
     flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation
     touching = np.asarray(rollout.observation)[..., flags : flags + len(HAND.links)].all(-1)
