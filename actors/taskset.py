@@ -140,7 +140,9 @@ def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Pose
 def _headings_of(task: TaskConfig, obj: GraspObject, seed: tuple[int, int]) -> dict[str, np.ndarray]:
     """What NumPy finds out about one object; resting poses without a reachable heading are left out."""
     rng = np.random.default_rng(seed)
-    sets = [sample_headings(obj, rng, count=HEADINGS, use_affordance=use) for use in (False, True)]
+    whole, plus = (sample_headings(obj, rng, count=HEADINGS, use_affordance=use) for use in (False, True))
+    assert whole is not None, "only O+ may be out of reach"
+    sets = [whole, plus or whole]
     reachable = np.array([[_reachable(task, headings, rest) for rest in obj.rest_poses] for headings in sets])
     if task.headings == "above" and reachable[0].any():
         steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
@@ -172,7 +174,7 @@ def _headings_of(task: TaskConfig, obj: GraspObject, seed: tuple[int, int]) -> d
         **{name: value.astype(np.float32) for name, value in floats.items()},
         "minus": minus,
         "heading_index": index.astype(np.int32),
-        "has_affordance": minus.any() & reachable[1].any(-1),
+        "has_affordance": (plus is not None) & minus.any() & reachable[1].any(-1),
     }
 
 

@@ -18,7 +18,7 @@ BACK_OFF = 0.15
 _BREADTH = 0.03  # half the breadth of the slab in which the local width is measured: a hand is some 6 cm broad
 _BEYOND = 0.01  # the slab ends this far beyond the heading position, where the fingertips close
 _TUBE = 0.01  # radius around the approach in which nothing may stand before the surface point
-_MARGIN = 0.01  # an approach stays this far from O-
+_MARGIN = 0.01  # an approach stays this far from O-, and closing fingers, which are this thick, meet none of it
 _ROLLS = 4
 _BATCH = 320
 _PREFERENCE = 0.015  # m of width for which a roll becomes e times less likely
@@ -47,7 +47,7 @@ def sample_headings(
     max_width: float = MAX_WIDTH,
     back_off: float = BACK_OFF,
     attempts: int = 6,
-) -> Headings:
+) -> Headings | None:
     """Samples an object's heading set by the paper's rules.
 
     A surface point of O+ (or of the whole surface) and a direction in the cone around its inward normal give the
@@ -57,10 +57,12 @@ def sample_headings(
     * the object's local width along the cross-finger axis exceeds `max_width`; it is measured on the surface points
       that the closing fingers sweep (3 cm to both sides of the hand's middle plane, down to 1 cm beyond the position);
     * another part of the object stands before the surface point (the point would not be the first one hit);
-    * with affordance, the approach comes within 1 cm of O-, or the position lies nearer to O- than to O+.
+    * with affordance, the approach comes within 1 cm of O-, or the position lies nearer to O- than to O+, or O- is as
+      wide as O+ where the fingers close, so that they would meet it first (ours: the paper's regions are those that
+      people held, and can be held).
 
-    If fewer than `count` remain after `attempts` batches, those found are repeated. If none remains, the candidates
-    that break the fewest of the last two rules are taken, among them the narrowest.
+    If fewer than `count` remain after `attempts` batches, those found are repeated. If none remains on the whole
+    surface, the candidates that break the fewest of the rules but the first are taken, among them the narrowest.
 
     Args:
       obj: the object.
@@ -74,7 +76,7 @@ def sample_headings(
       attempts: batches of candidates.
 
     Returns:
-      H headings, float32.
+      H headings, float32; None if O+ cannot be approached.
     """
     minus = obj.non_graspable_points & use_affordance
     sources = np.flatnonzero(~minus)
@@ -90,14 +92,16 @@ def sample_headings(
         faults = _faults(points, minus, position, direction, inward, back_off)
         position, direction, faults = (part[faults.argsort(kind="stable")] for part in (position, direction, faults))
         clean = int((faults == 0).sum())
-        cross, width = _roll(points, position[:clean], direction[:clean], rng)
+        cross, width = _roll(points, minus, position[:clean], direction[:clean], rng)
         good = np.flatnonzero(width <= max_width)
         found.append(Headings(position[good], direction[good], cross[good]))
         total += len(good)
         if total >= count:
             break
+    if total == 0 and minus.any():
+        return None
     if total == 0:
-        cross, width = _roll(points, position, direction, rng)
+        cross, width = _roll(points, minus, position, direction, rng)
         # Faults count whole numbers and a width in metres less than one: together they sort in the right order.
         best = (faults + width).argsort(kind="stable")[: _BATCH // 16]
         found.append(Headings(position[best], direction[best], cross[best]))
@@ -188,12 +192,15 @@ def _spin(side: np.ndarray, other: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _roll(
-    points: np.ndarray, position: np.ndarray, direction: np.ndarray, rng: np.random.Generator
+    points: np.ndarray, minus: np.ndarray, position: np.ndarray, direction: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cross-finger axes (N, 3), one of a few evenly spaced rolls each, and the object's local widths (N,) along them.
 
+    The width is infinite where the fingers would meet O- first.
+
     Args:
       points: (P, 3) surface points, the first of which cover the surface.
+      minus: (P,) bool, O-.
       position: (N, 3) heading positions.
       direction: (N, 3).
       rng: draws the rolls.
@@ -201,22 +208,29 @@ def _roll(
     side, other = _frame(direction)
     turn = rng.uniform(0, np.pi, len(direction))[:, None] + np.pi / _ROLLS * np.arange(_ROLLS)
     axes = _spin(side[:, None], other[:, None], turn).astype(np.float32)
-    points = points[:_WIDTH_POINTS]
+    points, minus = points[:_WIDTH_POINTS], minus[:_WIDTH_POINTS]
     along = (axes.reshape(-1, 3) @ points.T).reshape(*turn.shape, len(points))
     along -= (axes * position[:, None]).sum(-1, keepdims=True)
-    shallow = direction @ points.T - (direction * position).sum(-1, keepdims=True) < _BEYOND
+    depth = (direction @ points.T - (direction * position).sum(-1, keepdims=True))[:, None]
     # The slab's other axis is the roll a right angle further on: with the rolls spread over a half turn, the one
     # half of them later (the sign does not matter).
-    outside = ~(shallow[:, None] & (np.abs(np.roll(along, -_ROLLS // 2, 1)) < _BREADTH))
-    along[outside] = -np.inf
-    highest = along.max(-1)
-    along[outside] = np.inf
-    width = highest - along.min(-1)
+    slab = np.abs(np.roll(along, -_ROLLS // 2, 1)) < _BREADTH
+    low, high = _extent(along, slab & (depth < _BEYOND))
+    width = high - low
+    if minus.any():
+        low, high = _extent(along, slab & (depth < _BEYOND) & ~minus)
+        low_minus, high_minus = _extent(along, slab & (depth < _BEYOND + _MARGIN) & minus)
+        width[(low_minus < low + _MARGIN / 2) | (high_minus > high - _MARGIN / 2)] = np.inf
     # Gumbel's trick draws a roll with probability exp(-width / preference).
     pick = (rng.gumbel(size=width.shape) - width / _PREFERENCE).argmax(-1)
     rows = np.arange(len(width))
     sign = rng.choice(np.array([-1.0, 1.0], np.float32), len(width))
     return sign[:, None] * axes[rows, pick], width[rows, pick]
+
+
+def _extent(along: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest (...,) of coordinates (..., P) where `which` (..., P) is true."""
+    return np.where(which, along, np.inf).min(-1), np.where(which, along, -np.inf).max(-1)
 
 
 def _faults(

@@ -159,6 +159,9 @@ class ObjectsShow:
         for i, pose in enumerate(obj.rest_poses):
             counts = []
             for headings in (free, plus):
+                if headings is None:
+                    counts.append("none")
+                    continue
                 cleared = clear_table(headings, pose)
                 reachable = feasible(cleared, pose)
                 counts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
@@ -172,6 +175,7 @@ class ObjectsShow:
         if self.png:
             from services.cli.objects_picture import draw_object
 
+            assert free is not None, "only O+ may be out of reach"
             draw_object(obj, free, pathlib.Path(self.png))
             _console.print(f"The picture is {escape(self.png)}.")
         return 0
