@@ -33,7 +33,7 @@ class RewardWeights:
     object_position: float = 20.0
     """w_o: per square metre of the object's displacement (clipped at 0.04 m^2)."""
     object_rotation: float = 0.1
-    """w_R: per square radian of the object's rotation (clipped at 4 rad^2)."""
+    """w_R: per square radian of the object's rotation (clipped at 1 rad^2)."""
     wrist_velocity: float = 0.01
     """w_u: per squared velocity of the six wrist joints (m/s and rad/s)."""
     finger_deviation: float = 0.002

@@ -78,7 +78,7 @@ def reward_terms(
         ),
         "force_excess": -jnp.sum(jnp.clip(total_force - weights.force_max, 0.0, 50.0), -1),
         "object_position": -jnp.minimum(_square(state.object_position - state.object_position_initial), 0.04),
-        "object_rotation": -jnp.minimum(turned**2, 4.0),
+        "object_rotation": -jnp.minimum(turned**2, 1.0),
         "wrist_velocity": -jnp.minimum(_square(state.u_velocity), 100.0),
         "finger_deviation": -_square(state.q - state.q_initial),
         "drop": -fallen(task, state).astype(jnp.float32),

@@ -164,7 +164,7 @@ def test_reward_terms_against_numpy(near):
     shift = state.object_position[b] - state.object_position_initial[b]
     np.testing.assert_allclose(terms["object_position"][b], -min(shift @ shift, 0.04), rtol=1e-4)
     turn = _rotation(state.object_quaternion[b]).inv() * _rotation(state.object_quaternion_initial[b])
-    np.testing.assert_allclose(terms["object_rotation"][b], -min(turn.magnitude() ** 2, 4.0), rtol=1e-3)
+    np.testing.assert_allclose(terms["object_rotation"][b], -min(turn.magnitude() ** 2, 1.0), rtol=1e-3)
     np.testing.assert_allclose(terms["wrist_velocity"][b], -(state.u_velocity[b] ** 2).sum(), rtol=1e-4)
     np.testing.assert_allclose(terms["finger_deviation"][b], -((state.q[b] - state.q_initial[b]) ** 2).sum(), rtol=1e-4)
     frame = grasp_frame(HAND)
