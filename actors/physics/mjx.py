@@ -204,10 +204,8 @@ def _strongest_contacts(body_of_geom: np.ndarray, links: np.ndarray, object_body
     contact = data._impl.contact
     body = jnp.asarray(body_of_geom)[contact.geom]
     index = np.asarray(contact.efc_address)
-    rows = jnp.where((index >= 0)[:, None], data._impl.efc_force[index[:, None] + np.arange(4)], 0.0)
-    # A pyramidal contact of dimension 3 has four edges: two along each tangent (MuJoCo's documentation, "Cones").
-    mu = contact.friction[:, :2]
-    force = jnp.stack([rows.sum(-1), (rows[:, 0] - rows[:, 1]) * mu[:, 0], (rows[:, 2] - rows[:, 3]) * mu[:, 1]], -1)
+    # An elliptic contact of dimension 3 has a row for the normal and one for each tangent.
+    force = jnp.where((index >= 0)[:, None], data._impl.efc_force[index[:, None] + np.arange(3)], 0.0)
     # Normals point from the first geom to the second; the sensors want them from the link to the object.
     sign = jnp.where(body[:, 1] == object_body, 1.0, -1.0)[:, None]
     found = (contact.dist < contact.includemargin).astype(jnp.float32)[:, None]
