@@ -29,25 +29,31 @@ PRESETS = {
     "human": RunConfig(
         name="human",
         environments=4096,
-        updates=400,
-        task=TaskConfig(hold_steps_max=150, mass_range=(0.8, 1.25), friction_range=(0.8, 1.2)),
-        # Grasps first, then the precision with which constraints are met.
+        updates=600,
+        task=TaskConfig(hold_steps_max=200, mass_range=(0.8, 1.25), friction_range=(0.8, 1.2)),
+        # Grasps first, then the precision with which constraints are met: with the second weights from the beginning
+        # trajectories are not learnt.
         curriculum=CurriculumConfig(
-            ramp=(150, 250),
+            ramp=(100, 200),
             reward=RewardWeights(
-                force_excess=0.02,
-                object_position=60.0,
-                object_rotation=1.0,
-                heading_direction=1.0,
-                heading_position=6.0,
-                pose_wrist_position=100.0,
-                pose_wrist_rotation=2.0,
-                trajectory_position=200.0,
-                trajectory_rotation=5.0,
+                force=0.8,
+                object_position=80.0,
+                object_rotation=6.0,
+                drop=5.0,
+                heading_direction=2.5,
+                heading_position=12.0,
+                pose_finger=0.15,
+                pose_link=8.0,
+                pose_wrist_position=150.0,
+                pose_wrist_rotation=3.0,
+                trajectory_position=400.0,
+                trajectory_rotation=12.0,
+                affordance_distance=0.15,
+                affordance_force=0.3,
             ),
         ),
         objects=ObjectsConfig(families=PRIMITIVE_FAMILIES, count=768),
-        ppo=PPOConfig(rollouts_per_update=1),
+        ppo=PPOConfig(rollouts_per_update=1, gamma=0.99),
     ),
 }
 

@@ -59,7 +59,8 @@ class Pool:
             pieces += meshes
             self._owners += [n] * len(meshes)
         shared = dataclasses.replace(objects[0], pieces=tuple(pieces))
-        add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE)
+        body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE)
+        body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which the other objects may not have
         finish_spec(spec, hand)
         self.model: mujoco.MjModel = spec.compile()
         geoms = np.array([self.model.geom(f"object_{i}").id for i in range(len(pieces))])

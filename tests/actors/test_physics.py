@@ -220,6 +220,13 @@ def test_slots_are_the_same_bodies_as_models_of_their_own():
     assert set(leaves) == set(LEAVES)
 
 
+def test_a_pool_may_begin_with_an_object_whose_inertia_is_diagonal():
+    """MuJoCo has a shortcut for such bodies, which the other objects' inertias must not take."""
+    upright, skewed = procedural.generate(9000, "capsule"), procedural.generate(9001, "mug")
+    leaves = Pool(HAND, TASK, [upright, skewed]).leaves([upright, skewed])
+    assert np.isfinite(leaves["body_inertia"]).all()
+
+
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize("implementation", ["warp", "jax"])
 def test_engines_agree(env, implementation, monkeypatch):
