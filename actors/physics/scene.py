@@ -52,7 +52,7 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     spec.option.timestep = task.control_dt / task.substeps
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Held objects creep out of every grasp within seconds on pyramidal friction cones, and on elliptic ones unless
-    # friction is harder than normal forces and the solver converges: 6 iterations, or 12 of the line search, lose grasps.
+    # friction is harder than normal forces and the solver converges: 6 iterations, or 12 of its line search, are few.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
