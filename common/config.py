@@ -244,6 +244,8 @@ class RunConfig:
     """Observations travel (and are acted on) as float16."""
     checkpoint_every: int = 25
     """Updates between two checkpoints."""
+    collapse_patience: int = 60
+    """Updates in a row without contact, or with less than half of the best success, that end the run; 0: none do."""
     episode_every: int = 10
     """Rollouts of an actor between two episodes that it publishes for logs."""
     log_rollout_every: int = 20

@@ -28,6 +28,7 @@ from common.wire.codec import Message, encode
 from common.wire.messages import RolloutForm
 from learner import update as updates
 from learner.checkpoint import Checkpoints, flatten
+from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from learner.statistics import Pace, episode_means, staleness
@@ -109,7 +110,7 @@ def run_learner(
 
     Raises:
       CongraspError: the directory is not a run's; the checkpoint does not fit; the disk is full; a thread of this
-        process died.
+        process died; training collapsed.
       PhysicsError: a value was not finite; state and batch are in `failure/`.
     """
     open_run(run_dir)
@@ -207,7 +208,7 @@ class _Learner:
         """Updates until the end, a stop, or a thread's death; leaves a checkpoint behind in each case."""
         self._publish()
         self._warm_up()
-        pace = Pace()
+        pace, watch = Pace(), CollapseWatch(self._config.collapse_patience)
         saved = -1
         while self._state.version < self._config.updates and not stop.is_set() and not deaths:
             began = time.monotonic()
@@ -221,6 +222,14 @@ class _Learner:
             values["transitions"] = float(self._state.transitions)
             self._log("metrics", {"update": self._state.version, "version": self.version, "values": values})
             on_update({"update": float(self._state.version), "version": float(self.version), **values})
+            # What is learnt on stationary objects is expected to fall when they are let go.
+            stationary = self._config.curriculum.stationary(self.version)
+            if not stationary and (collapse := watch.add(values)):
+                self._event("fatal", f"Training collapsed: {collapse}.")
+                raise CongraspError(
+                    f"Training collapsed: {collapse}.",
+                    "See docs/training.md; --resume goes on from the last checkpoint.",
+                )
             if self._state.version % self._config.checkpoint_every == 0:
                 saved = self._save()
         if saved != self._state.version:

@@ -41,12 +41,12 @@ CONFIG = RunConfig(
 class MadeUpActor(threading.Thread):
     """Sends rollouts of random observations until the run ends; keeps the versions that it acted with."""
 
-    def __init__(self, transport, name: str = "a", reward: float = 1.0):
+    def __init__(self, transport, name: str = "a", reward: float = 1.0, links: float = 3.0):
         super().__init__(daemon=True)
         self.versions: list[int] = []
         self.ended = ""
         self.stop = threading.Event()
-        self._transport, self._actor, self._reward = transport, name, reward
+        self._transport, self._actor, self._reward, self._links = transport, name, reward, links
         self.start()
 
     def run(self) -> None:
@@ -77,6 +77,7 @@ class MadeUpActor(threading.Thread):
                 "reward": self._reward * rng.normal(size=(4, 2)).astype(np.float32),
                 "terminal": rng.random((4, 2)) < 0.3,
                 "episode/success": np.array([0.0, 1.0, 1.0, 1.0], np.float32),
+                "episode/links_at_removal": np.full(4, self._links, np.float32),
             }
             meta = {"version": bundle.version, "schema": bundle.spec.schema, "steps": 8}
             link.upload(Message(arrays, meta), ticket)
@@ -242,6 +243,19 @@ def test_a_dead_thread_ends_the_run_and_leaves_a_checkpoint(tmp_path, hub):
 def _started(thread: threading.Thread):
     thread.start()
     yield
+
+
+@pytest.mark.timeout(120)
+def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub):
+    config = dataclasses.replace(CONFIG, updates=20, collapse_patience=3)
+    create_run(tmp_path, config)
+    actor = MadeUpActor(MemoryTransport(hub), links=0.0)
+    events = []
+    with pytest.raises(CongraspError, match="Training collapsed: for 3 updates the hand has hardly touched"):
+        learn(tmp_path, hub, config, on_event=lambda level, text: events.append((level, text)))
+    actor.stop.set()
+    actor.join(10.0)
+    assert events[-1][0] == "fatal" and (tmp_path / "checkpoints" / "latest").exists()
 
 
 @pytest.mark.timeout(120)
