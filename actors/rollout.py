@@ -136,8 +136,12 @@ class RolloutWorker:
     def restart(self) -> None:
         """Fresh episodes in every world."""
         everywhere = jnp.ones_like(self.env.bad)
-        self.env = self._restart_jit(self._taskset, self.env, everywhere, self._stationary)
-        self.state = self.physics.reset(self.state, everywhere, self.env.world)
+        self.begin(self._restart_jit(self._taskset, self.env, everywhere, self._stationary))
+
+    def begin(self, env: EnvironmentState) -> None:
+        """Goes on with these episodes, which have just begun, one for each world."""
+        self.env = env
+        self.state = self.physics.reset(self.state, jnp.ones_like(env.bad), env.world)
         self._moment = self._moment_jit(self.env, self.physics.read(self.state))
 
     @property

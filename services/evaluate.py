@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -197,6 +198,42 @@ class Evaluator:
         order = np.arange(episodes * count) // episodes
         return [self.row(constraint, sample.where(order == i)) for i in range(count)]
 
+    def examples(self, constraint: str, successes: int, failures: int, most: int = 1000) -> list[Message]:
+        """Episodes of a row to look at, failures first; the object must be held to the end of the hold to succeed.
+
+        They are picked from up to `most` episodes of many worlds, and each is simulated once more alone, to be
+        recorded; the few that then end otherwise are left out.
+
+        Raises:
+          CongraspError: the pool does not allow these constraints.
+        """
+        self._check_available(constraint)
+        task = mixture(self.task, [constraint])
+        wanted = {False: failures, True: successes}
+        chosen: dict[bool, list[EnvironmentState]] = {False: [], True: []}
+        with self._worker(task, most) as worker:
+            if self.task.own_references and any(active_mask(constraint)[1:]):
+                self._make_references(worker)
+            for _ in range(0, most, self._batch):
+                env = self._begin(worker)
+                values = self._batch_of_episodes(worker).values
+                for row in np.flatnonzero(matching(values, constraint)):
+                    held = bool(values["held"][row] > 0)
+                    if len(chosen[held]) < wanted[held]:
+                        chosen[held].append(_world(env, int(row)))
+                if all(len(chosen[held]) == count for held, count in wanted.items()):
+                    break
+        messages = []
+        with self._worker(task, 1) as alone:
+            for held, envs in chosen.items():
+                for env in envs:
+                    alone.begin(env._replace(key=alone.env.key))
+                    rollout = alone.collect(self.bundle.acting, self.task.approach_steps + self._hold)
+                    message = self._message(env, rollout)
+                    if (message.meta["metrics"]["held"] > 0) is held:
+                        messages.append(message)
+        return messages
+
     def episode(self, constraint: str, tries: int = 1) -> Message:
         """An episode of one world under a set of constraints: the first that succeeds, or the last of `tries`.
 
@@ -292,6 +329,11 @@ class Evaluator:
                 kept.append([np.asarray(values)[rows].swapaxes(0, 1) for values in rollout.probed])
         force, torque = (np.concatenate(parts, 1) for parts in zip(*kept, strict=True))
         return Sample(_metrics(rollout), force, torque)
+
+
+def _world(env: EnvironmentState, index: int) -> EnvironmentState:
+    """One of the worlds."""
+    return jax.tree.map(lambda x: x[index : index + 1], env._replace(key=env.bad))
 
 
 def _nominal(bounds: tuple[float, float]) -> tuple[float, float]:

@@ -69,13 +69,13 @@ class MjxPhysics:
             pool.model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN
         self._host_model = pool.model
         self._body_of_geom = np.array(pool.model.geom_bodyid)
-        self._model = mjx.put_model(pool.model, impl=implementation)
+        self._model = self._blind = mjx.put_model(pool.model, impl=implementation)
         if implementation == "warp":
             # Warp's kernels print every overflow and iteration limit; thousands of worlds would flood the log.
             quiet = self._model.opt._impl.replace(warn_overflow=0)
             self._model = self._model.replace(opt=self._model.opt.replace(_impl=quiet))
-        blind = self._model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
-        self._blind = self._model.replace(opt=self._model.opt.replace(disableflags=blind))
+            blind = self._model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
+            self._blind = self._model.replace(opt=self._model.opt.replace(disableflags=blind))
         self._objects = self._leaves(objects)
         self._geoms = np.flatnonzero(pool.model.geom_bodyid == self._where.object_body)
         self._shared = {
@@ -122,12 +122,13 @@ class MjxPhysics:
             data = jax.vmap(mjx.step, in_axes=(axes, 0))(model.replace(**state.leaves), data)
             return data, self._usage(data)
 
-        # Nobody sees the contacts of all substeps but the last.
-        data, usage = jax.lax.scan(
-            lambda data, _: substep(self._blind, data), data, None, length=self._task.substeps - 1
-        )
-        data, last = substep(self._model, data)
-        usage = jnp.concatenate([usage, last[None]])
+        # Warp senses contacts in the last substep alone; MJX-JAX has no such sensors, and compiles one step only.
+        sensing = int(self._blind is not self._model)
+        length = self._task.substeps - sensing
+        data, usage = jax.lax.scan(lambda data, _: substep(self._blind, data), data, None, length=length)
+        if sensing:
+            data, last = substep(self._model, data)
+            usage = jnp.concatenate([usage, last[None]])
         bad = diverged(jnp, data.qpos, data.qvel)[:, None]
         data = data.replace(
             qpos=jnp.where(bad, state.qpos_start, data.qpos),

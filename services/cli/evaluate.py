@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 Table = Literal["single", "composed", "objects", "all"]
 _POOL = 64
+_PICTURED = 4
 _MOST = 50_000
 Track = Callable[[str, int | None], Callable[[int], None]]
 """(what is done, its total if known) -> what to call with the amount done."""
@@ -29,6 +30,7 @@ def evaluate(
     batch: int = 0,
     seed: int = 0,
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
+    pictures: pathlib.Path | None = None,
 ) -> int:
     """Evaluate a policy by the paper's protocol, beside the paper's figures.
 
@@ -49,6 +51,7 @@ def evaluate(
       batch: Worlds that run side by side; 0 chooses by the engine.
       seed: Seed of constraints and episodes.
       json: Also write the rows to this file.
+      pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
     """
     import sys
 
@@ -80,7 +83,7 @@ def evaluate(
         settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed}
         constraints = [name for key in TABLES if key in table or "all" in table for name in TABLES[key]]
         if constraints:
-            rows += _constraint_rows(loaded, given, pool or _POOL, constraints, episodes, settings, track)
+            rows += _constraint_rows(loaded, given, pool or _POOL, constraints, episodes, settings, track, pictures)
         if "objects" in table or "all" in table:
             rows += _object_rows(loaded, given, pool or min(episodes, _MOST), episodes, settings, track)
     source = str(objects) if objects else "held-out procedural objects"
@@ -107,6 +110,7 @@ def _constraint_rows(
     episodes: int,
     settings: dict[str, Any],
     track: Track,
+    pictures: pathlib.Path | None,
 ) -> list[Any]:
     import os
 
@@ -122,7 +126,15 @@ def _constraint_rows(
         hold_steps=two_seconds(bundle.task),
         **settings,
     )
-    return evaluator.rows(constraints, episodes, track("Episodes", len(constraints) * episodes))
+    rows = evaluator.rows(constraints, episodes, track("Episodes", len(constraints) * episodes))
+    if pictures is not None:
+        from services.failures import failure_sheet
+
+        drawn = track("Pictures", len(constraints))
+        for number, name in enumerate(constraints, 1):
+            failure_sheet(evaluator, bundle, name, pictures / f"{name}.png", _PICTURED, _PICTURED)
+            drawn(number)
+    return rows
 
 
 def _object_rows(
