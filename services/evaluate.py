@@ -98,6 +98,7 @@ class Evaluator:
         self._physics, self._threads, self._seed = physics, threads, seed
         self._batch = batch or _BATCH[physics]
         self._taskset = build_taskset(self._hand, self.task, objects, seed)
+        self._referred = False
 
     def samples(
         self, constraints: Sequence[str], episodes: int, progress: Callable[[int], None] = lambda done: None
@@ -113,8 +114,7 @@ class Evaluator:
           CongraspError: no object of the pool allows a row's constraints, or too few resting poses do.
         """
         with self._worker(mixture(self.task, constraints), episodes) as worker:
-            if self.task.own_references and any(any(active_mask(name)[1:]) for name in constraints):
-                self._make_references(worker)
+            self._refer(worker, constraints)
             return self._gather(worker, constraints, episodes, progress)
 
     def samples_of_pools(
@@ -141,8 +141,12 @@ class Evaluator:
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
 
-    def _make_references(self, worker: RolloutWorker) -> None:
-        """References from the policy's own grasps under headings, as the paper makes them for its hands."""
+    def _refer(self, worker: RolloutWorker, constraints: Sequence[str]) -> None:
+        """References from the policy's own grasps under headings, as the paper makes them for its hands; once."""
+        asked = any(any(active_mask(name)[1:]) for name in constraints)
+        if not self.task.own_references or self._referred or not asked:
+            return
+        self._referred = True
         worker.forget_references()
         wanted = _REFERENCES * len(self.objects)
         for _ in range(0, 2 * wanted, self._batch):
@@ -198,7 +202,7 @@ class Evaluator:
         order = np.arange(episodes * count) // episodes
         return [self.row(constraint, sample.where(order == i)) for i in range(count)]
 
-    def examples(self, constraint: str, successes: int, failures: int, most: int = 1000) -> list[Message]:
+    def examples(self, constraint: str, successes: int, failures: int, most: int = 300) -> list[Message]:
         """Episodes of a row to look at, failures first; the object must be held to the end of the hold to succeed.
 
         They are picked from up to `most` episodes of many worlds, and each is simulated once more alone, to be
@@ -212,8 +216,7 @@ class Evaluator:
         wanted = {False: failures, True: successes}
         chosen: dict[bool, list[EnvironmentState]] = {False: [], True: []}
         with self._worker(task, most) as worker:
-            if self.task.own_references and any(active_mask(constraint)[1:]):
-                self._make_references(worker)
+            self._refer(worker, [constraint])
             for _ in range(0, most, self._batch):
                 env = self._begin(worker)
                 values = self._batch_of_episodes(worker).values
