@@ -3,12 +3,12 @@
 Physics stands between `targets` and `score`; who steps it is `actors.rollout`'s business.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from actors.physics.engine import Readout, World
+from actors.physics.engine import Readout, World, where_worlds
 from actors.references import MAX_HEADING_M, MAX_HEADING_RAD, Grasps
 from actors.taskset import TaskSet
 from common import rotations
@@ -168,15 +168,6 @@ def restart(
     kept = {name: getattr(env, name) for name in ("grasps", "finished", "has_finished")}
     merged = where_worlds(mask, fresh._replace(key=mask, **kept), env._replace(key=mask))
     return merged._replace(key=fresh.key)
-
-
-def where_worlds(mask: Array, new: Any, old: Any) -> Any:
-    """Arrays (B, ...) of `new` in the masked worlds (B,), those of `old` elsewhere, for any pytree."""
-
-    def pick(a: Array, b: Array) -> Array:
-        return jnp.where(mask.reshape(-1, *([1] * (a.ndim - 1))), a, b)
-
-    return jax.tree.map(pick, new, old)
 
 
 def sample_episodes(

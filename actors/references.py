@@ -47,13 +47,13 @@ def renew(hand: Hand, task: TaskConfig, taskset: TaskSet, grasps: Grasps, key: A
         hand, fresh, taskset.rest[grasps.object_index], path_key, task.trajectory_points
     )
     slot = jax.random.randint(slot_key, grasps.found.shape, 0, poses)
-    where = grasps.object_index, grasps.variant, slot
+    place = grasps.object_index, grasps.variant, slot
     # Of several grasps for one place the last is taken, in all arrays: a scatter would mix them on a GPU.
     number = jnp.arange(slot.size)
     usable = grasps.found & valid.any(-1)
-    taken = jnp.full(taskset.pose_q.shape[:3], -1).at[where].max(jnp.where(usable, number, -1))
+    taken = jnp.full(taskset.pose_q.shape[:3], -1).at[place].max(jnp.where(usable, number, -1))
     # What is written outside of an array is dropped.
-    row = jnp.where(usable & (taken[where] == number), grasps.object_index, objects)
+    row = jnp.where(usable & (taken[place] == number), grasps.object_index, objects)
     where = row, grasps.variant, slot
     return taskset._replace(
         pose_q=taskset.pose_q.at[where].set(fresh.q, mode="drop"),

@@ -14,7 +14,7 @@ import numpy as np
 
 from actors import environment, references
 from actors.environment import EPISODE_FIELDS, EnvironmentState
-from actors.physics.engine import Physics, Readout
+from actors.physics.engine import Physics, Readout, where_worlds
 from actors.taskset import TaskSet
 from common.config import RewardWeights, TaskConfig
 from common.hands.spec import Hand
@@ -270,7 +270,7 @@ class RolloutWorker:
                 state = physics.reset(state, score.terminal, env.world)
                 # The worlds that go on keep their contacts, which `read` does not know.
                 fresh = environment.moment(self._hand, self._task, env, physics.read(state))
-                return env, state, environment.where_worlds(score.terminal, fresh, ended)
+                return env, state, where_worlds(score.terminal, fresh, ended)
 
             carry = jax.lax.cond(jnp.any(score.terminal), renew, lambda x: x, (env, state, (scene, seen)))
             return carry, (observation, action, log_probability, score.reward, score.terminal, readout.usage, kept)

@@ -137,6 +137,7 @@ class Evaluator:
             for number, objects in enumerate(pools, 1):
                 self.objects = objects
                 self._taskset = build_taskset(self._hand, self.task, objects, self._seed + number)
+                self._referred = False
                 worker.replace_objects(objects, self._taskset)
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]

@@ -8,17 +8,16 @@ import numpy as np
 from common.policy.bundle import PolicyBundle
 from common.wire.codec import Message
 from services.evaluate import Evaluator
-from services.render import key_steps, render_episode_frames
+from services.render import episode_strip
 from services.sheets import contact_sheet, save_png
 
 _MOMENTS = 5
 _SIZE = (300, 225)
 _PUSHED = 0.05  # m that an object may move before the table goes
-_FALLEN = 0.05  # m
 
 
-def cause(episode: Message) -> str:
-    """Why an episode ended without the object in the hand, or `held`."""
+def cause(episode: Message, drop_height: float) -> str:
+    """Why an episode ended with the object `drop_height` (m) or more below where it was, or `held`."""
     metrics = episode.meta["metrics"]
     if metrics["bad"]:
         return "the physics diverged"
@@ -30,7 +29,7 @@ def cause(episode: Message) -> str:
         return "not touched when the table went"
     without_table = ~np.asarray(episode.arrays["table"], bool)
     height = np.asarray(episode.arrays["object_position"])[without_table, 2]
-    fell = int(np.argmax(height < height[0] - _FALLEN))
+    fell = int(np.argmax(height < height[0] - drop_height))
     return f"slipped {fell * episode.meta['control_dt']:.2f} s after the table went"
 
 
@@ -43,7 +42,7 @@ def failure_sheet(
       evaluator: of the policy.
       policy: for the title.
       constraint: name of the row.
-      path: the PNG file to write.
+      path: the PNG file to write, if there is an episode to show.
       successes: how many to show.
       failures: how many to show, if there are so many.
 
@@ -51,14 +50,15 @@ def failure_sheet(
       What became of each episode, in words.
     """
     episodes = evaluator.examples(constraint, successes, failures)
+    if not episodes:
+        return []
     images: list[np.ndarray] = []
     labels: list[str] = []
-    causes = [cause(episode) for episode in episodes]
+    causes = [cause(episode, evaluator.task.drop_height) for episode in episodes]
     for episode, what in zip(episodes, causes, strict=True):
-        steps = key_steps(np.asarray(episode.arrays["table"], bool), _MOMENTS)
-        images += render_episode_frames(episode, steps, _SIZE)
-        seconds = [f"{episode.meta['control_dt'] * step:.2f} s" for step in steps]
-        labels += [episode.meta["object"], *seconds[1:-1], f"{seconds[-1]}: {what}"]
+        pictures, words = episode_strip(episode, _MOMENTS, _SIZE, episode.meta["object"], f": {what}")
+        images += pictures
+        labels += words
     title = f"{policy.spec.hand} hand, version {policy.version}, {constraint}: {len(episodes)} episodes, failures first"
     save_png(path, contact_sheet(images, labels, columns=_MOMENTS, title=title))
     return causes

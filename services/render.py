@@ -242,6 +242,23 @@ def episode_sheet(episode: Message, *, moments: int = 8, size: tuple[int, int] =
     return contact_sheet(images, labels, columns=min(4, len(steps)), title=episode_title(episode))
 
 
+def episode_strip(
+    episode: Message, moments: int, size: tuple[int, int], first: str, last: str
+) -> tuple[list[np.ndarray], list[str]]:
+    """A contact sheet's row: pictures of an episode's key moments, and their labels.
+
+    Args:
+      episode: the episode.
+      moments: number of pictures.
+      size: width and height of each, pixels.
+      first: label of the first picture.
+      last: what to say after the time of the last one.
+    """
+    steps = key_steps(np.asarray(episode.arrays["table"], bool), moments)
+    seconds = [f"{episode.meta['control_dt'] * step:.2f} s" for step in steps]
+    return list(render_episode_frames(episode, steps, size)), [first, *seconds[1:-1], f"{seconds[-1]}{last}"]
+
+
 def key_steps(table: np.ndarray, moments: int) -> list[int]:
     """Steps spread evenly over an episode whose `table` (T,) is present at first; the removal's step is among them."""
     steps = sorted({round(x) for x in np.linspace(0, len(table) - 1, moments)})

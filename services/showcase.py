@@ -10,7 +10,7 @@ from common.config import ObjectsConfig
 from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.policy.bundle import PolicyBundle
 from services.evaluate import Evaluator
-from services.render import key_steps, render_episode_frames
+from services.render import episode_strip
 from services.sheets import contact_sheet, save_png
 
 CONSTRAINTS = ("heading", "pose", "trajectory", "affordance")
@@ -38,13 +38,12 @@ def showcase(policy: PolicyBundle, path: pathlib.Path, progress: Callable[[str],
     for constraint in CONSTRAINTS:
         progress(f"grasping under the constraint '{constraint}'")
         episode = evaluator.episode(constraint, tries=_TRIES)
-        table = np.asarray(episode.arrays["table"], bool)
-        steps = key_steps(table, _MOMENTS)
-        images += render_episode_frames(episode, steps, _SIZE)
         successes += episode.meta["success"]
         result = "success" if episode.meta["success"] else "no success"
-        seconds = [f"{episode.meta['control_dt'] * step:.2f} s" for step in steps]
-        labels += [f"{constraint}: {seconds[0]}, {episode.meta['object']}", *seconds[1:-1], f"{seconds[-1]}, {result}"]
+        begins = f"{constraint}: 0.00 s, {episode.meta['object']}"
+        pictures, words = episode_strip(episode, _MOMENTS, _SIZE, begins, f", {result}")
+        images += pictures
+        labels += words
     title = f"{policy.spec.hand} hand, policy version {policy.version}: one grasp under each constraint"
     save_png(path, contact_sheet(images, labels, columns=_MOMENTS, title=title))
     return successes

@@ -7,6 +7,9 @@ threads and keeps its state in place. Both go through the same three calls.
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
+import jax
+import jax.numpy as jnp
+
 from common.objects.spec import GraspObject
 from common.task.types import Array
 
@@ -79,6 +82,15 @@ class Physics(Protocol):
 
     def close(self) -> None:
         """Releases threads and memory; safe to call twice."""
+
+
+def where_worlds(mask: Array, new: Any, old: Any) -> Any:
+    """Arrays (B, ...) of `new` in the masked worlds (B,), those of `old` elsewhere, for any pytree."""
+
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(mask.reshape(-1, *([1] * (a.ndim - 1))), a, b)
+
+    return jax.tree.map(pick, new, old)
 
 
 MAX_SPEED = 400.0

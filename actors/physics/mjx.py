@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from actors.physics.engine import Readout, World
+from actors.physics.engine import Readout, World, where_worlds
 from actors.physics.readout import diverged, readout
 from actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, addresses
 from actors.physics.slots import Pool
@@ -102,14 +102,13 @@ class MjxPhysics:
     def reset(self, state: MjxState, mask: Array, world: World) -> MjxState:
         """Starts the masked worlds anew; see `Physics.reset`."""
         fresh = self._place(state.data, state.pool, world)
-
-        def pick(new: Array, old: Array) -> Array:
-            return jnp.where(mask.reshape(-1, *([1] * (new.ndim - 1))), new, old)
-
         names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "mocap_pos", "mocap_quat", "eq_active", "time")
-        merged = {name: pick(getattr(fresh.data, name), getattr(state.data, name)) for name in names}
-        leaves = {name: pick(fresh.leaves[name], state.leaves[name]) for name in state.leaves}
-        return MjxState(state.data.replace(**merged), leaves, pick(fresh.qpos_start, state.qpos_start), state.pool)
+        started, going = (
+            ({name: getattr(worlds.data, name) for name in names}, worlds.leaves, worlds.qpos_start)
+            for worlds in (fresh, state)
+        )
+        merged, leaves, qpos_start = where_worlds(mask, started, going)
+        return MjxState(state.data.replace(**merged), leaves, qpos_start, state.pool)
 
     def step(self, state: MjxState, target: Array, table: Array) -> tuple[MjxState, Readout]:
         """One control step; see `Physics.step`."""

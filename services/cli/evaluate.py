@@ -83,7 +83,8 @@ def evaluate(
         settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed}
         constraints = [name for key in TABLES if key in table or "all" in table for name in TABLES[key]]
         if constraints:
-            rows += _constraint_rows(loaded, given, pool or _POOL, constraints, episodes, settings, track, pictures)
+            evaluator = _evaluator(loaded, given, pool or _POOL, settings, track)
+            rows += evaluator.rows(constraints, episodes, track("Episodes", len(constraints) * episodes))
         if "objects" in table or "all" in table:
             rows += _object_rows(loaded, given, pool or min(episodes, _MOST), episodes, settings, track)
     source = str(objects) if objects else "held-out procedural objects"
@@ -99,19 +100,18 @@ def evaluate(
             **settings,
         }
         write_json(rows, json, about)
+    if pictures is not None and constraints:
+        from services.failures import failure_sheet
+
+        for name in constraints:
+            failure_sheet(evaluator, loaded, name, pictures / f"{name}.png", _PICTURED, _PICTURED)
+            console.print(f"Episodes of '{name}' are drawn in {pictures}.", soft_wrap=True)
     return 0
 
 
-def _constraint_rows(
-    bundle: Any,
-    given: "list[GraspObject] | None",
-    pool: int,
-    constraints: list[str],
-    episodes: int,
-    settings: dict[str, Any],
-    track: Track,
-    pictures: pathlib.Path | None,
-) -> list[Any]:
+def _evaluator(
+    bundle: Any, given: "list[GraspObject] | None", pool: int, settings: dict[str, Any], track: Track
+) -> Any:
     import os
 
     from common.config import ObjectsConfig
@@ -119,22 +119,13 @@ def _constraint_rows(
     from services.evaluate import Evaluator, two_seconds
 
     track("Making constraints", None)
-    evaluator = Evaluator(
+    return Evaluator(
         bundle,
         given or load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED)),
         threads=os.cpu_count() or 1,
         hold_steps=two_seconds(bundle.task),
         **settings,
     )
-    rows = evaluator.rows(constraints, episodes, track("Episodes", len(constraints) * episodes))
-    if pictures is not None:
-        from services.failures import failure_sheet
-
-        drawn = track("Pictures", len(constraints))
-        for number, name in enumerate(constraints, 1):
-            failure_sheet(evaluator, bundle, name, pictures / f"{name}.png", _PICTURED, _PICTURED)
-            drawn(number)
-    return rows
 
 
 def _object_rows(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors import environment
+from actors.physics.engine import where_worlds
 from actors.references import Grasps, renew
 from actors.taskset import POSES, build_taskset, make_references
 from common import rotations
@@ -99,6 +99,6 @@ def test_a_grasp_replaces_one_reference_of_its_object_and_variant(taskset):
 def test_only_masked_worlds_are_exchanged():
     mask = jnp.array([True, False])
     new, old = {"a": jnp.ones((2, 3)), "b": jnp.array([True, True])}, {"a": jnp.zeros((2, 3)), "b": jnp.zeros(2, bool)}
-    merged = environment.where_worlds(mask, new, old)
+    merged = where_worlds(mask, new, old)
     np.testing.assert_array_equal(merged["a"], [[1, 1, 1], [0, 0, 0]])
     np.testing.assert_array_equal(merged["b"], [True, False])

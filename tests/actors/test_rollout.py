@@ -9,7 +9,7 @@ import pytest
 
 from actors import environment
 from actors.environment import EPISODE_FIELDS, METRICS
-from actors.physics.engine import Readout
+from actors.physics.engine import Readout, where_worlds
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker, finished_episodes
 from actors.taskset import build_taskset
@@ -183,7 +183,7 @@ class _Touching:
         return world
 
     def reset(self, state, mask, world):
-        return environment.where_worlds(mask, world, state)
+        return where_worlds(mask, world, state)
 
     def step(self, state, target, table):
         return state, self._readout(state, True)

@@ -34,7 +34,7 @@ def episode(heights, **metrics) -> Message:
     ],
 )
 def test_causes_in_words(metrics, said):
-    assert cause(episode([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics)) == said
+    assert cause(episode([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics), 0.05) == said
 
 
 def test_failures_of_an_untrained_policy_are_drawn(tmp_path):
