@@ -119,7 +119,7 @@ class LearnerHub:
         self._forgotten_missing = 0
         self._bundle: SharedMessage | None = None
         self._alive: set[Alive] = set()
-        self._arrivals: collections.deque[tuple[float, int]] = collections.deque()
+        self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
         self._last_event: dict[str, float] = {}
         self._finished = False
         if durable is not None:
@@ -179,16 +179,14 @@ class LearnerHub:
             for alive in sorted(self._alive):
                 marks = self._marks.get((alive.id, alive.incarnation)) if alive.role == "actor" else None
                 entry = {"rollouts": marks.rollouts, "version": marks.version} if marks else {}
-                roles.append({**alive._asdict(), **entry})
+                own = [steps for _, owner, steps in self._arrivals if owner == (alive.id, alive.incarnation)]
+                roles.append({**alive._asdict(), **entry, **(_rates(own, span) if alive.role == "actor" else {})})
             return {
                 **self._state(),
                 "run": self.keys.run,
                 "schema": self._schema,
                 "roles": roles,
-                "rates": {
-                    "rollouts_per_second": len(self._arrivals) / span,
-                    "steps_per_second": sum(steps for _, steps in self._arrivals) / span,
-                },
+                "rates": _rates([steps for *_, steps in self._arrivals], span),
                 "queue": {"length": len(self._queue), "limit": self._limit},
                 "ledger": self._staleness.ledger() | {"missing": missing},
             }
@@ -286,7 +284,7 @@ class LearnerHub:
             return self._answer("stale", why=why)
         self._queue.append((header, message))
         now = time.monotonic()
-        self._arrivals.append((now, header.steps))
+        self._arrivals.append((now, header.owner, header.steps))
         self._forget_arrivals(now)
         self._changed.notify_all()
         return self._answer("accepted")
@@ -331,7 +329,8 @@ class LearnerHub:
         if alive:
             return
         tickets = self._staleness.forget((who.id, who.incarnation)) if who.role == "actor" else 0
-        self._event("info", f"The {who.role} {who.id} left; {tickets} of its tickets returned.")
+        returned = f"; {tickets} of its tickets returned" if who.role == "actor" else ""
+        self._event("info", f"The {who.role} {who.id} left{returned}.")
 
     def _event(self, level: str, text: str, *, kind: str = "") -> None:
         """Publishes an event; at most one of a kind each second, if strangers can cause it at will."""
@@ -341,3 +340,8 @@ class LearnerHub:
         self._last_event[kind] = now
         meta = {"time": time.time(), "level": level, "text": text}
         self._transport.publish(self.keys.log("event", "learner", self._name), Message(meta=meta))
+
+
+def _rates(steps: list[int], seconds: float) -> dict[str, float]:
+    """Rates of rollouts of so many steps that arrived within some seconds."""
+    return {"rollouts_per_second": len(steps) / seconds, "steps_per_second": sum(steps) / seconds}

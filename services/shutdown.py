@@ -39,7 +39,8 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
 
     Python runs its handlers between two bytecodes of the main thread, which may sit in a compiler for a minute. The
     interpreter's wake-up file descriptor is written at once, so a thread that reads it sets the event, and ends the
-    process if it has not ended by itself within `grace` seconds.
+    process if it has not ended by itself within `grace` seconds, or at once if a second signal comes: from a user who
+    is in a hurry, or from the kernel because the parent has ended (`follow_parent`).
 
     Args:
       grace: seconds from the signal to the forced end.
@@ -55,7 +56,11 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
             return
         stop.signal = number[0]
         stop.set()
-        time.sleep(grace)
+        ends = time.monotonic() + grace
+        reader.settimeout(grace)
+        with contextlib.suppress(TimeoutError):
+            if not reader.recv(1):  # the block has ended; what follows it has the rest of the time
+                time.sleep(max(0.0, ends - time.monotonic()))
         os._exit(stop.exit_code)
 
     def handle(number: int, frame: object) -> None:
@@ -71,8 +76,7 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
         signal.set_wakeup_fd(wakeup)
         for number, handler in previous.items():
             signal.signal(number, handler)
-        if not stop.is_set():
-            writer.close()
+        writer.close()
 
 
 def follow_parent() -> None:

@@ -20,9 +20,12 @@ from common.transport.zenoh_transport import ZenohTransport
 from services.shutdown import GRACE, PARENT_VARIABLE
 
 MAX_RESTARTS = 5
+CHILD_GRACE = 2.5
+"""Seconds in which a child may drain; then this process has time to end it before it must end itself (`GRACE`)."""
 _BAD_INPUT = 2
+_POLL = 0.25
 Report = Callable[[dict[str, Any]], None]
-"""Given the learner's newest metrics, where there are any, and the number of actors alive, about once a second."""
+"""Given the learner's newest metrics, where there are any, and the number of actors alive, some times a second."""
 
 
 @dataclasses.dataclass
@@ -111,7 +114,7 @@ def _connected(endpoint: str, learner: Child, stop: threading.Event) -> ZenohTra
     deadline = time.monotonic() + 120.0
     while time.monotonic() < deadline and not stop.is_set():
         try:
-            return ZenohTransport(connect=[endpoint], wait=1.0)
+            return ZenohTransport(connect=[endpoint], wait=_POLL)
         except TransportError:
             assert learner.process is not None
             if learner.process.poll() not in (None, 0):
@@ -148,17 +151,17 @@ def _supervise(
                 child.restarts += 1
                 child.again_at = 0.0
                 child.start()
-        received = metrics.receive(1.0)
+        received = metrics.receive(_POLL)
         alive = sum(child is not learner and child.process.poll() is None for child in children if child.process)
         report({**(received[1].meta if received else {}), "actors": alive})
 
 
 def end_all(children: Sequence[Child]) -> None:
-    """SIGTERM to all, and SIGKILL to those that have not drained within `GRACE` seconds."""
+    """SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE` seconds."""
     running = [child.process for child in children if child.process is not None and child.process.poll() is None]
     for process in running:
         process.terminate()
-    deadline = time.monotonic() + GRACE
+    deadline = time.monotonic() + CHILD_GRACE
     for process in running:
         try:
             process.wait(max(0.0, deadline - time.monotonic()))

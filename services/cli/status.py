@@ -8,42 +8,44 @@ import tyro
 def status(
     connect: str = "tcp/127.0.0.1:7447",
     run: str = "quickstart",
+    watch: bool = False,
+    every: float = 1.0,
     json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Who works on a run, and how it goes: versions, roles, rates, and what became of tickets and rollouts.
+    """Who works on a run, and how it goes: versions, lag, rates, and what became of tickets and rollouts.
+
+    The exit code is 1 where the ledger does not add up.
 
     Args:
       connect: The learner's endpoint.
       run: Name of the run.
-      json: Print JSON instead of a table.
+      watch: Go on until Ctrl-C, also while the learner is away.
+      every: Seconds between two looks with --watch.
+      json: Print JSON instead of tables; with --watch one object a line, and null while the learner is away.
     """
     import json as json_module
 
     from rich.console import Console
-    from rich.table import Table
+    from rich.live import Live
 
-    from common.transport.keys import Keys
     from common.transport.zenoh_transport import ZenohTransport
-    from common.wire.codec import Message
+    from services.status import ask, follow, tables
 
     with ZenohTransport(connect=[connect]) as transport:
-        found = dict(transport.query(Keys(run).status, Message({}, {}), timeout=5.0).meta)
-    if json:
-        print(json_module.dumps(found))
-        return 0
-    console = Console()
-    roles = Table(title=f"{found['run']}, version {found['version']}, epoch {found['epoch']}")
-    for column in ("role", "name", "incarnation", "rollouts", "version"):
-        roles.add_column(column)
-    for role in found["roles"]:
-        roles.add_row(*(str(role.get(name, "")) for name in ("role", "id", "incarnation", "rollouts", "version")))
-    console.print(roles)
-    ledger = Table("tickets and rollouts", "number", title="Ledger")
-    for name, value in found["ledger"].items():
-        ledger.add_row(name, str(value))
-    console.print(ledger)
-    console.print(f"{found['rates']['steps_per_second']:.0f} steps/s, {found['queue']['length']} rollout(s) waiting")
-    return 0
+        found = ask(transport, run)
+        if not watch:
+            if json:
+                print(json_module.dumps(found))
+            else:
+                Console().print(tables(found))
+        elif json:
+            for now in follow(transport, run, every):
+                print(json_module.dumps(now), flush=True)
+        else:
+            with Live(tables(found), auto_refresh=False) as live:
+                for now in follow(transport, run, every):
+                    live.update(tables(now) if now else f"The learner of '{run}' is away …", refresh=True)
+        return 1 if found["warnings"] else 0
 
 
 COMMAND = status

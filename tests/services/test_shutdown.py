@@ -18,12 +18,14 @@ with on_signal(grace=0.2):
     lock.acquire()  # handlers run, and then it waits on for ever
 """
 POLITE = """
-import sys
+import sys, time
 from services.shutdown import on_signal
 with on_signal() as stop:
     print("ready", flush=True)
     stop.wait(30)
     print("drained", flush=True)
+time.sleep(0.2)
+print("said goodbye", flush=True)
 sys.exit(stop.exit_code)
 """
 PARENT = """
@@ -48,7 +50,7 @@ def test_a_process_that_polls_drains_and_tells_the_shell_why(number, code):
         assert process.stdout.readline() == "ready\n"
         process.send_signal(number)
         output, _ = process.communicate(timeout=20)
-    assert output == "drained\n"
+    assert output == "drained\nsaid goodbye\n"
     assert process.returncode == code
 
 
@@ -56,6 +58,17 @@ def test_a_process_that_is_stuck_ends_all_the_same():
     with start(STUCK) as process:
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+    assert process.returncode == 130
+
+
+def test_a_second_signal_ends_a_process_that_drains_for_long():
+    with start(STUCK.replace("0.2", "600")) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(1)
+        process.send_signal(signal.SIGTERM)
         process.communicate(timeout=20)
     assert process.returncode == 130
 

@@ -1,6 +1,10 @@
 """`congrasp status` against a live learner's end."""
 
+import copy
 import json
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ from common.wire.messages import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from services.cli.status import status
+from services.status import ask, warnings
 from services.train import free_port
 from tests.rollouts import ACTION, OBSERVATION, SCHEMA, bundle, rollout
 
@@ -46,10 +51,39 @@ def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
     assert status(endpoint, "r", json=True) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["run"], found["version"], found["ledger"]["accepted"]) == ("r", 0, 1)
-    assert {(role["role"], role["id"]) for role in found["roles"]} == {("learner", "0"), ("actor", "worker-7")}
+    assert [(role["role"], role["id"]) for role in found["roles"]] == [("actor", "worker-7"), ("learner", "0")]
+    actor = found["roles"][0]
+    assert (actor["rollouts"], actor["version"], actor["lag"]) == (1, 0, 0)
+    assert 0 < actor["steps_per_second"] == found["rates"]["steps_per_second"] <= 8
     assert status(endpoint, "r") == 0
     text = capsys.readouterr().out
-    assert "worker-7" in text and "accepted" in text and "1 rollout(s) waiting" in text
+    assert "worker-7" in text and "accepted" in text and "1 rollout(s) of at most 64 waiting" in text
+
+
+@pytest.mark.timeout(30)
+def test_a_ledger_that_does_not_add_up_is_said(endpoint):
+    with ZenohTransport(connect=[endpoint]) as transport:
+        found = ask(transport, "r")
+    assert found["warnings"] == []
+    lost = copy.deepcopy(found)
+    lost["ledger"]["accepted"] += 1
+    (words,) = warnings(lost)
+    assert words == "The ledger does not add up: accepted 2 is not consumed 0 + dropped 0 + queued 1."
+    lost["ledger"]["queued"] += 1
+    (words,) = warnings(lost)
+    assert words == "The ledger says that 2 rollouts wait; in the queue are 1."
+
+
+@pytest.mark.timeout(60)
+def test_watching_goes_on_until_it_is_interrupted(endpoint):
+    command = [sys.executable, "-m", "services.cli.main", "status", "--connect", endpoint, "--run", "r"]
+    with subprocess.Popen(
+        [*command, "--watch", "--every", "0.1", "--json"], stdout=subprocess.PIPE, text=True
+    ) as process:
+        versions = [json.loads(process.stdout.readline())["version"] for _ in range(3)]
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+    assert versions == [0, 0, 0] and process.returncode == 130
 
 
 @pytest.mark.timeout(30)

@@ -1,0 +1,88 @@
+"""How a run stands: asks its learner, checks the ledger's sums, and shows the answer as a table."""
+
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from common.errors import TransportError
+from common.transport.base import Transport
+from common.transport.keys import Keys
+from common.wire.codec import Message
+
+_TIMEOUT = 5.0
+_SUMS = {
+    "granted": ("running", "redeemed", "returned", "expired"),
+    "accepted": ("consumed", "dropped", "queued"),
+}
+"""Counts of the ledger that are the sums of others: no ticket and no accepted rollout is lost."""
+_ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/s", "steps/s")
+
+
+def ask(transport: Transport, run: str) -> dict[str, Any]:
+    """What the learner of a run says, with `lag` for each role and `warnings` in words.
+
+    Raises:
+      TransportError: nobody answers for this run.
+    """
+    found = dict(transport.query(Keys(run).status, Message({}, {}), timeout=_TIMEOUT).meta)
+    roles = [
+        {**role, "lag": found["version"] - role["version"]} if role.get("version", -1) >= 0 else role
+        for role in found["roles"]
+    ]
+    return {**found, "roles": roles, "warnings": warnings(found)}
+
+
+def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, Any] | None]:
+    """What the learner says, again and again; None while it is away."""
+    while True:
+        began = time.monotonic()
+        try:
+            yield ask(transport, run)
+        except TransportError:
+            yield None
+        time.sleep(max(0.0, every - (time.monotonic() - began)))
+
+
+def warnings(status: Mapping[str, Any]) -> list[str]:
+    """What does not add up in a learner's status; one line each."""
+    ledger, queue = status["ledger"], status["queue"]
+    found = []
+    for total, parts in _SUMS.items():
+        if ledger[total] != sum(ledger[part] for part in parts):
+            found.append(f"The ledger does not add up: {total} {ledger[total]} is not {_sum(ledger, parts)}.")
+    if ledger["queued"] != queue["length"]:
+        found.append(f"The ledger says that {ledger['queued']} rollouts wait; in the queue are {queue['length']}.")
+    return found
+
+
+def _sum(ledger: Mapping[str, int], parts: tuple[str, ...]) -> str:
+    return " + ".join(f"{part} {ledger[part]}" for part in parts)
+
+
+def tables(status: Mapping[str, Any]) -> Group:
+    """The status for a terminal."""
+    ended = ", finished" if status["finished"] else ""
+    roles = Table(title=f"{status['run']}, version {status['version']}, epoch {status['epoch']}{ended}")
+    for column in _ROLE:
+        roles.add_column(column, justify="left" if column in _ROLE[:3] else "right")
+    for role in status["roles"]:
+        version = status["version"] if role["role"] == "learner" else role.get("version", "")
+        rates = (f"{role[rate]:.2f}" if rate in role else "" for rate in ("rollouts_per_second", "steps_per_second"))
+        counts = (version, role.get("lag", ""), role.get("rollouts", ""))
+        roles.add_row(role["role"], role["id"], role["incarnation"], *map(str, counts), *rates)
+    ledger = Table(title="Ledger: tickets and rollouts")
+    ledger.add_column("count")
+    ledger.add_column("number", justify="right")
+    ledger.add_column("which is")
+    for name, value in status["ledger"].items():
+        ledger.add_row(name, str(value), " + ".join(_SUMS.get(name, ())))
+    rates, queue = status["rates"], status["queue"]
+    line = (
+        f"{rates['rollouts_per_second']:.2f} rollouts/s, {rates['steps_per_second']:.0f} steps/s; "
+        f"{queue['length']} rollout(s) of at most {queue['limit']} waiting"
+    )
+    return Group(roles, ledger, Text(line), *(Text(f"Warning: {text}", style="yellow") for text in status["warnings"]))
