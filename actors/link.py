@@ -85,6 +85,7 @@ class ActorLink:
         """
         self.keys = Keys(run)
         self.actor = actor
+        self._ticket_key, self._rollout_key = self.keys.ticket(actor), self.keys.rollout(actor)
         self.incarnation = secrets.token_hex(4)
         self._transport = transport
         self._max_refusals = max_refusals
@@ -133,7 +134,7 @@ class ActorLink:
         while True:
             self._check()
             try:
-                reply = self._ask(self.keys.ticket, self._identity(self._wanted), deadline)
+                reply = self._ask(self._ticket_key, self._identity(self._wanted), deadline)
             except RefusedError:
                 raise
             except TransportError as error:
@@ -153,7 +154,7 @@ class ActorLink:
         """Returns a ticket that is not needed; if that fails, it expires."""
         request = Message(meta={**self._identity(ticket.id), "give_back": True})
         with contextlib.suppress(TransportError):
-            self._transport.query(self.keys.ticket, request, timeout=self._timeout)
+            self._transport.query(self._ticket_key, request, timeout=self._timeout)
 
     def weights(self, newer_than: int) -> Message | None:
         """The latest policy bundle, or None if it is the one that the caller has or the learner is away.
@@ -300,7 +301,7 @@ class ActorLink:
         while not self._closed.is_set():
             pause = next(pauses)
             try:
-                reply = self._transport.query(self.keys.rollout, message, timeout=self._timeout)
+                reply = self._transport.query(self._rollout_key, message, timeout=self._timeout)
             except RefusedError as error:  # it arrived damaged, or the learner failed on it
                 damaged += 1
                 answered = time.monotonic()

@@ -125,10 +125,10 @@ class LearnerHub:
         if durable is not None:
             self._restore(durable)
         transport.serve(self.keys.config, self._on_config)
-        transport.serve(self.keys.ticket, self._on_ticket, depth=64)
+        transport.serve(self.keys.tickets, self._on_ticket, depth=64)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
         transport.serve(self.keys.weights, self._on_weights, workers=2, depth=16)
-        transport.serve(self.keys.rollout, self._on_rollout, workers=2, depth=8, on_damage=self._on_damage)
+        transport.serve(self.keys.rollouts, self._on_rollout, workers=2, depth=8, on_damage=self._on_damage)
         transport.watch_alive(self.keys.everyone, self._on_alive)
         transport.declare_alive(self.keys.alive("learner", name, self.life))
 
@@ -228,6 +228,7 @@ class LearnerHub:
         validate(request, TICKET)
         meta = request.meta
         owner = check_name("actor", meta["actor"]), check_name("incarnation", meta["incarnation"])
+        _check_sender(key, owner[0])
         ticket_id = check_name("ticket", meta["ticket"])
         if meta.get("give_back"):
             self._staleness.give_back(owner, ticket_id)
@@ -248,8 +249,9 @@ class LearnerHub:
         ticket = str(meta.get("ticket", ""))
         try:
             header = validate_rollout(message, self._form, schema=self._schema)
+            _check_sender(key, header.actor)
         except CongraspError as error:
-            self._staleness.refuse_damaged((str(meta.get("actor")), str(meta.get("incarnation"))), ticket)
+            self._staleness.refuse_damaged((_sender(key), str(meta.get("incarnation"))), ticket)
             self._event("warning", f"A rollout was refused: {error}", kind="refused")
             return self._answer("refused", why=str(error))
         if header.epoch != self.epoch:
@@ -345,3 +347,13 @@ class LearnerHub:
 def _rates(steps: list[int], seconds: float) -> dict[str, float]:
     """Rates of rollouts of so many steps that arrived within some seconds."""
     return {"rollouts_per_second": len(steps) / seconds, "steps_per_second": sum(steps) / seconds}
+
+
+def _sender(key: str) -> str:
+    """The actor that a key belongs to; access control may keep all others from using it."""
+    return key.rpartition("/")[2]
+
+
+def _check_sender(key: str, actor: str) -> None:
+    if _sender(key) != actor:
+        raise CongraspError(f"A message of the actor {ascii(actor)[:70]} came under the key {ascii(key)[:140]}.")

@@ -29,11 +29,11 @@ def check_name(what: str, name: str) -> str:
 
 def flow(key: str) -> Flow:
     """The flow of a key or key expression: the part below the run decides."""
-    part = key.split("/")[2:3]
-    if part in (["rollout"], ["weights"]):
+    part, *rest = (*key.split("/")[2:], "")
+    if part in ("rollout", "weights"):
         # The notice is tiny and urgent, the weights themselves are neither.
-        return "control" if key.endswith("/announce") else "bulk"
-    return "log" if part == ["log"] else "policy" if part == ["policy"] else "control"
+        return "control" if (part, rest[0]) == ("weights", "announce") else "bulk"
+    return "log" if part == "log" else "policy" if part == "policy" else "control"
 
 
 class Alive(NamedTuple):
@@ -78,14 +78,22 @@ class Keys:
         return self._key("config")
 
     @property
-    def ticket(self) -> str:
-        """Query: permission to make a rollout."""
-        return self._key("ticket")
+    def tickets(self) -> str:
+        """Expression of the keys under which actors ask for permission to make a rollout."""
+        return self._key("ticket", "*")
+
+    def ticket(self, actor: str) -> str:
+        """Query: permission for an actor to make a rollout."""
+        return self._key("ticket", check_name("actor", actor))
 
     @property
-    def rollout(self) -> str:
-        """Query: takes a rollout and acknowledges it."""
-        return self._key("rollout")
+    def rollouts(self) -> str:
+        """Expression of the keys under which actors send rollouts."""
+        return self._key("rollout", "*")
+
+    def rollout(self, actor: str) -> str:
+        """Query: takes a rollout of an actor and acknowledges it."""
+        return self._key("rollout", check_name("actor", actor))
 
     @property
     def weights(self) -> str:

@@ -29,9 +29,9 @@ class Learner:
         self.tickets = []
         self.pulls = 0
         self.transport.serve(KEYS.config, lambda key, m: self.reply(config="{}", schema="s"))
-        self.transport.serve(KEYS.ticket, self.on_ticket)
+        self.transport.serve(KEYS.tickets, self.on_ticket)
         self.transport.serve(KEYS.weights, self.on_weights)
-        self.transport.serve(KEYS.rollout, self.on_rollout, workers=4)
+        self.transport.serve(KEYS.rollouts, self.on_rollout, workers=4)
 
     def reply(self, **meta):
         return Message(meta={**self.state, "retry_after": 0.05, "why": "because", **meta})

@@ -59,7 +59,7 @@ def test_everything_a_run_publishes_is_in_the_file(transport: MemoryTransport, t
         transport.publish(KEYS.log("rollout", "actor", "a0"), rollout)
         sent = Message(episode().arrays, {**episode().meta, "metrics": absent})
         transport.publish(KEYS.log("episode", "actor", "a0"), sent)
-        transport.publish(KEYS.rollout, rollout)  # no log
+        transport.publish(KEYS.rollout("a"), rollout)  # no log
     assert (recorder.messages, recorder.damaged, recorder.dropped, recorder.error) == (8, 0, 0, "")
     (path,) = recorder.files
     assert is_complete(path)

@@ -59,10 +59,10 @@ def pair(request):
 
 
 def test_flows_and_keys():
-    assert KEYS.rollout == "congrasp/test/rollout"
-    assert [flow(key) for key in (KEYS.config, KEYS.ticket, KEYS.status, KEYS.announcement)] == ["control"] * 4
+    assert KEYS.rollout("a") == "congrasp/test/rollout/a"
+    assert [flow(key) for key in (KEYS.config, KEYS.ticket("a"), KEYS.status, KEYS.announcement)] == ["control"] * 4
     assert flow(KEYS.everyone) == flow(KEYS.alive("actor", "a", "0f")) == "control"
-    assert flow(KEYS.rollout) == flow(KEYS.weights) == "bulk"
+    assert flow(KEYS.rollout("announce")) == flow(KEYS.weights) == "bulk"
     assert flow(KEYS.logs) == flow(KEYS.log("metrics", "actor", "a")) == "log"
     assert flow(KEYS.act) == flow(KEYS.health) == "policy"
     assert parse_alive(KEYS.alive("actor", "a", "0f")) == ("actor", "a", "0f")
@@ -315,7 +315,7 @@ def test_flows_decide_the_ports():
         server.serve(KEYS.act, lambda key, message: message)
         assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=5).meta == {"n": 1}
         with pytest.raises(TransportError, match="no flow"):
-            client.query(KEYS.rollout, Message(), timeout=5)
+            client.query(KEYS.rollout("a"), Message(), timeout=5)
 
 
 def test_damaged_and_oversized_messages_are_refused():

@@ -336,22 +336,22 @@ def test_hostile_messages_harm_nobody_else(cluster):
         Message(),
     ]
     for message in refused:
-        assert cluster.observer.query(KEYS.rollout, message, timeout=5).meta["outcome"] == "refused"
-    session = cluster.observer._session(KEYS.rollout)
+        assert cluster.observer.query(KEYS.rollout("evil"), message, timeout=5).meta["outcome"] == "refused"
+    session = cluster.observer._session(KEYS.rollout("evil"))
     whole = encode(evil())
     damaged = [b"", b"\xff" * 64, whole[:-7], whole[:-1] + b"\x01", (1 << 40).to_bytes(8, "little") + whole[8:]]
     for payload in damaged:
-        reply = next(iter(session.get(KEYS.rollout, payload=payload, timeout=5.0)))
+        reply = next(iter(session.get(KEYS.rollout("evil"), payload=payload, timeout=5.0)))
         assert reply.err is not None
-    for key in (KEYS.ticket, KEYS.config, KEYS.weights, KEYS.status):
+    for key in (KEYS.ticket("evil"), KEYS.config, KEYS.weights, KEYS.status):
         list(cluster.observer._session(key).get(key, payload=os.urandom(100), timeout=5.0))
     with pytest.raises(CongraspError, match="ticket request"):
-        cluster.observer.query(KEYS.ticket, Message(meta={"actor": 1}), timeout=5)
+        cluster.observer.query(KEYS.ticket("evil"), Message(meta={"actor": 1}), timeout=5)
     with pytest.raises(TransportError, match="Nobody"):
         cluster.observer.query("congrasp/other/rollout", evil(), timeout=5)
     with pytest.raises(TransportError, match="Nobody"):
         cluster.observer.query("congrasp/chaos/shutdown", Message(), timeout=5)
-    replayed = cluster.observer.query(KEYS.rollout, evil(version=10**6), timeout=5).meta
+    replayed = cluster.observer.query(KEYS.rollout("evil"), evil(version=10**6), timeout=5).meta
     assert replayed["outcome"] == "stale"
     ledger = cluster.status()["ledger"]
     assert ledger["damaged"] == len(refused) + len(damaged)

@@ -60,10 +60,11 @@ class Bench:
         return self.peer.query(key, Message(arrays or {}, meta or {}), timeout=5).meta
 
     def send(self, *args, **options):
-        return self.peer.query(KEYS.rollout, rollout(*args, **options), timeout=5).meta
+        message = rollout(*args, **options)
+        return self.peer.query(KEYS.rollout(message.meta["actor"]), message, timeout=5).meta
 
     def ticket(self, name="t", **meta):
-        return self.ask(KEYS.ticket, {"actor": "a", "incarnation": "01", "ticket": name, **meta})
+        return self.ask(KEYS.ticket("a"), {"actor": "a", "incarnation": "01", "ticket": name, **meta})
 
     def ledger(self):
         return self.ask(KEYS.status)["ledger"]
@@ -112,7 +113,7 @@ def test_tickets_run_out_and_return(bench):
     with pytest.raises(RefusedError, match="'ticket' is 7, not str"):
         b.ticket(7)
     with pytest.raises(RefusedError, match="name of an actor"):
-        b.ask(KEYS.ticket, {"actor": "*", "incarnation": "1", "ticket": "t"})
+        b.ask(KEYS.ticket("a"), {"actor": "*", "incarnation": "1", "ticket": "t"})
 
 
 def test_death_returns_tickets_and_is_told(bench):
@@ -216,10 +217,23 @@ def test_hostile_rollouts_are_refused_alone(bench, change, why):
     b.hub.publish_weights(bundle(0), 0)
     good = rollout()
     bad = Message({**good.arrays, **change.get("arrays", {})}, {**good.meta, **change.get("meta", {})})
-    reply = b.peer.query(KEYS.rollout, bad, timeout=5).meta
+    reply = b.peer.query(KEYS.rollout("a"), bad, timeout=5).meta
     assert reply["outcome"] == "refused" and why in reply["why"]
     assert b.ledger()["damaged"] == 1 and b.ledger()["queued"] == 0
     assert b.send(0)["outcome"] == "accepted"
+
+
+def test_nobody_speaks_for_another(bench):
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    assert b.ticket("t")["granted"]
+    asked = {"actor": "a", "incarnation": "01", "ticket": "t", "give_back": True}
+    with pytest.raises(RefusedError, match=r"actor 'a' came under the key .*/ticket/b'"):
+        b.ask(KEYS.ticket("b"), asked)
+    reply = b.peer.query(KEYS.rollout("b"), rollout(), timeout=5).meta
+    assert reply["outcome"] == "refused" and "came under the key" in reply["why"]
+    ledger = b.ledger()
+    assert (ledger["running"], ledger["damaged"], ledger["accepted"]) == (1, 1, 0)  # a's ticket is still a's
 
 
 def _sized(steps, worlds):
@@ -238,7 +252,7 @@ def test_an_actor_of_another_configuration_is_refused_alone(bench, steps, worlds
     """Batches are counted in rollouts, so one of another length or width would not fit beside the others."""
     b = bench()
     b.hub.publish_weights(bundle(0), 0)
-    reply = b.peer.query(KEYS.rollout, _sized(steps, worlds), timeout=5).meta
+    reply = b.peer.query(KEYS.rollout("a"), _sized(steps, worlds), timeout=5).meta
     assert reply["outcome"] == "refused" and re.search(rule, reply["why"])
     assert b.send(0)["outcome"] == b.send(1)["outcome"] == "accepted"
     batch = b.hub.next_batch(2, 1)
