@@ -4,6 +4,7 @@ import functools
 import threading
 import time
 import zlib
+from collections.abc import Callable
 
 import numpy as np
 
@@ -37,6 +38,7 @@ def run_actor(
     physics: PhysicsName | None = None,
     threads: int = 1,
     patience: float = 60.0,
+    on_rollout: Callable[[dict[str, float]], None] = lambda values: None,
 ) -> None:
     """Acts for the learner of `run` until it ends or `stop` is set.
 
@@ -48,6 +50,7 @@ def run_actor(
       physics: engine, where it is not to be the run's.
       threads: threads of the `native` engine.
       patience: seconds without a learner after which the actor gives up.
+      on_rollout: given the figures of every rollout, its version among them.
 
     Raises:
       CongraspError: the learner is gone, or refuses this actor's rollouts.
@@ -56,7 +59,7 @@ def run_actor(
         with ActorLink(transport, run, actor, patience=patience) as link:
             try:
                 config = run_config_from_json(link.config(patience).config)
-                _Actor(config, link, transport, physics or config.physics, threads).act(stop)
+                _Actor(config, link, transport, physics or config.physics, threads, on_rollout).act(stop)
                 link.flush(_FLUSH_SECONDS)
                 return
             except RunFinished:
@@ -77,7 +80,15 @@ def first_worlds(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:
 class _Actor:
     """Worlds, policy and counters of one actor."""
 
-    def __init__(self, config: RunConfig, link: ActorLink, transport: Transport, physics: PhysicsName, threads: int):
+    def __init__(
+        self,
+        config: RunConfig,
+        link: ActorLink,
+        transport: Transport,
+        physics: PhysicsName,
+        threads: int,
+        on_rollout: Callable[[dict[str, float]], None],
+    ):
         self._config, self._link, self._transport = config, link, transport
         self._hand = get_hand(config.task.hand)
         number = zlib.crc32(link.actor.encode())
@@ -96,6 +107,7 @@ class _Actor:
             seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
             half=config.half_observations,
         )
+        self._on_rollout = on_rollout
         self._bundle: PolicyBundle | None = None
         self._rollouts = 0
 
@@ -149,6 +161,7 @@ class _Actor:
             **physics_usage(np.asarray(rollout.usage)),
         }
         self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
+        self._on_rollout({"version": float(bundle.version), **values})
         if self._rollouts % config.episode_every == 0 and started_fresh:
             self._publish_episode(bundle, rollout, env)
         if config.log_rollout_every and self._rollouts % config.log_rollout_every == 0:

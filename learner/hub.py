@@ -14,7 +14,7 @@ import dataclasses
 import secrets
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from common.errors import CongraspError
@@ -85,6 +85,7 @@ class LearnerHub:
         queue_limit: int = 64,
         name: str = "0",
         durable: Mapping[str, Any] | None = None,
+        on_event: Callable[[str, str], None] = lambda level, text: None,
     ):
         """Starts to answer; tickets are granted from the first `publish_weights` on.
 
@@ -99,6 +100,7 @@ class LearnerHub:
           queue_limit: rollouts that wait for an update.
           name: the learner's name, for logs.
           durable: what `durable` returned when the checkpoint was written, to go on from it.
+          on_event: given level and text of every event, which it must not hold up.
 
         Raises:
           CongraspError: the durable state is of another epoch.
@@ -112,7 +114,7 @@ class LearnerHub:
         self._form = form
         self._staleness = staleness
         self._limit = queue_limit
-        self._name = check_name("learner", name)
+        self._name, self._on_event = check_name("learner", name), on_event
         self._changed = threading.Condition()
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
         self._marks: collections.OrderedDict[Owner, _Marks] = collections.OrderedDict()
@@ -340,6 +342,7 @@ class LearnerHub:
         if kind and now - self._last_event.get(kind, -_EVENT_SECONDS) < _EVENT_SECONDS:
             return
         self._last_event[kind] = now
+        self._on_event(level, text)
         meta = {"time": time.time(), "level": level, "text": text}
         self._transport.publish(self.keys.log("event", "learner", self._name), Message(meta=meta))
 

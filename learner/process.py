@@ -183,6 +183,7 @@ class _Learner:
             staleness=StalenessManager(config.ppo.max_staleness, config.ppo.rollouts_per_update),
             name=name,
             durable=hub_state,
+            on_event=on_event,
         )
 
     @property

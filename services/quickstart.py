@@ -49,6 +49,7 @@ def run_training(
     resume: bool,
     evaluation: int,
     initial: pathlib.Path | None = None,
+    metrics_port: int = 0,
 ) -> int:
     """Trains, evaluates and shows; returns the exit code. With no actor processes everything is in this one."""
     if actors is not None and actors < 0:
@@ -87,6 +88,7 @@ def run_training(
                     physics=physics,
                     stop=stop,
                     resume=resume,
+                    metrics_port=metrics_port,
                     on_update=lambda values: progress.show(
                         {"values": values, "actors": 1, "version": int(values["version"])}
                     ),
@@ -99,6 +101,7 @@ def run_training(
                         actors=actors,
                         physics=physics,
                         stop=stop,
+                        metrics_port=metrics_port,
                         report=progress.show,
                         notify=lambda text: console.print(f"  [yellow]{text}[/]", soft_wrap=True),
                     )

@@ -1,21 +1,31 @@
 """The recorder as a process of its own."""
 
 import contextlib
+import functools
 import pathlib
+import secrets
 import time
 
 from rich.console import Console
 
 from common.errors import CongraspError
 from common.logs.recorder import Recorder
+from common.transport.keys import Keys, process_name
 from common.transport.zenoh_transport import ZenohTransport
 from services.live import LiveServer
+from services.logs import say
 
 _REFRESH, _CLOSE = 0.5, 2.5  # seconds
 
 
 def record_run(
-    connect: str, run: str, out: pathlib.Path, *, live: int | None = None, duration: float | None = None
+    connect: str,
+    run: str,
+    out: pathlib.Path,
+    *,
+    live: int | None = None,
+    duration: float | None = None,
+    structured: bool = False,
 ) -> int:
     """Records until `duration` seconds have passed, Ctrl-C, or, without a live view, the disk refuses.
 
@@ -25,6 +35,7 @@ def record_run(
       out: folder for the files.
       live: port of the live view, or None.
       duration: seconds, or None.
+      structured: speak through the log alone, without a progress line.
 
     Returns:
       Zero.
@@ -32,14 +43,17 @@ def record_run(
     Raises:
       CongraspError: recording stopped, or nothing could be recorded at all.
     """
-    console = Console(stderr=True)
+    console = Console(stderr=True, quiet=structured)
+    complain = functools.partial(say, "warning") if structured else lambda text: console.print(f"congrasp: {text}")
     end = time.monotonic() + duration if duration is not None else None
     with contextlib.ExitStack() as stack:
         transport = stack.enter_context(ZenohTransport(connect=[connect]))
         server = stack.enter_context(LiveServer(live)) if live is not None else None
         if server is not None:
             console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")
-        recorder = stack.enter_context(Recorder(transport, run, out, name="record", sinks=[server] if server else []))
+        sinks = [server] if server else []
+        recorder = stack.enter_context(Recorder(transport, run, out, name="record", sinks=sinks, complain=complain))
+        transport.declare_alive(Keys(run).alive("recorder", process_name("recorder"), secrets.token_hex(4)))
         try:
             with console.status(_state(recorder)) as status:
                 while (end is None or time.monotonic() < end) and (server is not None or not recorder.error):
@@ -48,7 +62,10 @@ def record_run(
         finally:
             recorder.close(_CLOSE)
             for file in recorder.files:
-                print(file)
+                if structured:
+                    say("info", f"Wrote {file}.")
+                else:
+                    print(file)
             console.print(_state(recorder))
     if recorder.error:
         raise CongraspError(recorder.error, "Free space and start again; a new file begins.")

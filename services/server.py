@@ -13,8 +13,9 @@ from common.policy.bundle import Acting, PolicyBundle, content_hash
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode
-from services.batching import Batcher
+from services.batching import Batcher, Late, Overloaded
 from services.inference import BATCH_SIZES, Answer, PolicyFunction
+from services.logs import say
 from services.requests import Query
 
 Source = Callable[[int], PolicyBundle | None]
@@ -39,7 +40,16 @@ class _Held(NamedTuple):
 class PolicyServer:
     """Answers queries with the newest policy; weights are swapped between two batches."""
 
-    def __init__(self, transport: Transport, run: str, source: Source, *, timeout: float = 1.0):
+    def __init__(
+        self,
+        transport: Transport,
+        run: str,
+        source: Source,
+        *,
+        timeout: float = 1.0,
+        on_answer: Callable[[str, float], None] = lambda outcome, seconds: None,
+        on_batch: Callable[[int], None] = lambda size: None,
+    ):
         """Loads the first policy, compiles, and begins to serve.
 
         Args:
@@ -47,6 +57,8 @@ class PolicyServer:
           run: name under which it serves.
           source: where policies come from.
           timeout: seconds that a query may wait when it names no deadline.
+          on_answer: given the outcome of every query (answered, refused, overloaded, late), and how long it took.
+          on_batch: given the size of every batch.
 
         Raises:
           CongraspError: there is no policy yet.
@@ -55,6 +67,7 @@ class PolicyServer:
         if first is None:
             raise CongraspError("There is no policy to serve yet.", "Start the server when the run has published one.")
         self._source, self._timeout = source, timeout
+        self._on_answer, self._on_batch = on_answer, on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
         self._function.warm_up(self._held.acting)
@@ -92,14 +105,25 @@ class PolicyServer:
         self._follower.join(2 * _FOLLOW_SECONDS)
 
     def _act(self, key: str, request: Message) -> Message:
-        began = time.monotonic()
+        began, outcome = time.monotonic(), "refused"
+        try:
+            answer = self._answer(request, began)
+            outcome = "answered"
+            return answer
+        except (Overloaded, Late) as error:
+            outcome = type(error).__name__.lower()
+            raise
+        finally:
+            self._on_answer(outcome, time.monotonic() - began)
+
+    def _answer(self, request: Message, began: float) -> Message:
         query = self._function.layout.parse(request)
         timeout = self._deadline(request.meta.get("timeout", self._timeout))
         future = self._batcher.submit(query, timeout)
         try:
             answer, held, queued, inferred = future.result(timeout + 1.0)
         except TimeoutError:
-            raise CongraspError(f"The policy did not answer within {timeout:g} s.", "Ask again later.") from None
+            raise Late(f"The policy did not answer within {timeout:g} s.", "Ask again later.") from None
         self._answered += 1
         meta = {
             "version": held.bundle.version,
@@ -123,6 +147,7 @@ class PolicyServer:
         self, queries: Sequence[Query], queued: Sequence[float]
     ) -> list[tuple[Answer, _Held, float, float] | Exception]:
         held, began = self._held, time.monotonic()
+        self._on_batch(len(queries))
         answers = self._function(held.acting, queries)
         spent = time.monotonic() - began
         return [
@@ -141,7 +166,7 @@ class PolicyServer:
                 continue  # the learner is away; it may come back
             except CongraspError as error:
                 if str(error) != self._trouble:
-                    print(f"congrasp: {error}", flush=True)
+                    say("warning", str(error))
                 self._trouble = str(error)
 
     def _swap(self, newer: PolicyBundle) -> None:

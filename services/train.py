@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import os
 import pathlib
 import socket
@@ -68,6 +69,7 @@ def train(
     endpoint: str | None = None,
     report: Report = lambda status: None,
     notify: Callable[[str], None] = lambda text: None,
+    metrics_port: int = 0,
 ) -> None:
     """Runs a prepared run directory to its end with one learner and `actors` actor processes.
 
@@ -82,6 +84,7 @@ def train(
       endpoint: where the learner listens; a free port of the loopback interface by default.
       report: shows progress.
       notify: told in words when something is restarted.
+      metrics_port: port of the learner's Prometheus endpoint on the loopback interface; 0 for none.
 
     Raises:
       CongraspError: a process failed for good; its last words are in the message.
@@ -90,9 +93,8 @@ def train(
     logs = run_dir / "logs"
     logs.mkdir(exist_ok=True)
     threads = max(1, (os.cpu_count() or 1) // max(1, actors))
-    learner = Child(
-        "learner", ["learner", "--run-dir", str(run_dir), "--listen", endpoint, "--resume"], logs / "learner.log"
-    )
+    arguments = ["learner", "--run-dir", str(run_dir), "--listen", endpoint, "--resume"]
+    learner = Child("learner", [*arguments, "--metrics-port", str(metrics_port)], logs / "learner.log")
     children = [learner]
     for number in range(actors):
         name = f"actor-{number}"
@@ -178,6 +180,7 @@ def train_in_process(
     stop: threading.Event,
     resume: bool,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
+    metrics_port: int = 0,
 ) -> None:
     """The same learner and one actor in this process, over the in-memory transport.
 
@@ -187,6 +190,8 @@ def train_in_process(
     from actors.process import run_actor
     from common.logs.recorder import Recorder
     from learner.process import LOGS, run_learner
+    from services.metrics import LearnerMetrics, exposed
+    from services.status import ask
 
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, max_staleness=0))
     broker = MemoryHub()
@@ -211,12 +216,19 @@ def train_in_process(
     actor = threading.Thread(target=act, name="actor", daemon=True)
     with MemoryTransport(broker) as transport:
         recorder = Recorder(transport, config.name, run_dir / LOGS)
+        metrics = LearnerMetrics(functools.partial(ask, transport, config.name))
+
+        def updated(values: dict[str, float]) -> None:
+            metrics.update(values)
+            on_update(values)
+
         actor_started = threading.Timer(0.5, actor.start)
         actor_started.start()
         try:
-            run_learner(
-                run_dir, config, transport, stop_event=stop, resume=resume, recorder=recorder, on_update=on_update
-            )
+            with exposed(metrics_port, "127.0.0.1", metrics) if metrics_port else contextlib.nullcontext():
+                run_learner(
+                    run_dir, config, transport, stop_event=stop, resume=resume, recorder=recorder, on_update=updated
+                )
         finally:
             ended.set()
             actor_started.cancel()

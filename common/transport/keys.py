@@ -1,6 +1,8 @@
 """Keys on the wire: `congrasp/<run>/...`, and which flow each belongs to."""
 
 import dataclasses
+import os
+import platform
 import re
 from typing import Literal, NamedTuple
 
@@ -25,6 +27,11 @@ def check_name(what: str, name: str) -> str:
             "Use 1 to 64 letters, digits, '_', '.' and '-'.",
         )
     return name
+
+
+def process_name(role: str) -> str:
+    """A name for this process where none was given: the machine's and the process's number."""
+    return re.sub(r"[^\w.-]", "-", f"{platform.node() or role}-{os.getpid()}", flags=re.ASCII)[-64:].lstrip(".-")
 
 
 def flow(key: str) -> Flow:

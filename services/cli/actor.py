@@ -5,6 +5,7 @@ from typing import Annotated
 import tyro
 
 from common.config import PhysicsName
+from services.cli.watch import Watch, Watched
 
 
 def actor(
@@ -14,6 +15,7 @@ def actor(
     physics: PhysicsName = "auto",
     threads: int = 0,
     patience: float = 60.0,
+    watch: Watched = Watch(),  # noqa: B008
 ) -> int:
     """One actor that works for a learner, on this machine or another; it may come and go while the learner trains.
 
@@ -24,17 +26,30 @@ def actor(
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
       threads: Threads of the native engine; 0 takes all cores.
       patience: Seconds without a learner after which the actor gives up.
+      watch: How it is watched.
     """
     import os
-    import platform
-    import re
 
     from actors.process import run_actor
+    from common.transport.keys import process_name
     from common.transport.zenoh_transport import ZenohTransport
+    from services.logs import say
+    from services.metrics import ActorMetrics
     from services.shutdown import on_signal
 
-    name = id or re.sub(r"[^\w.-]", "-", f"{platform.node() or 'actor'}-{os.getpid()}")
-    with on_signal() as stop, ZenohTransport(connect=[connect], wait=patience) as transport:
+    name = id or process_name("actor")
+    metrics = ActorMetrics()
+
+    def made(values: dict[str, float]) -> None:
+        metrics.rollout(values)
+        say("info", f"Rollout {values['rollouts']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
+
+    with (
+        watch.watched("actor", name, run, metrics),
+        on_signal() as stop,
+        ZenohTransport(connect=[connect], wait=patience) as transport,
+    ):
+        say("info", f"Acts for {connect}.")
         run_actor(
             transport,
             run=run,
@@ -43,6 +58,7 @@ def actor(
             physics=physics,
             threads=threads or os.cpu_count() or 1,
             patience=patience,
+            on_rollout=made,
         )
         return stop.exit_code
 

@@ -1,4 +1,4 @@
-"""Benchmarks, as ratios against a reference in the same run."""
+"""Benchmarks, as ratios against a reference in the same run, and what a run does when it is told to end."""
 
 
 def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines: tuple[str, ...] = ()) -> int:
@@ -46,4 +46,34 @@ def query(repeat: int = 1000, concurrency: int = 1) -> int:
     return 0
 
 
-COMMANDS = {"physics": physics, "query": query}
+def shutdown(tries: int = 100, within: float = 45.0, seed: int = 0) -> int:
+    """Whether a run with a learner and two actors ends within 5 s of a signal, and leaves no process behind.
+
+    Starts one again and again, and sends SIGINT and SIGTERM in turn at random moments, also while it starts. The exit
+    code is 1 if any took longer or left something.
+
+    Args:
+      tries: How often.
+      within: Seconds in which the moments lie; after some 30 it trains.
+      seed: Seed of the moments.
+    """
+    from rich.progress import track
+
+    from services.drain import LIMIT, attempts
+
+    results = []
+    for one in track(attempts(tries, within, seed), "shutting down", total=tries):
+        results.append(one)
+        if not one.fine:
+            left = f", left behind: {'; '.join(one.orphans)}" if one.orphans else ""
+            print(f"{one.signal} after {one.after:.1f} s: took {one.seconds:.1f} s{left}", flush=True)
+    seconds = sorted(one.seconds for one in results)
+    good = sum(one.fine for one in results)
+    print(
+        f"{good} of {tries} ended within {LIMIT:g} s with no orphan; median {seconds[len(seconds) // 2]:.2f} s, "
+        f"longest {seconds[-1]:.2f} s, {sum(len(one.orphans) for one in results)} orphan(s)"
+    )
+    return 0 if good == tries else 1
+
+
+COMMANDS = {"physics": physics, "query": query, "shutdown": shutdown}

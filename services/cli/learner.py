@@ -9,6 +9,7 @@ import tyro
 
 from common.config import RunConfig
 from services.cli.train import preset_of
+from services.cli.watch import Watch, Watched
 from services.presets import get_preset
 
 
@@ -30,29 +31,44 @@ class Learner:
     """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
     resume: bool = False
     """Go on with the run in --run-dir, from its latest checkpoint if it has one."""
+    watch: Watched = dataclasses.field(default_factory=Watch)
+    """How it is watched."""
 
     def run(self) -> int:
         """Runs the command."""
+        import functools
+
         from common.logs.recorder import Recorder
         from common.policy import bundle as bundles
         from common.transport.zenoh_transport import ZenohTransport
         from learner.process import LOGS, create_run, open_run, run_learner
+        from services.logs import say
+        from services.metrics import LearnerMetrics
         from services.shutdown import on_signal
+        from services.status import ask
 
         has_checkpoint = (self.run_dir / "checkpoints" / "latest").exists()
         config = open_run(self.run_dir) if self.resume else self.config
         with on_signal() as stop, ZenohTransport(listen=[self.listen]) as transport:
+            metrics = LearnerMetrics(functools.partial(ask, transport, config.name))
+
+            def updated(values: dict[str, float]) -> None:
+                metrics.update(values)
+                say("info", f"Update {values['update']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
+
             if not self.resume:
                 create_run(self.run_dir, config, None if self.initial is None else bundles.load(self.initial))
-            run_learner(
-                self.run_dir,
-                config,
-                transport,
-                stop_event=stop,
-                resume=self.resume and has_checkpoint,
-                recorder=Recorder(transport, config.name, self.run_dir / LOGS),
-                on_event=lambda level, text: print(f"{level}: {text}", flush=True),
-            )
+            with self.watch.watched("learner", "0", config.name, metrics):
+                run_learner(
+                    self.run_dir,
+                    config,
+                    transport,
+                    stop_event=stop,
+                    resume=self.resume and has_checkpoint,
+                    recorder=Recorder(transport, config.name, self.run_dir / LOGS),
+                    on_update=updated,
+                    on_event=say,
+                )
             return stop.exit_code
 
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
 from common.errors import CongraspError
+from services.logs import say_error
 from services.shutdown import follow_parent, on_signal
 
 COMMANDS = {
@@ -86,6 +87,7 @@ def run(arguments: list[str]) -> int:
             result = _parsed(name, load(name), rest)()
         except KeyboardInterrupt:
             result = None
+            stop.wait(1.0)  # the thread that notes which signal it was may be a moment behind
         return stop.exit_code or (result if isinstance(result, int) else 0)
 
 
@@ -159,6 +161,8 @@ def _prepare_environment() -> None:
 def _complain(text: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
+    if say_error(text):
+        return code
     _last_words(sys.stderr, f"congrasp: error: {text}\n")
     return code
 

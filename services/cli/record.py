@@ -2,6 +2,8 @@
 
 import pathlib
 
+from services.logs import LogFormat
+
 
 def record(
     connect: str = "tcp/127.0.0.1:7447",
@@ -9,6 +11,7 @@ def record(
     out: pathlib.Path = pathlib.Path("recordings"),
     live: int | None = None,
     duration: float | None = None,
+    log_format: LogFormat = "text",
 ) -> int:
     """Record a run to MCAP, from this machine or another: metrics, events, versions, rollouts and episodes.
 
@@ -21,10 +24,15 @@ def record(
       out: Folder for the MCAP files.
       live: Also offer everything to the Foxglove app on this port of the loopback interface: ws://127.0.0.1:PORT.
       duration: Seconds after which to stop; without it until Ctrl-C.
+      log_format: Text, or one JSON object a line: time, level, role, id, run, text, fields.
     """
+    from common.transport.keys import process_name
+    from services.logs import logging_as
     from services.record import record_run
 
-    return record_run(connect, run, out, live=live, duration=duration)
+    structured = log_format == "json"
+    with logging_as(log_format, role="recorder", id=process_name("recorder"), run=run):
+        return record_run(connect, run, out, live=live, duration=duration, structured=structured)
 
 
 COMMAND = record

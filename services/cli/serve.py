@@ -2,6 +2,8 @@
 
 import pathlib
 
+from services.cli.watch import Watch, Watched
+
 
 def serve(
     policy: pathlib.Path | None = None,
@@ -10,6 +12,7 @@ def serve(
     run: str = "quickstart",
     listen: str = "tcp/127.0.0.1:7457",
     name: str = "policy",
+    watch: Watched = Watch(),  # noqa: B008
 ) -> int:
     """Answer live queries with a policy file, or with the newest policy of a run while it trains.
 
@@ -20,10 +23,16 @@ def serve(
       run: Name of the run to follow.
       listen: Endpoint for the clients.
       name: Name under which the policy is served.
+      watch: How it is watched.
     """
+    import secrets
+
     from common.errors import CongraspError
     from common.policy.shipped import policy_file
+    from common.transport.keys import Keys
     from common.transport.zenoh_transport import ZenohTransport
+    from services.logs import say
+    from services.metrics import ServerMetrics
     from services.server import PolicyServer, follow_file, follow_run
     from services.shutdown import on_signal
 
@@ -31,13 +40,17 @@ def serve(
         raise CongraspError(
             f"The server can follow either {policy} or {connect}.", "Give one of --policy and --connect."
         )
-    with on_signal() as stop:
+    metrics = ServerMetrics()
+    with watch.watched("server", name, run if connect else "", metrics), on_signal() as stop:
         upstream = ZenohTransport(connect=[connect]) if connect else None
+        if upstream:
+            upstream.declare_alive(Keys(run).alive("server", name, secrets.token_hex(4)))
         source = follow_run(upstream, run) if upstream else follow_file(policy_file(policy, hand))
         with ZenohTransport(listen=[listen], flows=("policy",)) as transport:
-            server = PolicyServer(transport, name, source)
+            server = PolicyServer(transport, name, source, on_answer=metrics.answer, on_batch=metrics.batch)
+            metrics.health = server.health
             health = server.health()
-            print(f"serving '{name}' at {listen}: hand {health['hand']}, version {health['version']}", flush=True)
+            say("info", f"Serving '{name}' at {listen}: hand {health['hand']}, version {health['version']}.")
             stop.wait()
             server.close()
         if upstream:

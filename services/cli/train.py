@@ -33,6 +33,8 @@ class Train:
     """Go on from the latest checkpoint in --run-dir."""
     evaluation: int = 64
     """Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out."""
+    metrics_port: int = 0
+    """Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none."""
 
     def run(self) -> int:
         """Runs the command."""
@@ -46,6 +48,7 @@ class Train:
             resume=self.resume,
             initial=self.initial,
             evaluation=self.evaluation,
+            metrics_port=self.metrics_port,
         )
 
 

@@ -117,7 +117,8 @@ def test_tickets_run_out_and_return(bench):
 
 
 def test_death_returns_tickets_and_is_told(bench):
-    b = bench(max_staleness=0, batch=1)
+    said = []
+    b = bench(max_staleness=0, batch=1, on_event=lambda *event: said.append(event))
     b.hub.publish_weights(bundle(0), 0)
     events = b.peer.subscribe(KEYS.logs, depth=8)
     actor = MemoryTransport(b.peer._hub)
@@ -128,6 +129,7 @@ def test_death_returns_tickets_and_is_told(bench):
     key, event = events.receive(5)
     assert key == KEYS.log("event", "learner", "0")
     assert event.meta["text"] == "The actor a left; 1 of its tickets returned."
+    assert said == [("info", event.meta["text"])]
     assert b.ledger()["returned"] == 1 and b.ticket("u")["granted"]
     assert _roles(b) == {("learner", "0")}
 

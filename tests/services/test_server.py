@@ -20,23 +20,32 @@ from common.wire.codec import Message
 from services.client import PolicyClient
 from services.inference import PolicyFunction
 from services.load import example_episode, measure
+from services.metrics import ServerMetrics, exposed
 from services.presets import get_preset
 from services.quickstart import untrained
 from services.server import DEPTH, PolicyServer, follow_file, follow_run
-from services.train import free_port
+from services.train import free_port as free_ports
+from tests.services.test_metrics import scrape
 
 pytestmark = pytest.mark.timeout(300)
 CONFIG = dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory):
+def metrics():
+    """What the server is watched by."""
+    return ServerMetrics()
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory, metrics):
     """A server over Zenoh that follows a policy file, and the start of an episode."""
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
     bundles.save(untrained(CONFIG), path)
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_ports()}"
     with ZenohTransport(listen=[endpoint], flows=("policy",)) as transport:
-        server = PolicyServer(transport, "policy", follow_file(path))
+        server = PolicyServer(transport, "policy", follow_file(path), on_answer=metrics.answer, on_batch=metrics.batch)
+        metrics.health = server.health
         yield path, endpoint, example_episode(1_000_000)
         server.close()
 
@@ -52,6 +61,25 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
     # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the limits.
     expected = first.q_target + 0.1 * second.action[:20]
     np.testing.assert_allclose(second.q_target[3:7], expected[3:7], atol=1e-4)
+
+
+def test_answers_refusals_and_batches_are_counted(served, metrics, free_port):
+    _, endpoint, episode = served
+    port = free_port()
+    with PolicyClient(endpoint) as client, exposed(port, "127.0.0.1", metrics):
+        before = scrape(port)
+        client.reset(**episode["reset"])
+        for _ in range(3):
+            client.act(episode["state"])
+        client.reset(**{**episode["reset"], "constraints": ["levitation"]})
+        with pytest.raises(TransportError):
+            client.act(episode["state"])
+        after = scrape(port)
+    grown = {name: value - before[name] for name, value in after.items()}
+    assert grown["congrasp_policy_queries_total", "answered"] == 3 == grown["congrasp_policy_seconds_count",]
+    assert grown["congrasp_policy_queries_total", "refused"] == 1
+    assert grown["congrasp_policy_batch_count",] == 3 == grown["congrasp_policy_batch_sum",]
+    assert after["congrasp_policy_ready",] == 1 and after["congrasp_policy_version",] == 0
 
 
 @pytest.mark.parametrize(
@@ -118,7 +146,7 @@ def test_a_client_of_another_hand_is_refused(served):
             client.act(episode["state"])
 
 
-def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, monkeypatch):
+def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, metrics, monkeypatch):
     _, endpoint, episode = served
     entered, go = threading.Semaphore(0), threading.Event()
     infer = PolicyFunction.__call__
@@ -147,6 +175,7 @@ def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, mo
             time.sleep(0.01)
         with pytest.raises(TransportError, match="Overloaded"):
             ask(clients[-1])
+        assert metrics.outcomes["overloaded"] == 1
         assert not any(future.done() for future in asked)
         go.set()
         assert len({future.result(60) for future in asked}) == 1

@@ -1,0 +1,115 @@
+"""How a run ends when it is told to: signals a small real one at random moments, and looks for what lives on."""
+
+import os
+import pathlib
+import random
+import secrets
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import psutil
+
+LIMIT = 5.0
+"""Seconds that a run may take to end."""
+_MARK = "CONGRASP_TRY"  # environment variable by which all processes of a try are found
+PATIENCE = 3 * LIMIT
+"""Seconds after which a try is given up."""
+_LOOK = 0.02
+SMALL = (
+    *("train", "--preset", "quickstart", "--updates", "1000000", "--environments", "4", "--checkpoint-every", "3"),
+    *("--objects.count", "2", "--objects.families", "box", "--network.hidden", "32", "--network.encoder", "8"),
+    *("--ppo.epochs", "1", "--ppo.minibatches", "2", "--evaluation", "0", "--actors", "2", "--physics", "native"),
+)
+"""A run with a learner and two actors that goes on until it is told to end."""
+
+
+class Try(NamedTuple):
+    """What came of one signal."""
+
+    signal: str
+    after: float
+    """Seconds from the start of the run to the signal."""
+    processes: int
+    """Processes that the run consisted of at the signal."""
+    seconds: float
+    """From the signal until none of them lived; infinite if that took so long that they were killed."""
+    orphans: tuple[str, ...]
+    """Command lines of those that lived on when the one that was signalled had ended."""
+    code: int
+
+    @property
+    def fine(self) -> bool:
+        """Whether all ended together and in time."""
+        return self.seconds <= LIMIT and not self.orphans
+
+
+def attempts(tries: int, within: float, seed: int = 0) -> Iterator[Try]:
+    """Starts a small run again and again, and ends it by SIGINT and SIGTERM in turn.
+
+    Args:
+      tries: how often.
+      within: seconds in which the moment of the signal is drawn uniformly; the start of the run is part of them.
+      seed: of the moments.
+    """
+    moments = random.Random(seed)
+    for number in range(tries):
+        with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
+            command = [sys.executable, "-m", "services.cli.main", *SMALL, "--run-dir", str(pathlib.Path(folder, "run"))]
+            yield attempt(command, moments.uniform(0.0, within), signal.SIGTERM if number % 2 else signal.SIGINT)
+
+
+def attempt(command: Sequence[str], after: float, number: signal.Signals) -> Try:
+    """Starts a command, signals it after some seconds, and waits until it and all that it started have ended."""
+    mark = secrets.token_hex(8)
+    run = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, _MARK: mark},
+        start_new_session=True,
+    )
+    try:
+        time.sleep(after)
+        processes = len(_marked(mark))
+        run.send_signal(number)
+        began = time.monotonic()
+        orphans: tuple[str, ...] | None = None
+        while time.monotonic() - began < PATIENCE:
+            ended = run.poll() is not None
+            alive = _marked(mark)
+            if ended and orphans is None:
+                orphans = tuple(map(_command_line, alive))
+            if ended and not alive:
+                return Try(number.name, after, processes, time.monotonic() - began, orphans or (), run.returncode)
+            time.sleep(_LOOK)
+        left = tuple(map(_command_line, _marked(mark)))
+        return Try(number.name, after, processes, float("inf"), left, run.poll() or 0)
+    finally:
+        for process in _marked(mark):
+            process.kill()
+        run.wait()
+
+
+def _marked(mark: str) -> list[psutil.Process]:
+    """Processes of a try that live, whoever their parent is by now."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if process.environ().get(_MARK) == mark and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process)
+        except (psutil.Error, OSError):
+            continue
+    return found
+
+
+def _command_line(process: psutil.Process) -> str:
+    try:
+        return " ".join(process.cmdline()[2:]) or process.name()
+    except psutil.Error:
+        return "a process that has just ended"

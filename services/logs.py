@@ -1,0 +1,74 @@
+"""What a role says of itself while it runs: lines for people, or one JSON object a line for a log collector."""
+
+import contextlib
+import datetime
+import json
+import logging
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+LogFormat = Literal["text", "json"]
+_log = logging.getLogger("congrasp")
+
+
+class JsonLines(logging.Formatter):
+    """Records as JSON: time (ISO 8601, UTC), level, role, id, run, text, and the fields that go with the text."""
+
+    def __init__(self, **who: str):
+        """The entries `who` are in every line."""
+        super().__init__()
+        self._who = who
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line."""
+        entry: dict[str, Any] = {
+            "time": datetime.datetime.fromtimestamp(record.created, datetime.UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            **self._who,
+            "text": record.getMessage(),
+        }
+        if record.exc_info:
+            entry["trace"] = self.formatException(record.exc_info)
+        return json.dumps(entry | {"fields": getattr(record, "fields", {})})
+
+
+class Lines(logging.Formatter):
+    """Records as `level: text`, with the fields left out."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line, and the trace of an error in others."""
+        record.levelname = record.levelname.lower()
+        return super().format(record)
+
+
+@contextlib.contextmanager
+def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[None]:
+    """Writes what this process says to the standard output while the block runs, libraries' warnings among it.
+
+    A full disk under the output costs the lines, and not the process.
+    """
+    root, handler = logging.getLogger(), logging.StreamHandler(sys.stdout)
+    handler.setFormatter(
+        JsonLines(role=role, id=id, run=run) if form == "json" else Lines("%(levelname)s: %(message)s")
+    )
+    handler.handleError = lambda record: None  # type: ignore[method-assign]
+    root.addHandler(handler)
+    _log.setLevel(logging.INFO)
+    yield
+    # After an exception the handler stays: `say_error` has the last words.
+    root.removeHandler(handler)
+
+
+def say(level: str, text: str, fields: Mapping[str, float] | None = None) -> None:
+    """Says a line; levels: info, warning, error, fatal. Numbers that are not finite are left out of the fields."""
+    finite = {name: value for name, value in (fields or {}).items() if abs(value) < float("inf")}
+    _log.log(logging.getLevelNamesMapping()[level.upper()], text, extra={"fields": finite})
+
+
+def say_error(text: str) -> bool:
+    """Says why the process ends if its lines are JSON; whether they are."""
+    structured = any(isinstance(handler.formatter, JsonLines) for handler in logging.getLogger().handlers)
+    if structured:
+        say("error", text)
+    return structured
