@@ -42,7 +42,7 @@ def endpoint():
         with ZenohTransport(connect=[endpoint]) as actor:
             actor.declare_alive(Keys("r").alive("actor", "worker-7", "1f"))
             sent = rollout(actor="worker-7", incarnation="1f")
-            assert actor.query(Keys("r").rollout, sent, timeout=5.0).meta["outcome"] == "accepted"
+            assert actor.query(Keys("r").rollout("worker-7"), sent, timeout=5.0).meta["outcome"] == "accepted"
             yield endpoint
 
 
