@@ -3,6 +3,10 @@
 A rollout gets its identity (actor, incarnation, sequence) when it is handed over, and is sent under that identity until
 the learner has answered it, across restarts of the learner. Sending happens in the background, so that the next rollout
 is made meanwhile; at most `window` rollouts are on their way, further ones wait in `upload`.
+
+A learner that is killed takes with it what it had accepted since its last checkpoint. So accepted rollouts are kept, a
+few in all: those that are fresh, and those that will be when the learner goes on from that checkpoint. Its next life is
+sent them again before any new ticket is asked for; what it has after all is a duplicate to it.
 """
 
 import contextlib
@@ -15,15 +19,19 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, Literal, NamedTuple, Self
 
+import numpy as np
+
 from common.errors import CongraspError, TransportError
+from common.journal import Journal
 from common.transport.base import RefusedError, Transport
 from common.transport.keys import Keys
-from common.wire.codec import Message, SharedMessage
+from common.wire.codec import Message, SharedMessage, checksum
 
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 """What became of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""
 _BACKOFF = (0.1, 0.5)  # first and longest pause between two attempts, s
 _POLL = 0.2
+_SLOWEST = 100e3  # bytes a second of a link that is waited for
 
 
 class RunRestarted(CongraspError):
@@ -55,7 +63,8 @@ class Ticket(NamedTuple):
 
 class _Upload(NamedTuple):
     message: Message
-    outcome: "Future[Outcome]"
+    outcome: "Future[Outcome] | None"
+    """None for one that is sent again."""
 
 
 class ActorLink:
@@ -71,6 +80,8 @@ class ActorLink:
         max_refusals: int = 5,
         request_timeout: float = 10.0,
         patience: float = 300.0,
+        keep: bool = True,
+        journal: Journal | None = None,
     ):
         """Announces the actor.
 
@@ -80,8 +91,10 @@ class ActorLink:
           actor: the actor's name, unique in the run.
           window: rollouts on their way at a time.
           max_refusals: rollouts refused in a row after which the link fails.
-          request_timeout: seconds that one request may take.
+          request_timeout: seconds that one request may take; a rollout gets more, by its size.
           patience: seconds without any answer after which the link gives the learner up.
+          keep: keep accepted rollouts for a learner's next life; needless where actor and learner die together.
+          journal: where every rollout and each answer to it is written down; it stays the caller's.
         """
         self.keys = Keys(run)
         self.actor = actor
@@ -104,8 +117,15 @@ class ActorLink:
         self._uploads: queue.SimpleQueue[_Upload | None] = queue.SimpleQueue()
         self._pending: set[Future[Outcome]] = set()
         self._closed = threading.Event()
+        self._keep, self._journal = keep, journal
+        self._news = threading.Event()
+        self._lock = threading.Lock()  # of the next two
+        self._kept: dict[int, Message] = {}
+        self._owed = 0  # rollouts that are being sent again
+        self._write(actor=actor, incarnation=self.incarnation)
         self._announcements = transport.subscribe(self.keys.announcement, depth=1)
         transport.declare_alive(self.keys.alive("actor", actor, self.incarnation))
+        threading.Thread(target=self._follow, daemon=True, name="announcements").start()
         for index in range(window):
             threading.Thread(target=self._upload_all, daemon=True, name=f"upload-{index}").start()
 
@@ -133,6 +153,13 @@ class ActorLink:
         deadline = time.monotonic() + timeout
         while True:
             self._check()
+            if self._owed:
+                rest = deadline - time.monotonic()
+                if rest <= 0:
+                    return None
+                self._closed.wait(min(_POLL, rest))
+                continue
+            self._news.clear()
             try:
                 reply = self._ask(self._ticket_key, self._identity(self._wanted), deadline)
             except RefusedError:
@@ -148,7 +175,7 @@ class ActorLink:
             pause = min(float(reply.meta["retry_after"]), deadline - time.monotonic())
             if pause <= 0:
                 return None
-            self._listen(pause)
+            self._news.wait(pause)
 
     def give_back(self, ticket: Ticket) -> None:
         """Returns a ticket that is not needed; if that fails, it expires."""
@@ -167,7 +194,6 @@ class ActorLink:
         Raises:
           RunRestarted: see there.
         """
-        self._listen(0.0)
         self._check()
         if newer_than >= 0 and (newer_than, self._held_life) == self._learner:
             return None
@@ -213,11 +239,16 @@ class ActorLink:
             "sequence": next(self._sequence),
             "epoch": self._info.epoch,
         }
-        upload = _Upload(SharedMessage(rollout.arrays, meta), Future())
-        self._pending.add(upload.outcome)
-        upload.outcome.add_done_callback(self._pending.discard)
-        self._uploads.put(upload)
-        return upload.outcome
+        arrays = rollout.arrays
+        if self._keep:
+            arrays = {name: np.asarray(array) for name, array in arrays.items()}  # no device memory is held on to
+        message, outcome = SharedMessage(arrays, meta), Future[Outcome]()
+        if self._journal is not None:
+            self._write(made=meta["sequence"], version=meta["version"], checksum=checksum(message))
+        self._pending.add(outcome)
+        outcome.add_done_callback(self._pending.discard)
+        self._uploads.put(_Upload(message, outcome))
+        return outcome
 
     def flush(self, timeout: float) -> bool:
         """Waits until every rollout has its outcome; False if that takes longer than `timeout` seconds."""
@@ -255,15 +286,35 @@ class ActorLink:
     def _note(self, meta: Any) -> None:
         """Takes in what every answer and announcement of the learner says about itself."""
         self._answered = time.monotonic()
+        life = self._learner[1]
         self._learner = int(meta["version"]), str(meta["life"])
         self._finished = bool(meta["finished"])
         if self._info and meta["epoch"] != self._info.epoch:
             self._failure = _restarted(self._info.epoch, meta["epoch"])
+        with self._lock:
+            if life not in ("", meta["life"]):
+                for message in self._kept.values():
+                    self._owed += 1
+                    self._uploads.put(_Upload(message, None))
+                self._kept.clear()
+            elif meta["version"] >= 0:
+                first, last = meta["saved"]
+                self._kept = {
+                    sequence: kept
+                    for sequence, kept in self._kept.items()
+                    if kept.meta["version"] >= meta["oldest"] or first <= kept.meta["version"] <= last
+                }
 
-    def _listen(self, timeout: float) -> None:
-        """Waits for an announcement; returns early when one comes."""
-        if received := self._announcements.receive(timeout):
-            self._note(received[1].meta)
+    def _follow(self) -> None:
+        """Takes announcements in as they come, whatever the caller is doing meanwhile."""
+        while not self._closed.is_set():
+            received = self._announcements.receive(_POLL)
+            if received is None:
+                self._closed.wait(0.01)  # a closed transport does not wait
+                continue
+            with contextlib.suppress(KeyError, TypeError, ValueError):  # from nobody who speaks this language
+                self._note(received[1].meta)
+                self._news.set()
 
     def _ask(self, key: str, meta: dict[str, Any], deadline: float) -> Message:
         """Asks until there is an answer; a refusal is one."""
@@ -281,27 +332,38 @@ class ActorLink:
 
     def _upload_all(self) -> None:
         while (upload := self._uploads.get()) is not None:
+            outcome = upload.outcome or Future[Outcome]()
             try:
-                upload.outcome.set_result(self._deliver(upload.message))
+                outcome.set_result(self._deliver(upload.message))
             except CongraspError as error:
                 self._failure = self._failure or error
-                upload.outcome.set_exception(error)
+                outcome.set_exception(error)
             except Exception as error:  # an answer that is none: the thread must not die in silence
                 self._failure = CongraspError(f"The learner's answer cannot be understood: {error!r}.")
-                upload.outcome.set_exception(self._failure)
+                outcome.set_exception(self._failure)
             finally:
-                self._free.release()
+                if upload.outcome is None:
+                    with self._lock:
+                        self._owed -= 1
+                else:
+                    self._free.release()
         self._uploads.put(None)
+
+    def _write(self, **entry: Any) -> None:
+        if self._journal is not None:
+            self._journal.write(**entry)
 
     def _deliver(self, message: Message) -> Outcome:
         """Sends one rollout until it has an outcome."""
         answered = time.monotonic()
         damaged = 0
+        # To send again what is still on its way would only fill a slow link; a dead one ends the query by itself.
+        timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience)
         pauses = _pauses()
         while not self._closed.is_set():
             pause = next(pauses)
             try:
-                reply = self._transport.query(self._rollout_key, message, timeout=self._timeout)
+                reply = self._transport.query(self._rollout_key, message, timeout=timeout)
             except RefusedError as error:  # it arrived damaged, or the learner failed on it
                 damaged += 1
                 answered = time.monotonic()
@@ -315,10 +377,15 @@ class ActorLink:
                 if self._failure:
                     raise self._failure
                 outcome = reply.meta["outcome"]
+                if outcome != "retry":
+                    self._write(answer=message.meta["sequence"], outcome=outcome, life=reply.meta["life"])
                 if outcome == "refused":
                     return self._refused(str(reply.meta["why"]))
                 if outcome != "retry":
                     self._refusals = 0
+                    if self._keep and outcome != "stale":
+                        with self._lock:
+                            self._kept[message.meta["sequence"]] = Message(message.arrays, message.meta)
                     return outcome
                 pauses = _pauses()
                 pause = float(reply.meta["retry_after"])

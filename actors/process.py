@@ -16,6 +16,7 @@ from actors.rollout import Rollout, RolloutWorker, finished_episodes, goal_of_wo
 from actors.taskset import build_taskset
 from common.config import PhysicsName, RunConfig, run_config_from_json
 from common.hands import get_hand
+from common.journal import Journal
 from common.logs.channels import finite
 from common.objects.pool import load_pool
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
@@ -39,6 +40,8 @@ def run_actor(
     threads: int = 1,
     patience: float = 60.0,
     on_rollout: Callable[[dict[str, float]], None] = lambda values: None,
+    keep: bool = True,
+    journal: Journal | None = None,
 ) -> None:
     """Acts for the learner of `run` until it ends or `stop` is set.
 
@@ -51,12 +54,14 @@ def run_actor(
       threads: threads of the `native` engine.
       patience: seconds without a learner after which the actor gives up.
       on_rollout: given the figures of every rollout, its version among them.
+      keep: see `ActorLink`.
+      journal: see `ActorLink`.
 
     Raises:
       CongraspError: the learner is gone, or refuses this actor's rollouts.
     """
     while not stop.is_set():
-        with ActorLink(transport, run, actor, patience=patience) as link:
+        with ActorLink(transport, run, actor, patience=patience, keep=keep, journal=journal) as link:
             try:
                 config = run_config_from_json(link.config(patience).config)
                 _Actor(config, link, transport, physics or config.physics, threads, on_rollout).act(stop)
@@ -138,7 +143,7 @@ class _Actor:
 
     def _rollout(self, bundle: PolicyBundle, ticket: Ticket) -> None:
         config, env = self._config, self._worker.env
-        began = time.time()
+        began = time.monotonic()
         self._worker.configure(
             config.curriculum.weights(config.task.reward, bundle.version),
             stationary=config.curriculum.stationary(bundle.version),
@@ -153,7 +158,7 @@ class _Actor:
             self._worker.renew_references()
         meta = {"version": bundle.version, "schema": self._spec.schema, "steps": steps}
         self._link.upload(Message(arrays, meta), ticket)
-        seconds = time.time() - began
+        seconds = time.monotonic() - began
         values = {
             "steps_per_second": steps / seconds,
             "rollouts": self._rollouts + 1.0,

@@ -4,9 +4,9 @@ A rollout is identified by (actor, incarnation, sequence). It is acknowledged wh
 acknowledged one is never taken twice, however often its actor sends it.
 
 What a checkpoint keeps of the hub (`durable`) fits the weights beside it: when training resumes from it, what was
-decided after it is undone with the updates that used it. Such rollouts show as gaps in their actors' sequences, which
-the ledger counts as `missing`; so do rollouts that later ones have overtaken, until they arrive. All others are in the
-ledger once: as consumed, dropped, queued or stale.
+decided after it is undone with the updates that used it. Actors send what they still have of that again; what does not
+come shows as gaps in their sequences, which the ledger counts as `missing`; so do rollouts that later ones have
+overtaken, until they arrive. All others are in the ledger once: as consumed, dropped, queued or stale.
 """
 
 import collections
@@ -22,6 +22,7 @@ from common.transport.base import Transport
 from common.transport.keys import Alive, Keys, check_name, parse_alive
 from common.wire.codec import Message, SharedMessage
 from common.wire.messages import TICKET, RolloutForm, RolloutHeader, validate, validate_bundle, validate_rollout
+from learner.audit import AuditLog
 from learner.staleness import Owner, StalenessManager
 
 _INCARNATIONS = 1024  # whose marks are kept
@@ -29,6 +30,7 @@ _WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one a
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
 _EVENT_SECONDS = 1.0  # between two events of one kind
+_RETURN_SECONDS = 1.0  # that actors have after a resume to send again what the last life had accepted
 
 
 @dataclasses.dataclass
@@ -86,6 +88,7 @@ class LearnerHub:
         name: str = "0",
         durable: Mapping[str, Any] | None = None,
         on_event: Callable[[str, str], None] = lambda level, text: None,
+        audit: AuditLog | None = None,
     ):
         """Starts to answer; tickets are granted from the first `publish_weights` on.
 
@@ -101,6 +104,7 @@ class LearnerHub:
           name: the learner's name, for logs.
           durable: what `durable` returned when the checkpoint was written, to go on from it.
           on_event: given level and text of every event, which it must not hold up.
+          audit: keeps what becomes of every rollout.
 
         Raises:
           CongraspError: the durable state is of another epoch.
@@ -124,8 +128,13 @@ class LearnerHub:
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
         self._last_event: dict[str, float] = {}
         self._finished = False
+        self._audit = audit
+        self._saved = 0 if durable is None else durable["version"]
+        self._held_until = 0.0 if durable is None else float("inf")
         if durable is not None:
             self._restore(durable)
+        if audit is not None:
+            staleness.note_undone(audit.begin(self.life, epoch, staleness.version, staleness.max_staleness))
         transport.serve(self.keys.config, self._on_config)
         transport.serve(self.keys.tickets, self._on_ticket, depth=64)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
@@ -135,20 +144,30 @@ class LearnerHub:
         transport.declare_alive(self.keys.alive("learner", name, self.life))
 
     def next_batch(self, count: int, timeout: float) -> list[Message] | None:
-        """The `count` oldest rollouts that are fresh enough; None if there are not so many within `timeout` seconds."""
+        """The `count` rollouts of the oldest policies that are fresh enough; None if `timeout` seconds bring fewer."""
         deadline = time.monotonic() + timeout
         with self._changed:
             while True:
                 self._drop_stale()
-                if len(self._queue) >= count:
-                    batch = [self._queue.popleft() for _ in range(count)]
+                held = max(0.0, self._held_until - time.monotonic())
+                if len(self._queue) >= count and not held:
+                    waiting = sorted(self._queue, key=lambda entry: -self.lag(entry[0].version))
+                    batch, self._queue = waiting[:count], collections.deque(waiting[count:])
                     for header, _ in batch:
                         self._staleness.take(header.version)
-                    return [message for _, message in batch]
+                    break
                 rest = deadline - time.monotonic()
                 if rest <= 0:
                     return None
-                self._changed.wait(rest)
+                self._changed.wait(min(rest, held or rest))
+        messages = [message for _, message in batch]
+        if self._audit is not None:
+            self._audit.used(self._staleness.version, [self.lag(header.version) for header, _ in batch], messages)
+        return messages
+
+    def lag(self, version: int) -> int:
+        """Updates between the policy of a version and the current one."""
+        return self._staleness.lag(version)
 
     def publish_weights(self, bundle: Message, version: int) -> None:
         """Makes a policy bundle the latest one, and says so to everyone.
@@ -161,6 +180,8 @@ class LearnerHub:
         if (bundle.meta["version"], bundle.meta["epoch"]) != (version, self.epoch):
             raise CongraspError(f"The bundle is not version {version} of epoch {self.epoch}.")
         with self._changed:
+            if self._bundle is None and self._held_until:
+                self._held_until = time.monotonic() + _RETURN_SECONDS
             self._bundle = SharedMessage(bundle.arrays, bundle.meta)
             self._staleness.publish(version)
         self._transport.publish(self.keys.announcement, Message(meta=self._state()))
@@ -169,6 +190,12 @@ class LearnerHub:
         """Tells actors that the run is over."""
         self._finished = True
         self._transport.publish(self.keys.announcement, Message(meta=self._state()))
+
+    def close(self) -> None:
+        """Notes what waits unused at an orderly end."""
+        if self._audit is not None:
+            with self._changed:
+                self._audit.end((*header.owner, header.sequence) for header, _ in self._queue)
 
     def status(self) -> dict[str, Any]:
         """How things stand, as JSON: roles, versions, rates and the ledger."""
@@ -211,6 +238,10 @@ class LearnerHub:
                 "marks": marks,
             }
 
+    def note_saved(self, durable: Mapping[str, Any]) -> None:
+        """Notes that there is a checkpoint with this; actors may forget what it covers."""
+        self._saved = durable["version"]
+
     def _restore(self, durable: Mapping[str, Any]) -> None:
         if durable["epoch"] != self.epoch:
             raise CongraspError(f"The checkpoint is of epoch {durable['epoch']}, not {self.epoch}.")
@@ -221,7 +252,10 @@ class LearnerHub:
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1
-        return {"version": version, "epoch": self.epoch, "life": self.life, "finished": self._finished}
+        oldest = self._staleness.oldest
+        saved = [self._saved - self._staleness.max_staleness, self._saved + self._staleness.max_staleness]
+        life = {"epoch": self.epoch, "life": self.life, "finished": self._finished}
+        return {"version": version, "oldest": oldest, "saved": saved, **life}
 
     def _on_config(self, key: str, request: Message) -> Message:
         return Message(meta={**self._state(), "config": self._config, "schema": self._schema})
@@ -235,7 +269,7 @@ class LearnerHub:
         if meta.get("give_back"):
             self._staleness.give_back(owner, ticket_id)
             return Message(meta=self._state())
-        may = self._bundle is not None and not self._finished
+        may = self._bundle is not None and not self._finished and time.monotonic() >= self._held_until
         ticket = self._staleness.grant(owner, ticket_id) if may else None
         return Message(meta={**self._state(), "granted": ticket is not None, "retry_after": _RETRY_SECONDS})
 
@@ -278,7 +312,8 @@ class LearnerHub:
             self._staleness.refuse_stale(header.owner, ticket)
             marks.add(header, accepted=False)
             return self._answer("stale", why="The run is finished.")
-        verdict = self._staleness.arrive(header.owner, ticket, header.version)
+        returning = time.monotonic() < self._held_until
+        verdict = self._staleness.arrive(header.owner, ticket, header.version, beyond_capacity=returning)
         if verdict == "full":
             return self._answer("retry", why="No more rollouts are needed at this version.")
         marks.add(header, accepted=verdict == "accepted")
@@ -317,6 +352,8 @@ class LearnerHub:
         )
         for header in stale:
             self._staleness.take(header.version)
+        if self._audit is not None:
+            self._audit.dropped((*header.owner, header.sequence) for header in stale)
         actors = ", ".join(sorted({header.actor for header in stale}))
         self._event("warning", f"Dropped as too old at version {self._staleness.version}: {len(stale)} of {actors}.")
 
@@ -331,6 +368,8 @@ class LearnerHub:
         with self._changed:
             (self._alive.add if alive else self._alive.discard)(who)
         if alive:
+            if who.role == "actor":  # it may have missed what was announced
+                self._transport.publish(self.keys.announcement, Message(meta=self._state()))
             return
         tickets = self._staleness.forget((who.id, who.incarnation)) if who.role == "actor" else 0
         returned = f"; {tickets} of its tickets returned" if who.role == "actor" else ""

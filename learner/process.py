@@ -1,11 +1,13 @@
 """The learner process: rollouts in, policy bundles out, and a run directory from which it can be resumed.
 
 A run directory holds `config.json`, `initial.safetensors` where training does not begin with random weights,
-`checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `version` (the newest version that was
-ever published, so that versions rise over a crash, too) and, after an update that was not finite, `failure/`.
+`checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (what became of every rollout),
+`version` (the newest version that was ever published, so that versions rise over a crash, too) and, after an update
+that was not finite, `failure/`.
 """
 
 import contextlib
+import os
 import pathlib
 import secrets
 import threading
@@ -27,6 +29,7 @@ from common.transport.keys import Keys
 from common.wire.codec import Message, encode
 from common.wire.messages import RolloutForm
 from learner import update as updates
+from learner.audit import AuditLog
 from learner.checkpoint import Checkpoints, flatten
 from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
@@ -89,6 +92,7 @@ def run_learner(
     stop_event: threading.Event,
     resume: bool = False,
     name: str = "0",
+    audit: bool = True,
     recorder: contextlib.AbstractContextManager[object] | None = None,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
     on_event: Notify = lambda level, text: None,
@@ -104,6 +108,7 @@ def run_learner(
       stop_event: ends training after the update that is under way.
       resume: go on from the latest checkpoint.
       name: the learner's name on the wire.
+      audit: keep the journal in `audit/`; it needs rollouts on the host, so not where they stay on a device.
       recorder: entered while the learner runs, for example one that writes the run's logs.
       on_update: given the figures of every update.
       on_event: given what is worth a line.
@@ -115,8 +120,11 @@ def run_learner(
     """
     open_run(run_dir)
     with _watch_threads() as deaths, recorder or contextlib.nullcontext():
-        learner = _Learner(run_dir, config, transport, name, resume, on_event)
-        learner.train(stop_event, deaths, on_update)
+        learner = _Learner(run_dir, config, transport, name, resume, audit, on_event)
+        try:
+            learner.train(stop_event, deaths, on_update)
+        finally:
+            learner.close()
         return learner.bundle()
 
 
@@ -148,10 +156,17 @@ class _Learner:
         transport: Transport,
         name: str,
         resume: bool,
+        audit: bool,
         on_event: Notify,
     ):
         self._run_dir, self._config, self._transport, self._name = run_dir, config, transport, name
-        self._on_event, self._keys = on_event, Keys(config.name)
+        self._keys = Keys(config.name)
+
+        def tell(level: str, text: str) -> None:
+            with contextlib.suppress(OSError):  # standard output may be on a disk that is full
+                on_event(level, text)
+
+        self._on_event = tell
         self._spec: PolicySpec = bundles.policy_spec(config.task, config.network)
         self._checkpoints = Checkpoints(run_dir / "checkpoints")
         self._state = updates.init_state(
@@ -183,8 +198,13 @@ class _Learner:
             staleness=StalenessManager(config.ppo.max_staleness, config.ppo.rollouts_per_update),
             name=name,
             durable=hub_state,
-            on_event=on_event,
+            on_event=tell,
+            audit=AuditLog(run_dir, name, lambda text: self._event("error", text)) if audit else None,
         )
+
+    def close(self) -> None:
+        """Notes what is left; the transport stays open."""
+        self._hub.close()
 
     @property
     def version(self) -> int:
@@ -210,7 +230,7 @@ class _Learner:
         self._publish()
         self._warm_up()
         pace, watch = Pace(), CollapseWatch(self._config.collapse_patience)
-        saved = -1
+        saved, due = -1, False
         while self._state.version < self._config.updates and not stop.is_set() and not deaths:
             began = time.monotonic()
             messages = self._next_batch(stop, deaths)
@@ -231,8 +251,9 @@ class _Learner:
                     f"Training collapsed: {collapse}.",
                     "See docs/training.md; --resume goes on from the last checkpoint.",
                 )
-            if self._state.version % self._config.checkpoint_every == 0:
-                saved = self._save()
+            due = due or self._state.version % self._config.checkpoint_every == 0
+            if due and self._save_if_possible():
+                saved, due = self._state.version, False
         if saved != self._state.version:
             self._save()
         if deaths:
@@ -254,7 +275,7 @@ class _Learner:
         return None
 
     def _update(self, messages: list[Message]) -> dict[str, float]:
-        figures = {**staleness(messages, self.version), **episode_means(messages)}
+        figures = {**staleness(messages, self._hub.lag), **episode_means(messages)}
         batch = updates.collate([message.arrays for message in messages])
         try:
             self._state, metrics = updates.update(self._state, batch, self._spec.layout, self._config.ppo)
@@ -269,10 +290,13 @@ class _Learner:
         return {**metrics, **figures}
 
     def _publish(self) -> None:
-        # Renamed without flushing: this must survive the process, and a power cut costs no more than a version.
-        temporary = self._run_dir / f".{_VERSION_FILE}.tmp"
-        temporary.write_text(str(self.version))
-        temporary.replace(self._run_dir / _VERSION_FILE)
+        # Overwritten in place, which needs no space on a disk that is full, and not flushed: this must survive the
+        # process, and a power cut costs no more than a version.
+        try:
+            with open(os.open(self._run_dir / _VERSION_FILE, os.O_WRONLY | os.O_CREAT, 0o644), "wb", 0) as file:
+                file.write(f"{self.version:020d}\n".encode())
+        except OSError as error:
+            self._event("error", f"{self._run_dir / _VERSION_FILE} could not be written: {error.strerror}.")
         self._hub.publish_weights(self.bundle().to_message(), self.version)
         meta = {"version": self.version, "epoch": self._epoch, "schema": self._spec.schema}
         self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
@@ -304,11 +328,21 @@ class _Learner:
         copy = self._state._replace(optimizer=jax.tree.map(jnp.copy, self._state.optimizer))
         updates.update(copy, batch, spec.layout, config.ppo)
 
-    def _save(self) -> int:
-        meta = {"epoch": self._epoch, "skipped": self._skipped, "hub": self._hub.durable()}
+    def _save(self) -> None:
+        durable = self._hub.durable()
+        meta = {"epoch": self._epoch, "skipped": self._skipped, "hub": durable}
         self._checkpoints.save(self._state, meta, self._state.version)
+        self._hub.note_saved(durable)
         bundles.save(self.bundle(), self._run_dir / POLICY_FILE)
-        return self._state.version
+
+    def _save_if_possible(self) -> bool:
+        """A checkpoint on the way; one that fails is tried again after the next update, and training goes on."""
+        try:
+            self._save()
+        except CongraspError as error:
+            self._event("error", f"{error} Training goes on; the next update tries again.")
+            return False
+        return True
 
     def _say_goodbye(self) -> None:
         """Sends the actors home, and gives them a moment to hear it."""

@@ -10,6 +10,10 @@ only be thrown away, unless its actor is slow. A rollout that arrives more than 
 policy that made it is refused, and dropped if it grows that old while it waits.
 
 A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes.
+
+The lag of a rollout is the number of updates between the policy that acted and the current one. A learner that resumes
+from a checkpoint gives its policy a new number; what acted under the versions before is measured from the checkpoint's:
+rollouts of that very policy are as fresh as ever, those of policies that died with the killed learner are not.
 """
 
 import dataclasses
@@ -61,6 +65,8 @@ class Ledger:
     """Arrivals of a rollout that had been accepted before."""
     damaged: int = 0
     """Messages refused because they were damaged or broke the rules of a rollout."""
+    undone: int = 0
+    """Rollouts that were consumed by updates which died with a killed learner; not among the others."""
 
 
 class StalenessManager:
@@ -93,12 +99,26 @@ class StalenessManager:
         self._tickets: dict[tuple[Owner, str], Ticket] = {}
         self._version = 0
         self._in_update = 0
+        # Where the last resume began: the version of the checkpoint, and the one that its policy got instead.
+        self._resumed: tuple[int, int | None] = 0, 0
         self._ledger = Ledger()
 
     @property
     def version(self) -> int:
         """The current policy version."""
         return self._version
+
+    @property
+    def max_staleness(self) -> int:
+        """Eta."""
+        return self._max_staleness
+
+    @property
+    def oldest(self) -> int:
+        """Version of the oldest policy whose rollouts are still of use."""
+        source, renamed = self._resumed
+        left = self._max_staleness - (self._version - (renamed or 0))
+        return source - left if left >= 0 else self._version - self._max_staleness
 
     @property
     def rollouts_per_update(self) -> int:
@@ -154,7 +174,7 @@ class StalenessManager:
             self._ledger.returned += len(mine)
             return len(mine)
 
-    def arrive(self, owner: Owner, ticket_id: str, version: int) -> Verdict:
+    def arrive(self, owner: Owner, ticket_id: str, version: int, *, beyond_capacity: bool = False) -> Verdict:
         """Decides about a valid rollout that arrived for the first time.
 
         Its ticket ends unless the verdict is `full`: it has none (any more), and nothing more may come in. It may come
@@ -164,13 +184,14 @@ class StalenessManager:
           owner: who made it.
           ticket_id: the ticket it was made under.
           version: the policy version it was made with.
+          beyond_capacity: without a ticket it need not fit: it had been admitted before.
         """
         with self._lock:
             if self.is_stale(version) or version > self._version:
                 self.refuse_stale(owner, ticket_id)
                 return "stale"
             self._expire()
-            if (owner, ticket_id) not in self._tickets and self.capacity <= 0:
+            if (owner, ticket_id) not in self._tickets and self.capacity <= 0 and not beyond_capacity:
                 return "full"
             self.redeem(owner, ticket_id)
             self._ledger.accepted += 1
@@ -201,9 +222,16 @@ class StalenessManager:
                 self.redeem(owner, ticket_id)
             self._ledger.damaged += 1
 
+    def lag(self, version: int) -> int:
+        """Updates between the policy of a version and the current one."""
+        source, renamed = self._resumed
+        if renamed is None or version >= renamed:
+            return self._version - version
+        return abs(version - source) + self._version - renamed
+
     def is_stale(self, version: int) -> bool:
         """Whether a rollout of this policy version is too old to learn from."""
-        return self._version - version > self._max_staleness
+        return self.lag(version) > self._max_staleness
 
     def take(self, version: int) -> bool:
         """Hands an accepted rollout to the coming update; False if it has grown too old, and is dropped."""
@@ -218,6 +246,8 @@ class StalenessManager:
     def publish(self, version: int) -> None:
         """Moves on to a version, which ends the update that led to it."""
         with self._lock:
+            if self._resumed[1] is None:
+                self._resumed = self._version, version
             self._version = version
             self._in_update = 0
 
@@ -239,11 +269,17 @@ class StalenessManager:
             }
 
     def restore(self, durable: Mapping[str, int], version: int) -> None:
-        """Goes on from a checkpoint: its counts and its version, with nothing under way."""
+        """Goes on from a checkpoint: its counts and its version, with nothing under way; `publish` renames it."""
         with self._lock:
             self._ledger = Ledger(**durable)
             self._tickets.clear()
-            self.publish(version)
+            self._version, self._in_update = version, 0
+            self._resumed = version, None
+
+    def note_undone(self, count: int) -> None:
+        """Notes how many rollouts the run has lost with updates that died with a killed learner."""
+        with self._lock:
+            self._ledger.undone = count
 
     def _expire(self) -> None:
         now = self._clock()

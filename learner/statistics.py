@@ -39,9 +39,9 @@ def episode_means(messages: Sequence[Message]) -> dict[str, float]:
     return {**means, "episodes": float(count)}
 
 
-def staleness(messages: Sequence[Message], version: int) -> dict[str, float]:
-    """Versions by which each transition of the batch lags behind the learner's `version`: mean and maximum."""
-    lags = np.array([version - int(message.meta["version"]) for message in messages], np.float64)
+def staleness(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str, float]:
+    """Lag of each transition of the batch, mean and maximum; `lag` gives that of a policy version."""
+    lags = np.array([lag(int(message.meta["version"])) for message in messages], np.float64)
     weights = np.array([int(message.meta["steps"]) for message in messages], np.float64)
     return {"staleness_mean": float(np.average(lags, weights=weights)), "staleness_max": float(lags.max())}
 

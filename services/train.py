@@ -15,6 +15,7 @@ from typing import Any
 
 from common.config import PhysicsName, RunConfig
 from common.errors import CongraspError, TransportError
+from common.journal import AUDIT
 from common.transport.keys import FLOWS, Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.zenoh_transport import ZenohTransport
@@ -99,6 +100,7 @@ def train(
     for number in range(actors):
         name = f"actor-{number}"
         arguments = ["actor", "--connect", endpoint, "--run", config.name, "--id", name, "--physics", physics]
+        arguments += ["--audit", str(run_dir / AUDIT / f"{name}.jsonl")]
         children.append(Child(name, [*arguments, "--threads", str(threads)], logs / f"{name}.log"))
     try:
         for child in children:
@@ -208,6 +210,7 @@ def train_in_process(
                     stop=ended,
                     physics=physics,
                     threads=os.cpu_count() or 1,
+                    keep=False,
                 )
         except BaseException as error:
             failures.append(error)
@@ -227,7 +230,14 @@ def train_in_process(
         try:
             with exposed(metrics_port, "127.0.0.1", metrics) if metrics_port else contextlib.nullcontext():
                 run_learner(
-                    run_dir, config, transport, stop_event=stop, resume=resume, recorder=recorder, on_update=updated
+                    run_dir,
+                    config,
+                    transport,
+                    stop_event=stop,
+                    resume=resume,
+                    audit=False,
+                    recorder=recorder,
+                    on_update=updated,
                 )
         finally:
             ended.set()

@@ -130,6 +130,16 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
     return Message(_arrays(header, section), meta)
 
 
+def checksum(message: Message) -> str:
+    """A checksum of a message's arrays with their names, dtypes and shapes; the same at both ends of a link."""
+    crc = 0
+    for name in sorted(message.arrays):
+        array = _portable(name, message.arrays[name])
+        crc = crc32(f"{name} {_NAMES[array.dtype]} {array.shape} ".encode(), crc)
+        crc = crc32(array.reshape(-1).view(np.uint8).data, crc)
+    return f"{crc:08x}"
+
+
 def _portable(name: str, value: Any) -> np.ndarray:
     """A contiguous little-endian array of a known dtype."""
     array = np.asarray(value)

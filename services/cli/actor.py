@@ -1,5 +1,6 @@
 """`congrasp actor`: one actor."""
 
+import pathlib
 from typing import Annotated
 
 import tyro
@@ -15,6 +16,7 @@ def actor(
     physics: PhysicsName = "auto",
     threads: int = 0,
     patience: float = 60.0,
+    audit: pathlib.Path | None = None,
     watch: Watched = Watch(),  # noqa: B008
 ) -> int:
     """One actor that works for a learner, on this machine or another; it may come and go while the learner trains.
@@ -26,11 +28,13 @@ def actor(
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
       threads: Threads of the native engine; 0 takes all cores.
       patience: Seconds without a learner after which the actor gives up.
+      audit: Journal of every rollout and the learner's answer to it, for 'congrasp audit'; nothing is written without.
       watch: How it is watched.
     """
     import os
 
     from actors.process import run_actor
+    from common.journal import Journal
     from common.transport.keys import process_name
     from common.transport.zenoh_transport import ZenohTransport
     from services.logs import say
@@ -59,6 +63,7 @@ def actor(
             threads=threads or os.cpu_count() or 1,
             patience=patience,
             on_rollout=made,
+            journal=Journal(audit, lambda text: say("error", text)) if audit else None,
         )
         return stop.exit_code
 

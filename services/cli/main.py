@@ -30,6 +30,7 @@ COMMANDS = {
     "plot": "draw a run's learning curves and reward terms",
     "render": "draw the hand, or an episode of a run",
     "status": "who works on a run, and how it goes",
+    "audit": "what became of every rollout of a run",
     "bench": "benchmarks, as ratios against a reference",
     "doctor": "what is wrong with this machine or installation",
 }

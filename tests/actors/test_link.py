@@ -22,7 +22,7 @@ class Learner:
 
     def __init__(self, hub, *, epoch="e", life="1"):
         self.transport = MemoryTransport(hub)
-        self.state = {"version": 0, "epoch": epoch, "life": life, "finished": False}
+        self.state = {"version": 0, "oldest": -1, "saved": [-1, 1], "epoch": epoch, "life": life, "finished": False}
         self.granted = True
         self.outcomes = []  # what rollouts are told, the last one for ever
         self.received = []
@@ -76,6 +76,15 @@ def ends():
     for transport, link in made:
         link.close()
         transport.close()
+
+
+def eventually(look):
+    """What `look` returns, once that is something."""
+    deadline = time.monotonic() + 10.0
+    while not (seen := look()):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return seen
 
 
 def rollout(value=0.0):
@@ -149,16 +158,16 @@ def test_weights_are_pulled_only_when_there_are_others(ends):
         assert link.weights(0) is None
     assert learner.pulls == 1
     learner.announce(version=1)
-    assert link.weights(0).meta["version"] == 1
+    assert eventually(lambda: link.weights(0)).meta["version"] == 1
     assert link.weights(1) is None and learner.pulls == 2
     learner.state["version"] = 2  # its announcement is lost; a ticket tells as well
     assert link.weights(1) is None
     link.acquire_ticket(5)
     assert link.weights(1).meta["version"] == 2
     learner.announce(version=1, life="2")  # it resumed from a checkpoint
-    assert link.weights(2).meta["version"] == 1
+    assert eventually(lambda: link.weights(2)).meta["version"] == 1
     learner.announce(version=1, life="3")
-    assert link.weights(1).meta["version"] == 1
+    assert eventually(lambda: link.weights(1)).meta["version"] == 1
     assert link.weights(1) is None
 
 
@@ -305,3 +314,25 @@ def test_liveliness(ends):
     hub, make = ends
     link = make()
     assert hub.tokens == [KEYS.alive("actor", "a", link.incarnation)]
+
+
+def test_a_new_life_is_sent_what_the_old_one_may_have_lost(ends):
+    """The old life saved version 4 and is at 9: rollouts of 3 to 5 and from 8 on are of use to the next one."""
+    hub, make = ends
+    learner, link = Learner(hub), make()
+    learner.state |= {"version": 9, "oldest": 8, "saved": [3, 5]}
+    link.config(5)
+    for version in range(2, 10):
+        message = Message({"reward": np.full(3, version)}, {"version": version, "schema": "s", "steps": 3})
+        link.upload(message, TICKET).result(5)
+    link.acquire_ticket(5)
+    learner.outcomes = ["retry", "retry", "duplicate", "stale", "accepted"]
+    learner.received.clear()
+    learner.announce(life="2")
+    eventually(lambda: learner.received)
+    assert link.acquire_ticket(5).version == 9
+    assert [message.meta["version"] for message in learner.received[2:]] == [3, 4, 5, 8, 9]  # before any ticket
+    assert {message.arrays["reward"][0] for message in learner.received} == {3, 4, 5, 8, 9}
+    learner.announce(life="3")
+    eventually(lambda: len(learner.received) >= 7 + 4)
+    assert sorted(message.meta["version"] for message in learner.received[7:]) == [3, 5, 8, 9]  # 4 was stale

@@ -152,7 +152,7 @@ def test_batches_come_in_order_and_wait(bench):
     assert sequences(b.hub.next_batch(2, 10)) == [2, 3]
     assert b.ledger() | {"capacity": 0} == {
         "granted": 0, "redeemed": 0, "returned": 0, "expired": 0, "accepted": 4, "consumed": 4, "dropped": 0,
-        "stale": 0, "duplicate": 0, "damaged": 0, "running": 0, "queued": 0, "capacity": 0, "missing": 0,
+        "stale": 0, "duplicate": 0, "damaged": 0, "undone": 0, "running": 0, "queued": 0, "capacity": 0, "missing": 0,
     }  # fmt: skip
 
 
@@ -273,7 +273,9 @@ def test_weights_are_pulled_by_version(bench):
     b = bench()
     notices = b.peer.subscribe(KEYS.announcement, depth=4)
     b.hub.publish_weights(bundle(0), 0)
-    assert notices.receive(5)[1].meta == {"version": 0, "epoch": "e", "life": b.hub.life, "finished": False}
+    assert notices.receive(5)[1].meta == {
+        "version": 0, "oldest": -1, "saved": [-1, 1], "epoch": "e", "life": b.hub.life, "finished": False,
+    }  # fmt: skip
     pulled = b.peer.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5)
     assert pulled.meta == bundle(0).meta and pulled.arrays["actor/w"][0] == 0
     assert b.ask(KEYS.weights, {"newer_than": 0})["version"] == 0
@@ -397,3 +399,20 @@ def _header(sequence):
     from common.wire.messages import RolloutHeader
 
     return RolloutHeader("a", "01", sequence, 0, "e", "s", 1)
+
+
+def test_a_resumed_learner_waits_for_what_was_accepted_before_and_uses_the_oldest_first(bench):
+    b = bench(batch=2)
+    b.hub.publish_weights(bundle(3), 3)
+    resumed = bench(batch=2, durable=b.hub.durable())
+    resumed.hub.publish_weights(bundle(5), 5)  # 4 died with the first life, and 5 is 3 under another number
+    assert not resumed.ticket()["granted"]
+    versions = [4, 4, 3, 3, 2, 2]  # more than there are tickets for, none of which they have any more
+    assert {resumed.send(i, version=version)["outcome"] for i, version in enumerate(versions)} == {"accepted"}
+    assert resumed.send(9, version=1)["outcome"] == "stale"
+    batches = []
+    for version in (6, 7, 8):
+        batches.append(sequences(resumed.hub.next_batch(2, 5 if version < 8 else 0.05) or []))
+        resumed.hub.publish_weights(bundle(version), version)
+    assert batches == [[0, 1], [2, 3], []]  # of 4 and 2, one update away from 3, only one batch could be used
+    assert resumed.ticket()["granted"]

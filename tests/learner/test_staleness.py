@@ -31,7 +31,7 @@ def test_tickets_worked_out_by_hand():
     assert staleness.capacity == 2
     assert staleness.ledger() == {
         "granted": 4, "redeemed": 2, "returned": 0, "expired": 0, "accepted": 2, "consumed": 2, "dropped": 0,
-        "stale": 0, "duplicate": 0, "damaged": 0, "running": 2, "queued": 0, "capacity": 2,
+        "stale": 0, "duplicate": 0, "damaged": 0, "undone": 0, "running": 2, "queued": 0, "capacity": 2,
     }  # fmt: skip
 
 
@@ -43,6 +43,21 @@ def test_without_staleness_nothing_starts_during_an_update():
     assert staleness.grant(A, "y") is None
     staleness.publish(1)
     assert staleness.grant(A, "y").version == 1
+
+
+def test_a_resumed_learner_measures_from_its_checkpoint():
+    """Checkpoint at version 3, killed at 6, resumed as 7: that is the policy of 3, so 3 lags by 0, 4 and 2 by 1."""
+    staleness = manager(max_staleness=1)
+    staleness.restore(manager().durable(), 3)
+    staleness.publish(7)
+    assert [staleness.lag(version) for version in (7, 6, 5, 4, 3, 2, 1)] == [0, 3, 2, 1, 0, 1, 2]
+    assert staleness.oldest == 2
+    assert [staleness.arrive(A, "", version) for version in (5, 3)] == ["stale", "accepted"]
+    staleness.publish(8)
+    assert [staleness.lag(version) for version in (8, 7, 4, 3)] == [0, 1, 2, 1]
+    assert staleness.oldest == 3
+    staleness.publish(9)
+    assert staleness.lag(3) == 2 and staleness.oldest == 8
 
 
 def test_asking_twice_is_asking_once():

@@ -50,7 +50,7 @@ def test_errors_and_success_count_where_their_constraint_was_active():
 
 
 def test_staleness_weighs_transitions():
-    lags = staleness([rollout(version=9, steps=300), rollout(version=7, steps=100)], version=9)
+    lags = staleness([rollout(version=9, steps=300), rollout(version=7, steps=100)], lambda version: 9 - version)
     assert lags == {"staleness_mean": 0.5, "staleness_max": 2.0}
 
 

@@ -1,0 +1,74 @@
+"""The learner's journal: which rollouts its updates used, which it dropped, and what a resume undid.
+
+Every life of the learner begins with a line that names the checkpoint's version. What was handed to updates of that
+version or later ones, before, died with the process: these rollouts are undone, and may come again.
+"""
+
+import pathlib
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+from common.journal import AUDIT, Journal, read_journal
+from common.wire.codec import Message, checksum
+
+
+class Used(NamedTuple):
+    """A rollout that was handed to an update."""
+
+    actor: str
+    incarnation: str
+    sequence: int
+    lag: int
+    """Versions between the policy that acted and the one that learnt."""
+    checksum: str
+    """Of its content when it was handed over."""
+
+
+class AuditLog:
+    """Writes the journal of one learner."""
+
+    def __init__(self, run_dir: pathlib.Path, name: str, complain: Callable[[str], None] = lambda text: None):
+        """Opens, or goes on with, the journal of the learner called `name`."""
+        self._path = journal_path(run_dir, name)
+        self._journal = Journal(self._path, complain)
+
+    def begin(self, life: str, epoch: str, version: int, max_staleness: int) -> int:
+        """A life begins from a checkpoint of `version`, or 0; returns how many rollouts the run has lost by undoing."""
+        self._journal.write(life=life, epoch=epoch, version=version, max_staleness=max_staleness)
+        return len(replay(read_journal(self._path))[1])
+
+    def used(self, version: int, lags: Sequence[int], messages: Sequence[Message]) -> None:
+        """Rollouts are handed to the update that follows `version`."""
+        rows = [[*_identity(message), lag, checksum(message)] for lag, message in zip(lags, messages, strict=True)]
+        self._journal.write(version=version, used=rows)
+
+    def dropped(self, identities: Iterable[tuple[str, str, int]]) -> None:
+        """Accepted rollouts had grown too old."""
+        self._journal.write(dropped=list(identities))
+
+    def end(self, waiting: Iterable[tuple[str, str, int]]) -> None:
+        """The life ends in order, with these accepted rollouts unused."""
+        self._journal.write(end=list(waiting))
+        self._journal.close()
+
+
+def journal_path(run_dir: pathlib.Path, name: str) -> pathlib.Path:
+    """Where the learner called `name` keeps its journal."""
+    return run_dir / AUDIT / f"learner-{name}.jsonl"
+
+
+def replay(entries: Iterable[dict[str, Any]]) -> tuple[list[Used], list[Used]]:
+    """The uses that stand, and those that resumes from checkpoints undid, in their order."""
+    standing: list[tuple[int, Used]] = []
+    undone: list[Used] = []
+    for entry in entries:
+        if "life" in entry:
+            undone += [use for version, use in standing if version >= entry["version"]]
+            standing = [(version, use) for version, use in standing if version < entry["version"]]
+        for row in entry.get("used", ()):
+            standing.append((entry["version"], Used(*row)))
+    return [use for _, use in standing], undone
+
+
+def _identity(message: Message) -> tuple[str, str, int]:
+    return message.meta["actor"], message.meta["incarnation"], message.meta["sequence"]

@@ -1,0 +1,317 @@
+"""A learner and actors as real processes over Zenoh, without networks and physics, for tests that do damage.
+
+Run as a script, this file is the learner or the actor. The hub, the link, the wire and the journals are the real ones;
+the "policy" is a version number, an "update" consumes two rollouts and may take some time, and a checkpoint is a JSON
+file.
+"""
+
+import contextlib
+import json
+import os
+import pathlib
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+
+from actors.link import ActorLink, RunFinished, RunRestarted
+from common.errors import TransportError
+from common.journal import AUDIT, Journal
+from common.transport.keys import FLOWS, Keys
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message
+from common.wire.messages import RolloutForm
+from learner.audit import AuditLog
+from learner.hub import LearnerHub
+from learner.staleness import StalenessManager
+from services.audit import FAULTS, audit
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+KEYS = Keys("chaos")
+T, B, D, A = 20, 16, 32, 4
+BATCH = 2
+LIMIT = 64 << 20
+
+
+def bundle(version, epoch):
+    arrays = {f"{kind}/{name}": np.zeros(shape) for kind, shape in (("observation", D), ("value", ()))
+              for name in ("mean", "m2")}  # fmt: skip
+    arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": np.zeros(1000, np.float32)}
+    meta = {"version": version, "epoch": epoch, "schema": "s", "hand": "human", "layout": [], "action_size": A}
+    return Message(arrays, {**meta, "format": 1})
+
+
+def rollout(steps, value, version):
+    """All values are the same, so that a torn one shows."""
+    arrays = {
+        "observation": np.full((steps, B, D), value, np.float16),
+        "action": np.full((steps, B, A), value, np.float32),
+        "log_probability": np.full((steps, B), value, np.float32),
+        "reward": np.full((steps, B), value, np.float32),
+        "terminal": np.zeros((steps, B), bool),
+        "last_observation": np.full((B, D), value, np.float16),
+    }
+    return Message(arrays, {"version": version, "schema": "s", "steps": steps * B})
+
+
+# --- the two roles ---
+
+
+def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0):
+    """Consumes batches and checkpoints after `every` updates, until it is told to stop (SIGTERM) or killed."""
+    path = folder / "checkpoint"
+    saved = json.loads(path.read_text()) if path.exists() else {"durable": None, "history": [], "version": 0}
+    history, version = saved["history"], saved["version"]
+    published = folder / "version"
+    if saved["durable"] is not None and int(published.read_text()) > version:
+        version = int(published.read_text()) + 1
+    stopped = []
+    signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
+    with ZenohTransport(listen=[endpoint], max_message=LIMIT) as transport:
+        hub = LearnerHub(
+            transport, run="chaos", config_json="{}", epoch=epoch, schema="s",
+            form=RolloutForm(steps, B, D, A, half=True), staleness=StalenessManager(1, BATCH),
+            durable=saved["durable"], audit=AuditLog(folder, "0"),
+        )  # fmt: skip
+        save(published, version)
+        hub.publish_weights(bundle(version, epoch), version)
+        print("ready", flush=True)
+        updates = 0
+        while not stopped:
+            batch = hub.next_batch(BATCH, 0.1)
+            if batch is None:
+                continue
+            for message in batch:
+                expected = message.meta["sequence"] % 1000
+                for name, array in message.arrays.items():
+                    assert name == "terminal" or (array == expected).all(), f"torn: {name}"
+                history.append([message.meta[name] for name in ("actor", "incarnation", "sequence")])
+            time.sleep(pause)
+            version, updates = version + 1, updates + 1
+            save(published, version)
+            hub.publish_weights(bundle(version, epoch), version)
+            if updates % every == 0:
+                durable = hub.durable()
+                save(path, {"durable": durable, "history": history, "version": version})
+                hub.note_saved(durable)
+        hub.finish()
+        time.sleep(0.5)  # actors hear of it; what is on its way still comes in
+        hub.close()
+        save(folder / "final", {"history": history, "ledger": hub.status()["ledger"], "version": version})
+
+
+def save(path, content):
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(content))
+    os.replace(temporary, path)
+
+
+def run_actor(folder, endpoint, *, name, steps=T, pause=0.0):
+    """Makes rollouts until the run is finished; writes each outcome down."""
+    journal = Journal(folder / AUDIT / f"{name}.jsonl")
+    with (
+        open(folder / f"{name}.log", "a", buffering=1) as log,
+        ZenohTransport(connect=[endpoint], flows=["control", "bulk", "log"], max_message=LIMIT) as transport,
+        ActorLink(transport, "chaos", name, window=2, request_timeout=3.0, journal=journal) as link,
+    ):
+        made = []
+        with contextlib.suppress(RunFinished):
+            while True:
+                try:
+                    work(link, steps, pause, made, log)
+                except RunRestarted:
+                    log.write(json.dumps({"restarted": link.config(20).epoch}) + "\n")
+        link.flush(5)
+
+
+def work(link, steps, pause, made, log):
+    link.config(20)
+    version = -1
+    while True:
+        ticket = link.acquire_ticket(1.0)
+        if ticket is None:
+            continue
+        pulled = link.weights(version)
+        version = pulled.meta["version"] if pulled else version
+        time.sleep(pause)
+        future = link.upload(rollout(steps, len(made) % 1000, version), ticket)
+        entry = {"incarnation": link.incarnation, "sequence": len(made)}
+        made.append(future)
+        future.add_done_callback(
+            lambda f, entry=entry: log.write(json.dumps({**entry, "outcome": outcome_of(f)}) + "\n")
+        )
+
+
+def outcome_of(future):
+    error = future.exception()
+    return "unknown" if error else future.result()
+
+
+def jump_about():
+    """From now on, this process cannot trust its wall clock."""
+    honest, rng = time.time, random.Random(0)
+    time.time = lambda: honest() + rng.uniform(-1, 1) * 30 * 86400
+    time.time_ns = lambda: int(1e9 * time.time())
+
+
+# --- what a test has in hand ---
+
+
+class Cluster:
+    """Processes of one test, and a look at the learner from outside."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.port = base_port()
+        self.endpoint = f"tcp/127.0.0.1:{self.port}"
+        self.checkpoint = folder / "checkpoint"
+        self.options = {}
+        """Of all processes that are started from now on."""
+        self.processes = []
+        self.observer = None
+
+    def start(self, role, endpoint=None, **options):
+        """Starts a process; options are those of its function in this file, or `clock`."""
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        arguments = {"folder": str(self.folder), "endpoint": endpoint or self.endpoint, **self.options, **options}
+        process = subprocess.Popen(
+            [sys.executable, __file__, role, json.dumps(arguments)],
+            env=environment, stdout=subprocess.PIPE, stderr=(self.folder / f"{role}.err").open("ab"),
+        )  # fmt: skip
+        self.processes.append(process)
+        return process
+
+    def start_learner(self, **options):
+        process = self.start("learner", **options)
+        assert process.stdout.readline() == b"ready\n", (self.folder / "learner.err").read_text()
+        if self.observer is None:
+            self.observer = ZenohTransport(connect=[self.endpoint], max_message=LIMIT)
+        return process
+
+    def start_actor(self, name="a", **options):
+        return self.start("actor", name=name, **options)
+
+    def status(self):
+        try:
+            return self.observer.query(KEYS.status, Message(), timeout=2).meta
+        except TransportError:
+            return None
+
+    def wait(self, condition, timeout=15.0):
+        """Polls the learner's status until it is as wanted."""
+        deadline = time.monotonic() + timeout
+        while True:
+            status = self.status()
+            if status and condition(status):
+                return status
+            errors = "".join(path.read_text() for path in self.folder.glob("*.err"))
+            assert time.monotonic() < deadline, f"not in time: {status} {errors}"
+            time.sleep(0.02)
+
+    def wait_for_updates(self, count, timeout=15.0):
+        """Until the learner has published so many more versions."""
+        version = self.wait(bool, timeout)["version"]
+        return self.wait(lambda status: status["version"] >= version + count, timeout)
+
+    def outcomes(self, name="a"):
+        return [json.loads(line) for line in (self.folder / f"{name}.log").read_text().splitlines()]
+
+    def stop(self, learner):
+        """Ends the learner and the actors gently; returns what the learner found in its books, and the audit's counts.
+
+        Whatever happened before: nothing that was accepted is lost, duplicated or torn.
+        """
+        for process in self.processes:  # those that a test has stopped must hear of the end
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+        learner.terminate()
+        assert learner.wait(10) == 0, (self.folder / "learner.err").read_text()
+        for process in self.processes:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10)
+        report = audit(self.folder)
+        assert not report.faults and not any(report.counts[name] for name in FAULTS), report
+        assert report.lag_max <= report.max_staleness == 1 and report.lag_mean <= 1
+        assert report.counts["used"] > 0
+        return json.loads((self.folder / "final").read_text()), report.counts
+
+    def close(self):
+        for process in self.processes:
+            process.kill()
+            process.communicate()
+        if self.observer:
+            self.observer.close()
+
+
+class Proxy:
+    """A network between actors and the learner that can be made silent or slow."""
+
+    def __init__(self, port):
+        """Forwards to the learner's ports, from `endpoint` on."""
+        first = base_port()
+        self.endpoint = f"tcp/127.0.0.1:{first}"
+        self.bytes_per_second = float("inf")
+        self._open, self._ended = threading.Event(), threading.Event()
+        self._open.set()
+        self._sockets = []
+        for i in range(len(FLOWS)):
+            listener = socket.create_server(("127.0.0.1", first + i))
+            self._sockets.append(listener)
+            threading.Thread(target=self._accept, args=(listener, port + i), daemon=True).start()
+
+    def silence(self):
+        """Nothing passes any more, and nobody is told."""
+        self._open.clear()
+
+    def restore(self):
+        self._open.set()
+
+    def close(self):
+        self._ended.set()
+        self._open.set()
+        for one in self._sockets:
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+
+    def _accept(self, listener, port):
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = listener.accept()
+                self._open.wait()
+                far = socket.create_connection(("127.0.0.1", port))
+                self._sockets += [near, far]
+                for source, sink in ((near, far), (far, near)):
+                    threading.Thread(target=self._pump, args=(source, sink), daemon=True).start()
+
+    def _pump(self, source, sink):
+        with contextlib.suppress(OSError):
+            while (data := source.recv(1 << 14)) and not self._ended.is_set():
+                self._open.wait()
+                time.sleep(len(data) / self.bytes_per_second)
+                sink.sendall(data)
+        for one in (source, sink):
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+
+
+def base_port():
+    while True:
+        base = random.randrange(15000, 30000)
+        with contextlib.suppress(OSError):
+            for port in range(base, base + len(FLOWS)):
+                with socket.socket() as probe:
+                    probe.bind(("127.0.0.1", port))
+            return base
+
+
+if __name__ == "__main__":
+    given = json.loads(sys.argv[2])
+    if given.pop("clock", "") == "jumps":
+        jump_about()
+    {"learner": run_learner, "actor": run_actor}[sys.argv[1]](pathlib.Path(given.pop("folder")), **given)

@@ -1,0 +1,152 @@
+"""What becomes of accepted rollouts when processes are killed and stopped, links fail, and clocks jump.
+
+Every test ends with the audit of `Cluster.stop`: nothing that was accepted is lost, duplicated or torn, and nothing was
+learnt from that is older than the cap.
+"""
+
+import signal
+import time
+
+import pytest
+
+from common.wire.codec import Message
+from tests.cluster import KEYS, Proxy, T, rollout
+
+pytestmark = pytest.mark.timeout(90)
+
+
+def names(status):
+    return {role["id"] for role in status["roles"] if role["role"] == "actor"}
+
+
+def contributions(status):
+    return {role["id"]: role["rollouts"] for role in status["roles"] if "rollouts" in role}
+
+
+def test_a_killed_learner_costs_nobody_a_rollout(cluster):
+    """Killed with rollouts in its queue and in its update, each time; actors send them again, and all are used."""
+    cluster.options["pause"] = 0.05
+    learner = cluster.start_learner()
+    for name in ("a", "b"):
+        cluster.start_actor(name)
+    for _ in range(3):
+        cluster.wait_for_updates(3)
+        cluster.wait(lambda status: status["queue"]["length"])
+        learner.kill()
+        learner.wait(5)
+        learner = cluster.start_learner()
+    cluster.wait_for_updates(3)
+    final, counts = cluster.stop(learner)
+    assert counts["used"] + counts.get("waiting", 0) + counts.get("dropped as too old", 0) == counts["accepted"]
+    assert final["ledger"]["missing"] <= counts.get("unanswered", 0)
+
+
+def test_updates_that_die_before_a_checkpoint_are_undone_and_counted(cluster):
+    learner = cluster.start_learner(every=1000)
+    cluster.start_actor()
+    cluster.wait_for_updates(4)
+    learner.kill()
+    learner.wait(5)
+    cluster.checkpoint.write_text('{"durable": null, "history": [], "version": 0}')
+    learner = cluster.start_learner(every=1)
+    cluster.wait_for_updates(3)
+    final, counts = cluster.stop(learner)
+    assert counts["undone"] >= 4
+    assert final["ledger"]["undone"] >= counts["undone"]  # some of them were sent again in time
+
+
+def test_actors_and_learner_stopped_for_fifteen_seconds(cluster):
+    learner = cluster.start_learner()
+    stopped = cluster.start_actor("a")
+    cluster.start_actor("b")
+    cluster.wait(lambda status: len(contributions(status)) == 2)
+    stopped.send_signal(signal.SIGSTOP)
+    began = time.monotonic()
+    status = cluster.wait(lambda status: names(status) == {"b"}, timeout=10)
+    before = status["ledger"]["accepted"]
+    cluster.wait(lambda status: status["ledger"]["accepted"] >= before + 4)  # nobody waits for it
+    learner.send_signal(signal.SIGSTOP)
+    time.sleep(15)
+    learner.send_signal(signal.SIGCONT)
+    stopped.send_signal(signal.SIGCONT)
+    assert time.monotonic() - began > 15
+    before = cluster.wait(lambda status: len(contributions(status)) == 2)
+    cluster.wait(
+        lambda status: all(contributions(status).get(name, 0) > contributions(before)[name] for name in ("a", "b"))
+    )
+    cluster.stop(learner)
+
+
+@pytest.fixture
+def proxy(cluster):
+    made = Proxy(cluster.port)
+    yield made
+    made.close()
+
+
+def test_a_link_that_goes_silent_is_noticed_and_comes_back(cluster, proxy):
+    learner = cluster.start_learner()
+    cluster.start_actor("a", endpoint=proxy.endpoint)
+    cluster.start_actor("b")
+    cluster.wait(lambda status: contributions(status).get("a", 0) > 3 and "b" in contributions(status))
+    proxy.silence()
+    status = cluster.wait(lambda status: names(status) == {"b"}, timeout=10)
+    before = status["ledger"]["accepted"]
+    status = cluster.wait(lambda status: status["ledger"]["accepted"] >= before + 4)
+    proxy.restore()
+    came = cluster.wait(lambda status: "a" in contributions(status), timeout=20)
+    cluster.wait(lambda status: contributions(status).get("a", 0) > contributions(came)["a"])
+    cluster.stop(learner)
+
+
+def test_a_slow_link_slows_its_actor_alone(cluster, proxy):
+    """Two rollouts take some five seconds, longer than the three that the actor allows other requests."""
+    cluster.options["steps"] = 400  # 560 kB
+    proxy.bytes_per_second = 220e3
+    learner = cluster.start_learner(pause=0.3)
+    cluster.start_actor("slow", endpoint=proxy.endpoint)
+    cluster.start_actor("fast")
+    cluster.wait(lambda status: "slow" in names(status) and contributions(status).get("fast", 0) > 3)
+    cluster.wait_for_updates(3)  # for which nobody has to wait
+    status = cluster.wait(lambda status: cluster.outcomes("slow"), 30)
+    assert {entry["outcome"] for entry in cluster.outcomes("slow")} <= {"accepted", "stale"}
+    assert status["ledger"]["duplicate"] == 0  # once is enough
+    cluster.stop(learner)
+
+
+def test_wall_clocks_do_not_matter(cluster):
+    """The clocks of learner and actor jump by weeks with every look at them."""
+    learner = cluster.start_learner(clock="jumps")
+    cluster.start_actor("a", clock="jumps")
+    cluster.start_actor("b")
+    cluster.wait_for_updates(10)
+    status = cluster.wait(lambda status: min(contributions(status).values(), default=0) > 3)
+    assert status["ledger"]["expired"] == 0
+    cluster.stop(learner)
+
+
+def test_replayed_rollouts_and_tickets_of_others_change_nothing(cluster):
+    learner = cluster.start_learner(pause=0.2)
+    cluster.start_actor()
+    cluster.wait(lambda status: status["ledger"]["accepted"] >= 4)
+    (who,) = (role for role in cluster.status()["roles"] if role["id"] == "a")
+    mine = {"actor": "a", "incarnation": who["incarnation"], "epoch": "e", "ticket": "x"}
+
+    def replay(**meta):
+        other = rollout(T, 77, cluster.status()["version"])  # under the name of one that was accepted
+        message = Message(other.arrays, {**other.meta, **mine, **meta})
+        return cluster.observer.query(KEYS.rollout("a"), message, timeout=5).meta["outcome"]
+
+    assert [replay(sequence=sequence) for sequence in range(3)] == ["duplicate"] * 3
+    assert replay(sequence=0, epoch="another") == "stale"
+    asked = {"actor": "b", "incarnation": "01", "ticket": "y"}
+    cluster.wait(
+        lambda status: cluster.observer.query(KEYS.ticket("b"), Message(meta=asked), timeout=5).meta["granted"]
+    )
+    for thief in ({**asked, "actor": "c"}, {**asked, "incarnation": "02"}):
+        cluster.observer.query(KEYS.ticket(thief["actor"]), Message(meta={**thief, "give_back": True}), timeout=5)
+    assert cluster.status()["ledger"]["returned"] == 0
+    cluster.observer.query(KEYS.ticket("b"), Message(meta={**asked, "give_back": True}), timeout=5)
+    assert cluster.status()["ledger"]["returned"] == 1
+    final, _ = cluster.stop(learner)
+    assert final["ledger"]["duplicate"] == 3
