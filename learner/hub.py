@@ -10,7 +10,6 @@ overtaken, until they arrive. All others are in the ledger once: as consumed, dr
 """
 
 import collections
-import dataclasses
 import secrets
 import threading
 import time
@@ -23,52 +22,15 @@ from common.transport.keys import Alive, Keys, check_name, parse_alive
 from common.wire.codec import Message, SharedMessage
 from common.wire.messages import TICKET, RolloutForm, RolloutHeader, validate, validate_bundle, validate_rollout
 from learner.audit import AuditLog
+from learner.limits import DAMAGED, Credit, certificate
+from learner.marks import Marks
 from learner.staleness import Owner, StalenessManager
 
 _INCARNATIONS = 1024  # whose marks are kept
-_WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
 _EVENT_SECONDS = 1.0  # between two events of one kind
 _RETURN_SECONDS = 1.0  # that actors have after a resume to send again what the last life had accepted
-
-
-@dataclasses.dataclass
-class _Marks:
-    """Which rollouts of an incarnation were decided on: all below `next` but those skipped, and those in `ahead`."""
-
-    next: int = 0
-    ahead: set[int] = dataclasses.field(default_factory=set)
-    refused: set[int] = dataclasses.field(default_factory=set)
-    """Those among them that were refused, as far as they are recent; the others were accepted."""
-    skipped: int = 0
-    """Sequence numbers below `next` that never came."""
-    rollouts: int = 0
-    version: int = -1
-
-    def __contains__(self, sequence: int) -> bool:
-        return sequence < self.next or sequence in self.ahead
-
-    def add(self, header: RolloutHeader, accepted: bool) -> None:
-        if accepted:
-            self.rollouts += 1
-            self.version = header.version
-        else:
-            self.refused.add(header.sequence)
-        self.ahead.add(header.sequence)
-        if len(self.ahead) > _WINDOW:
-            self.skipped += min(self.ahead) - self.next
-            self.next = min(self.ahead)
-        while self.next in self.ahead:
-            self.ahead.remove(self.next)
-            self.next += 1
-        if len(self.refused) > _WINDOW:
-            self.refused.remove(min(self.refused))
-
-    @property
-    def missing(self) -> int:
-        """Sequence numbers below the highest that are not decided on."""
-        return self.skipped + max(self.ahead, default=self.next - 1) + 1 - self.next - len(self.ahead)
 
 
 class LearnerHub:
@@ -121,7 +83,7 @@ class LearnerHub:
         self._name, self._on_event = check_name("learner", name), on_event
         self._changed = threading.Condition()
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
-        self._marks: collections.OrderedDict[Owner, _Marks] = collections.OrderedDict()
+        self._marks: collections.OrderedDict[Owner, Marks] = collections.OrderedDict()
         self._forgotten_missing = 0
         self._bundle: SharedMessage | None = None
         self._alive: set[Alive] = set()
@@ -131,15 +93,24 @@ class LearnerHub:
         self._audit = audit
         self._saved = 0 if durable is None else durable["version"]
         self._held_until = 0.0 if durable is None else float("inf")
+        self._credit = Credit()
         if durable is not None:
             self._restore(durable)
         if audit is not None:
             staleness.note_undone(audit.begin(self.life, epoch, staleness.version, staleness.max_staleness))
         transport.serve(self.keys.config, self._on_config)
-        transport.serve(self.keys.tickets, self._on_ticket, depth=64)
+        charging, turnstile = self._credit.charging, self._turnstile
+        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, turnstile=turnstile)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
         transport.serve(self.keys.weights, self._on_weights, workers=2, depth=16)
-        transport.serve(self.keys.rollouts, self._on_rollout, workers=2, depth=8, on_damage=self._on_damage)
+        transport.serve(
+            self.keys.rollouts,
+            charging(self._on_rollout),
+            workers=2,
+            depth=8,
+            on_damage=self._on_damage,
+            turnstile=turnstile,
+        )
         transport.watch_alive(self.keys.everyone, self._on_alive)
         transport.declare_alive(self.keys.alive("learner", name, self.life))
 
@@ -217,7 +188,7 @@ class LearnerHub:
                 "roles": roles,
                 "rates": _rates([steps for *_, steps in self._arrivals], span),
                 "queue": {"length": len(self._queue), "limit": self._limit},
-                "ledger": self._staleness.ledger() | {"missing": missing},
+                "ledger": self._staleness.ledger() | {"missing": missing, "turned_away": self._credit.turned_away},
             }
 
     def durable(self) -> dict[str, Any]:
@@ -248,7 +219,7 @@ class LearnerHub:
         self._staleness.restore(durable["ledger"], durable["version"])
         self._forgotten_missing = durable["forgotten_missing"]
         for actor, incarnation, start, ahead, refused, skipped in durable["marks"]:
-            self._marks[actor, incarnation] = _Marks(start, set(ahead), set(refused), skipped)
+            self._marks[actor, incarnation] = Marks(start, set(ahead), set(refused), skipped)
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1
@@ -331,12 +302,13 @@ class LearnerHub:
     def _answer(self, outcome: str, *, why: str = "") -> Message:
         return Message(meta={**self._state(), "outcome": outcome, "why": why, "retry_after": _RETRY_SECONDS})
 
-    def _marks_of(self, owner: Owner) -> _Marks:
-        marks = self._marks.setdefault(owner, _Marks())
+    def _marks_of(self, owner: Owner) -> Marks:
+        marks = self._marks.setdefault(owner, Marks())
         self._marks.move_to_end(owner)
         if len(self._marks) > _INCARNATIONS:
-            _, oldest = self._marks.popitem(last=False)
-            self._forgotten_missing += oldest.missing
+            # Whoever has many incarnations displaces his own, so that nobody makes the learner forget another's.
+            mine = (of for of in self._marks if of != owner and certificate(of[0]) == certificate(owner[0]))
+            self._forgotten_missing += self._marks.pop(next(mine, next(iter(self._marks)))).missing
         return marks
 
     def _forget_arrivals(self, now: float) -> None:
@@ -357,7 +329,15 @@ class LearnerHub:
         actors = ", ".join(sorted({header.actor for header in stale}))
         self._event("warning", f"Dropped as too old at version {self._staleness.version}: {len(stale)} of {actors}.")
 
+    def _turnstile(self, key: str) -> Message | None:
+        if self._credit.admits(key):
+            return None
+        self._event("warning", f"Too many useless requests of {_sender(key)}: turned away.", kind="turned away")
+        retry = self._answer("retry", why="Too many of your requests were of no use.")
+        return Message(meta={**retry.meta, "granted": False})
+
     def _on_damage(self, key: str, error: CongraspError) -> None:
+        self._credit.charge(key, DAMAGED)
         self._staleness.refuse_damaged()
         self._event("warning", f"A damaged message arrived at {key}: {error}", kind="damaged")
 

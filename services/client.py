@@ -1,5 +1,7 @@
 """The client of a policy server, for a robot's control loop: needs nothing but numpy and zenoh."""
 
+import os
+import pathlib
 import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -7,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.transport.keys import Keys
+from common.transport.security import Credentials
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 
@@ -38,7 +41,14 @@ class PolicyClient:
     """
 
     def __init__(
-        self, connect: str, run: str = "policy", *, hand: str = "human", timeout: float = 1.0, wait: float = 10.0
+        self,
+        connect: str,
+        run: str = "policy",
+        *,
+        hand: str = "human",
+        timeout: float = 1.0,
+        wait: float = 10.0,
+        certs: str | os.PathLike[str] | None = None,
     ):
         """Connects; when the server goes away and comes back, so does the connection.
 
@@ -48,11 +58,13 @@ class PolicyClient:
           hand: name of the hand that is to be controlled; a server with another hand's policy refuses.
           timeout: seconds that one call may take.
           wait: seconds to wait for the server to appear.
+          certs: folder of a client's certificate, for a server that asks for one.
 
         Raises:
           TransportError: nobody is there.
         """
-        self._transport = ZenohTransport(connect=[connect], flows=("policy",), wait=wait)
+        credentials = None if certs is None else Credentials(pathlib.Path(certs), "client")
+        self._transport = ZenohTransport(connect=[connect], flows=("policy",), wait=wait, credentials=credentials)
         self._keys, self._hand, self._timeout = Keys(run), hand, timeout
         self._episode: dict[str, np.ndarray] = {}
         self._constraints: list[str] = []

@@ -93,14 +93,20 @@ def example_episode(seed: int) -> dict[str, Any]:
 
 
 def measure(
-    connect: str, name: str, episode: dict[str, Any], repeat: int, concurrency: int, timeout: float
+    connect: str,
+    name: str,
+    episode: dict[str, Any],
+    repeat: int,
+    concurrency: int,
+    timeout: float,
+    certs: pathlib.Path | None = None,
 ) -> dict[str, float]:
     """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is not counted."""
     share = max(1, repeat // concurrency)
 
     def ask(_: int) -> tuple[list[float], int, int]:
         times, failed, overloaded = [], 0, 0
-        with PolicyClient(connect, name, timeout=timeout) as client:
+        with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
             client.reset(**episode["reset"])
             client.act(episode["state"])
             for _ in range(share):

@@ -20,8 +20,10 @@ from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.shipped import shipped
+from common.transport.zenoh_transport import DEFAULT_ENDPOINT
 from learner import update as updates
 from learner.process import LOGS, POLICY_FILE, create_run, open_run
+from services.access import check_training
 from services.client import PolicyClient
 from services.evaluate import Evaluator
 from services.load import example_episode, one_answer, serving, wait_until_ready
@@ -50,10 +52,18 @@ def run_training(
     evaluation: int,
     initial: pathlib.Path | None = None,
     metrics_port: int = 0,
+    listen: str | None = None,
+    certs: pathlib.Path | None = None,
+    insecure: bool = False,
 ) -> int:
     """Trains, evaluates and shows; returns the exit code. With no actor processes everything is in this one."""
     if actors is not None and actors < 0:
         raise CongraspError(f"--actors is {actors}.", "Name a number of actor processes, or 0 for none of their own.")
+    if listen is not None or certs is not None:
+        check_training(listen or DEFAULT_ENDPOINT, certs, insecure=insecure)
+        if actors == 0:
+            raise CongraspError("With --actors 0 nothing listens.", "Leave out --listen and --certs, or --actors.")
+        actors = actors or 2
     physics = resolve_physics(config.physics)
     if actors is None:
         actors = 0 if physics == "warp" else 2
@@ -102,6 +112,9 @@ def run_training(
                         physics=physics,
                         stop=stop,
                         metrics_port=metrics_port,
+                        endpoint=listen,
+                        certs=certs,
+                        insecure=insecure,
                         report=progress.show,
                         notify=lambda text: console.print(f"  [yellow]{text}[/]", soft_wrap=True),
                     )

@@ -11,6 +11,7 @@ from rich.console import Console
 from common.errors import CongraspError
 from common.logs.recorder import Recorder
 from common.transport.keys import Keys, process_name
+from common.transport.security import Credentials
 from common.transport.zenoh_transport import ZenohTransport
 from services.live import LiveServer
 from services.logs import say
@@ -26,6 +27,7 @@ def record_run(
     live: int | None = None,
     duration: float | None = None,
     structured: bool = False,
+    credentials: Credentials | None = None,
 ) -> int:
     """Records until `duration` seconds have passed, Ctrl-C, or, without a live view, the disk refuses.
 
@@ -36,6 +38,7 @@ def record_run(
       live: port of the live view, or None.
       duration: seconds, or None.
       structured: speak through the log alone, without a progress line.
+      credentials: of an observer, or None.
 
     Returns:
       Zero.
@@ -47,7 +50,7 @@ def record_run(
     complain = functools.partial(say, "warning") if structured else lambda text: console.print(f"congrasp: {text}")
     end = time.monotonic() + duration if duration is not None else None
     with contextlib.ExitStack() as stack:
-        transport = stack.enter_context(ZenohTransport(connect=[connect]))
+        transport = stack.enter_context(ZenohTransport(connect=[connect], credentials=credentials))
         server = stack.enter_context(LiveServer(live)) if live is not None else None
         if server is not None:
             console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")

@@ -18,7 +18,9 @@ from common.errors import CongraspError, TransportError
 from common.journal import AUDIT
 from common.transport.keys import FLOWS, Keys
 from common.transport.memory import MemoryHub, MemoryTransport
+from common.transport.security import Credentials
 from common.transport.zenoh_transport import ZenohTransport
+from services.access import credentials, nearby
 from services.shutdown import GRACE, PARENT_VARIABLE
 
 MAX_RESTARTS = 5
@@ -68,6 +70,8 @@ def train(
     physics: PhysicsName,
     stop: threading.Event,
     endpoint: str | None = None,
+    certs: pathlib.Path | None = None,
+    insecure: bool = False,
     report: Report = lambda status: None,
     notify: Callable[[str], None] = lambda text: None,
     metrics_port: int = 0,
@@ -83,6 +87,8 @@ def train(
       physics: engine of the actors.
       stop: drains everything within a few seconds when set.
       endpoint: where the learner listens; a free port of the loopback interface by default.
+      certs: an authority's folder, for mutual TLS.
+      insecure: listen beyond loopback without certificates.
       report: shows progress.
       notify: told in words when something is restarted.
       metrics_port: port of the learner's Prometheus endpoint on the loopback interface; 0 for none.
@@ -91,21 +97,23 @@ def train(
       CongraspError: a process failed for good; its last words are in the message.
     """
     endpoint = endpoint or f"tcp/127.0.0.1:{free_port()}"
+    connect, secure = nearby(endpoint), [] if certs is None else ["--certs", str(certs)]
+    listen = [endpoint, *secure, *(["--insecure"] if insecure else [])]
     logs = run_dir / "logs"
     logs.mkdir(exist_ok=True)
     threads = max(1, (os.cpu_count() or 1) // max(1, actors))
-    arguments = ["learner", "--run-dir", str(run_dir), "--listen", endpoint, "--resume"]
+    arguments = ["learner", "--run-dir", str(run_dir), "--resume", "--listen", *listen]
     learner = Child("learner", [*arguments, "--metrics-port", str(metrics_port)], logs / "learner.log")
     children = [learner]
     for number in range(actors):
         name = f"actor-{number}"
-        arguments = ["actor", "--connect", endpoint, "--run", config.name, "--id", name, "--physics", physics]
+        arguments = ["actor", "--connect", connect, "--run", config.name, "--id", name, "--physics", physics, *secure]
         arguments += ["--audit", str(run_dir / AUDIT / f"{name}.jsonl")]
         children.append(Child(name, [*arguments, "--threads", str(threads)], logs / f"{name}.log"))
     try:
         for child in children:
             child.start()
-        transport = _connected(endpoint, learner, stop)
+        transport = _connected(connect, learner, stop, credentials(certs, "observer"))
         if transport is not None:
             with transport:
                 _supervise(children, transport, config.name, stop, report, notify)
@@ -113,12 +121,14 @@ def train(
         end_all(children)
 
 
-def _connected(endpoint: str, learner: Child, stop: threading.Event) -> ZenohTransport | None:
+def _connected(
+    endpoint: str, learner: Child, stop: threading.Event, secrets: Credentials | None
+) -> ZenohTransport | None:
     """A connection to the learner once it listens; None if the run is stopped before."""
     deadline = time.monotonic() + 120.0
     while time.monotonic() < deadline and not stop.is_set():
         try:
-            return ZenohTransport(connect=[endpoint], wait=_POLL)
+            return ZenohTransport(connect=[endpoint], wait=_POLL, credentials=secrets)
         except TransportError:
             assert learner.process is not None
             if learner.process.poll() not in (None, 0):

@@ -13,6 +13,8 @@ Handler = Callable[[str, Message], Message]
 """(key, request) -> reply."""
 Damage = Callable[[str, CongraspError], None]
 """(key, what is wrong): a request arrived that could not be decoded."""
+Turnstile = Callable[[str], Message | None]
+"""key -> the reply with which a request is turned away before anyone looks at it, or None to let it pass."""
 
 
 class RefusedError(TransportError):
@@ -75,7 +77,14 @@ class Transport(Protocol):
     """One process's end of the wire."""
 
     def serve(
-        self, key: str, handler: Handler, *, workers: int = 1, depth: int = 4, on_damage: Damage | None = None
+        self,
+        key: str,
+        handler: Handler,
+        *,
+        workers: int = 1,
+        depth: int = 4,
+        on_damage: Damage | None = None,
+        turnstile: Turnstile | None = None,
     ) -> None:
         """Answers queries.
 
@@ -85,6 +94,7 @@ class Transport(Protocol):
           workers: threads that run the handler.
           depth: queries that wait; further ones wait at their senders.
           on_damage: told about requests that cannot be decoded, which are refused without asking the handler.
+          turnstile: asked before a request is decoded; it may send it away with a reply.
         """
         ...
 

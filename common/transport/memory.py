@@ -13,7 +13,7 @@ from concurrent.futures import Future
 from typing import NamedTuple, Self
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Damage, Handler, RefusedError, Subscription
+from common.transport.base import Damage, Handler, RefusedError, Subscription, Turnstile
 from common.transport.keys import matches
 from common.wire.codec import Message
 
@@ -68,7 +68,14 @@ class MemoryTransport:
         self._closed = False
 
     def serve(
-        self, key: str, handler: Handler, *, workers: int = 1, depth: int = 4, on_damage: Damage | None = None
+        self,
+        key: str,
+        handler: Handler,
+        *,
+        workers: int = 1,
+        depth: int = 4,
+        on_damage: Damage | None = None,
+        turnstile: Turnstile | None = None,
     ) -> None:
         """See `Transport.serve`; nothing is ever damaged here."""
         self._check_open()
@@ -77,7 +84,8 @@ class MemoryTransport:
             self._hub.servers.append(server)
         self._servers.append(server)
         for _ in range(workers):
-            threading.Thread(target=_serve, args=(server, handler), daemon=True, name=f"memory-{key}").start()
+            arguments = server, handler, turnstile or (lambda _: None)
+            threading.Thread(target=_serve, args=arguments, daemon=True, name=f"memory-{key}").start()
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
@@ -183,13 +191,14 @@ def _refuse_waiting(server: _Server) -> None:
             server.questions.put_nowait(None)
 
 
-def _serve(server: _Server, handler: Handler) -> None:
+def _serve(server: _Server, handler: Handler, turnstile: Turnstile) -> None:
     while not server.ended.is_set():
         question = server.questions.get()
         if question is None:
             continue
         try:
-            question.answer.set_result(handler(question.key, question.request))
+            turned_away = turnstile(question.key)
+            question.answer.set_result(turned_away or handler(question.key, question.request))
         except CongraspError as error:
             question.answer.set_exception(RefusedError(str(error)))
         except Exception as error:

@@ -24,8 +24,9 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Damage, Handler, RefusedError, Subscription
+from common.transport.base import Damage, Handler, RefusedError, Subscription, Turnstile
 from common.transport.keys import FLOWS, Flow, flow
+from common.transport.security import Credentials, refusal, secured
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -52,7 +53,7 @@ class ZenohTransport:
         flows: Sequence[Flow] = FLOWS,
         max_message: int = MAX_MESSAGE,
         wait: float = 10.0,
-        extra: Mapping[str, Any] | None = None,
+        credentials: Credentials | None = None,
     ):
         """Opens the sessions.
 
@@ -63,15 +64,17 @@ class ZenohTransport:
           flows: which flows to open; flow i uses the port i above the endpoint's, so both ends must start alike.
           max_message: bytes of the longest message.
           wait: seconds to wait for somebody to listen at `connect`.
-          extra: Zenoh configuration keys and their JSON values, set last (TLS, access control).
+          credentials: everything goes over mutual TLS with these; one that listens allows each role what
+            `common.transport.security` gives it, and nothing else.
 
         Raises:
-          CongraspError: an endpoint or key is malformed, or a port is in use.
+          CongraspError: an endpoint or key is malformed, a port is in use, or the certificates are not accepted.
           TransportError: nobody answers.
         """
         if bool(connect) == bool(listen):
             raise CongraspError("A transport needs endpoints either to connect to or to listen on.")
-        endpoints = {name: [_shifted(one, i) for one in (connect or listen)] for i, name in enumerate(flows)}
+        wanted = [secured(one, credentials) for one in (connect or listen)]
+        endpoints = {name: [_shifted(one, i) for one in wanted] for i, name in enumerate(flows)}
         self._max_message = max_message
         self._sender = secrets.token_bytes(8)
         self._counts: dict[str, int] = {}
@@ -82,20 +85,31 @@ class ZenohTransport:
         deadline = time.monotonic() + wait
         try:
             for name, where in endpoints.items():
-                config = _config(name, where, bool(listen), max_message, extra or {})
-                self._work.sessions[name] = _listen(config, where) if listen else _connect(config, where, deadline)
+                secure = credentials.settings(name, listens=bool(listen)) if credentials else {}
+                config = _config(name, where, bool(listen), max_message, secure)
+                self._work.sessions[name] = (
+                    _listen(config, where) if listen else _connect(config, where, deadline, credentials)
+                )
         except BaseException:
             self.close()
             raise
 
     def serve(
-        self, key: str, handler: Handler, *, workers: int = 1, depth: int = 4, on_damage: Damage | None = None
+        self,
+        key: str,
+        handler: Handler,
+        *,
+        workers: int = 1,
+        depth: int = 4,
+        on_damage: Damage | None = None,
+        turnstile: Turnstile | None = None,
     ) -> None:
         """See `Transport.serve`."""
         queryable = self._session(key).declare_queryable(key, FifoChannel(depth))
         self._declared.append(queryable)
+        hooks = on_damage or (lambda *_: None), turnstile or (lambda _: None)
         for _ in range(workers):
-            self._work.start(_serve, queryable.handler, handler, on_damage or (lambda *_: None), self._max_message)
+            self._work.start(_serve, queryable.handler, handler, *hooks, self._max_message)
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
@@ -289,11 +303,16 @@ def _listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
         raise CongraspError(f"Cannot listen on {where}: {_first_line(error)}.") from None
 
 
-def _connect(config: zenoh.Config, endpoints: list[str], deadline: float) -> zenoh.Session:
+def _connect(
+    config: zenoh.Config, endpoints: list[str], deadline: float, credentials: Credentials | None
+) -> zenoh.Session:
     while True:
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
+            refusals = [refusal(one, credentials) for one in endpoints]
+            if all(refusals) and refusals[0]:
+                raise refusals[0] from None
             if time.monotonic() >= deadline:
                 where = ", ".join(endpoints)
                 remedy = "Start the learner or the server there, or correct the address."
@@ -314,10 +333,13 @@ def _received(channel: Any) -> Iterator[Any]:
             yield channel.recv()
 
 
-def _serve(queries: Any, handler: Handler, on_damage: Damage, max_message: int) -> None:
+def _serve(queries: Any, handler: Handler, on_damage: Damage, turnstile: Turnstile, max_message: int) -> None:
     for query in _received(queries):
         with contextlib.suppress(zenoh.ZError), query:
             key = str(query.key_expr)
+            if (turned_away := turnstile(key)) is not None:
+                query.reply(key, encode(turned_away))
+                continue
             try:
                 request = decode(query.payload.to_bytes() if query.payload else b"", max_bytes=max_message)
             except CongraspError as error:

@@ -18,6 +18,7 @@ def actor(
     patience: float = 60.0,
     audit: pathlib.Path | None = None,
     watch: Watched = Watch(),  # noqa: B008
+    certs: pathlib.Path | None = None,
 ) -> int:
     """One actor that works for a learner, on this machine or another; it may come and go while the learner trains.
 
@@ -30,6 +31,7 @@ def actor(
       patience: Seconds without a learner after which the actor gives up.
       audit: Journal of every rollout and the learner's answer to it, for 'congrasp audit'; nothing is written without.
       watch: How it is watched.
+      certs: Folder of an actor's certificate (congrasp certs), whose number its name on the wire begins with.
     """
     import os
 
@@ -37,11 +39,12 @@ def actor(
     from common.journal import Journal
     from common.transport.keys import process_name
     from common.transport.zenoh_transport import ZenohTransport
+    from services.access import acting
     from services.logs import say
     from services.metrics import ActorMetrics
     from services.shutdown import on_signal
 
-    name = id or process_name("actor")
+    credentials, name = acting(certs, id or process_name("actor"))
     metrics = ActorMetrics()
 
     def made(values: dict[str, float]) -> None:
@@ -51,7 +54,7 @@ def actor(
     with (
         watch.watched("actor", name, run, metrics),
         on_signal() as stop,
-        ZenohTransport(connect=[connect], wait=patience) as transport,
+        ZenohTransport(connect=[connect], wait=patience, credentials=credentials) as transport,
     ):
         say("info", f"Acts for {connect}.")
         run_actor(

@@ -26,7 +26,11 @@ class Learner:
     preset: str = "quickstart"
     """Named configuration to start from."""
     listen: str = "tcp/127.0.0.1:7447"
-    """Endpoint for the actors; bulk messages use the next port. Other machines need tcp/0.0.0.0:PORT."""
+    """Endpoint for the actors, which takes four ports from this one on. Other machines need tls/0.0.0.0:PORT."""
+    certs: pathlib.Path | None = None
+    """Folder of a learner's certificate (congrasp certs): mutual TLS, and each role may do only what is its own."""
+    insecure: bool = False
+    """Listen beyond loopback without certificates."""
     initial: pathlib.Path | None = None
     """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
     resume: bool = False
@@ -42,6 +46,7 @@ class Learner:
         from common.policy import bundle as bundles
         from common.transport.zenoh_transport import ZenohTransport
         from learner.process import LOGS, create_run, open_run, run_learner
+        from services.access import listening
         from services.logs import say
         from services.metrics import LearnerMetrics
         from services.shutdown import on_signal
@@ -49,7 +54,8 @@ class Learner:
 
         has_checkpoint = (self.run_dir / "checkpoints" / "latest").exists()
         config = open_run(self.run_dir) if self.resume else self.config
-        with on_signal() as stop, ZenohTransport(listen=[self.listen]) as transport:
+        credentials = listening(self.listen, self.certs, "learner", insecure=self.insecure)
+        with on_signal() as stop, ZenohTransport(listen=[self.listen], credentials=credentials) as transport:
             metrics = LearnerMetrics(functools.partial(ask, transport, config.name))
 
             def updated(values: dict[str, float]) -> None:

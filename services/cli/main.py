@@ -32,6 +32,7 @@ COMMANDS = {
     "status": "who works on a run, and how it goes",
     "audit": "what became of every rollout of a run",
     "bench": "benchmarks, as ratios against a reference",
+    "certs": "certificates for mutual TLS between the processes of a run",
     "doctor": "what is wrong with this machine or installation",
 }
 """Commands in the order of the help; `services.cli.<name>` is the module."""

@@ -1,5 +1,6 @@
 """`congrasp query`: one query of a policy server, or a latency test."""
 
+import pathlib
 from typing import Annotated
 
 import tyro
@@ -12,6 +13,7 @@ def query(
     repeat: int = 1,
     concurrency: int = 1,
     timeout: float = 1.0,
+    certs: pathlib.Path | None = None,
     json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Ask a policy server for one action at the start of an episode, or measure its latency.
@@ -23,22 +25,26 @@ def query(
       repeat: Queries in all.
       concurrency: Clients that ask at the same time, each with a connection of its own.
       timeout: Seconds that one query may take.
+      certs: Folder of a client's certificate (congrasp certs).
       json: Print JSON: p50_ms, p99_ms, answers_per_s, failed, overloaded.
     """
     import json as json_module
 
     from common.errors import CongraspError
+    from services.access import credentials
     from services.client import PolicyClient
     from services.load import example_episode, measure, one_answer
 
     if repeat < 1 or concurrency < 1:
         raise CongraspError(f"--repeat {repeat} and --concurrency {concurrency} must be at least 1.")
-    with PolicyClient(connect, name, timeout=timeout) as client:
+    mine = credentials(certs, "client")
+    certs = mine.folder if mine else None
+    with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
         episode = example_episode(object_seed)
         if repeat == 1 and not json:
             print(one_answer(client, episode))
             return 0
-    result = measure(connect, name, episode, repeat, concurrency, timeout)
+    result = measure(connect, name, episode, repeat, concurrency, timeout, certs)
     if json:
         print(json_module.dumps(result))
     else:

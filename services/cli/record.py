@@ -12,6 +12,7 @@ def record(
     live: int | None = None,
     duration: float | None = None,
     log_format: LogFormat = "text",
+    certs: pathlib.Path | None = None,
 ) -> int:
     """Record a run to MCAP, from this machine or another: metrics, events, versions, rollouts and episodes.
 
@@ -25,14 +26,16 @@ def record(
       live: Also offer everything to the Foxglove app on this port of the loopback interface: ws://127.0.0.1:PORT.
       duration: Seconds after which to stop; without it until Ctrl-C.
       log_format: Text, or one JSON object a line: time, level, role, id, run, text, fields.
+      certs: Folder of an observer's certificate (congrasp certs).
     """
     from common.transport.keys import process_name
+    from services.access import credentials
     from services.logs import logging_as
     from services.record import record_run
 
-    structured = log_format == "json"
+    structured, mine = log_format == "json", credentials(certs, "observer")
     with logging_as(log_format, role="recorder", id=process_name("recorder"), run=run):
-        return record_run(connect, run, out, live=live, duration=duration, structured=structured)
+        return record_run(connect, run, out, live=live, duration=duration, structured=structured, credentials=mine)
 
 
 COMMAND = record

@@ -13,6 +13,8 @@ def serve(
     listen: str = "tcp/127.0.0.1:7457",
     name: str = "policy",
     watch: Watched = Watch(),  # noqa: B008
+    certs: pathlib.Path | None = None,
+    insecure: bool = False,
 ) -> int:
     """Answer live queries with a policy file, or with the newest policy of a run while it trains.
 
@@ -24,6 +26,8 @@ def serve(
       listen: Endpoint for the clients.
       name: Name under which the policy is served.
       watch: How it is watched.
+      certs: Folder of a server's certificate (congrasp certs), for its clients and for the learner.
+      insecure: Listen beyond loopback without certificates.
     """
     import secrets
 
@@ -31,6 +35,7 @@ def serve(
     from common.policy.shipped import policy_file
     from common.transport.keys import Keys
     from common.transport.zenoh_transport import ZenohTransport
+    from services.access import listening
     from services.logs import say
     from services.metrics import ServerMetrics
     from services.server import PolicyServer, follow_file, follow_run
@@ -40,13 +45,13 @@ def serve(
         raise CongraspError(
             f"The server can follow either {policy} or {connect}.", "Give one of --policy and --connect."
         )
-    metrics = ServerMetrics()
+    metrics, credentials = ServerMetrics(), listening(listen, certs, "server", insecure=insecure)
     with watch.watched("server", name, run if connect else "", metrics), on_signal() as stop:
-        upstream = ZenohTransport(connect=[connect]) if connect else None
+        upstream = ZenohTransport(connect=[connect], credentials=credentials) if connect else None
         if upstream:
             upstream.declare_alive(Keys(run).alive("server", name, secrets.token_hex(4)))
         source = follow_run(upstream, run) if upstream else follow_file(policy_file(policy, hand))
-        with ZenohTransport(listen=[listen], flows=("policy",)) as transport:
+        with ZenohTransport(listen=[listen], flows=("policy",), credentials=credentials) as transport:
             server = PolicyServer(transport, name, source, on_answer=metrics.answer, on_batch=metrics.batch)
             metrics.health = server.health
             health = server.health()

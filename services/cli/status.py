@@ -1,5 +1,6 @@
 """`congrasp status`: a live run."""
 
+import pathlib
 from typing import Annotated
 
 import tyro
@@ -10,6 +11,7 @@ def status(
     run: str = "quickstart",
     watch: bool = False,
     every: float = 1.0,
+    certs: pathlib.Path | None = None,
     json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Who works on a run, and how it goes: versions, lag, rates, and what became of tickets and rollouts.
@@ -21,6 +23,7 @@ def status(
       run: Name of the run.
       watch: Go on until Ctrl-C, also while the learner is away.
       every: Seconds between two looks with --watch.
+      certs: Folder of an observer's certificate (congrasp certs).
       json: Print JSON instead of tables; with --watch one object a line, and null while the learner is away.
     """
     import json as json_module
@@ -29,9 +32,10 @@ def status(
     from rich.live import Live
 
     from common.transport.zenoh_transport import ZenohTransport
+    from services.access import credentials
     from services.status import ask, follow, tables
 
-    with ZenohTransport(connect=[connect]) as transport:
+    with ZenohTransport(connect=[connect], credentials=credentials(certs, "observer")) as transport:
         found = ask(transport, run)
         if not watch:
             if json:

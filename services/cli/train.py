@@ -31,6 +31,12 @@ class Train:
     """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
     resume: bool = False
     """Go on from the latest checkpoint in --run-dir."""
+    listen: str | None = None
+    """Endpoint where actors of other machines may join, such as tls/0.0.0.0:7447; on this machine alone by default."""
+    certs: pathlib.Path | None = None
+    """The authority's folder (congrasp certs), for mutual TLS."""
+    insecure: bool = False
+    """Listen beyond loopback without certificates."""
     evaluation: int = 64
     """Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out."""
     metrics_port: int = 0
@@ -49,6 +55,9 @@ class Train:
             initial=self.initial,
             evaluation=self.evaluation,
             metrics_port=self.metrics_port,
+            listen=self.listen,
+            certs=self.certs,
+            insecure=self.insecure,
         )
 
 

@@ -294,18 +294,6 @@ def test_absent_peer_is_an_error_with_a_deadline():
     assert time.monotonic() - start < 5
 
 
-def test_settings_are_passed_on_and_checked():
-    endpoint = f"tcp/127.0.0.1:{base_port()}"
-    with pytest.raises(CongraspError, match="no/such/key"):
-        ZenohTransport(listen=[endpoint], extra={"no/such/key": 1})
-    nothing = {"rules": [], "subjects": [], "policies": []}
-    deny = {"access_control": {"enabled": True, "default_permission": "deny", **nothing}}
-    with ZenohTransport(listen=[endpoint], extra=deny) as server, ZenohTransport(connect=[endpoint]) as client:
-        server.serve(KEYS.act, lambda key, message: message)
-        with pytest.raises(TransportError, match="Nobody"):
-            client.query(KEYS.act, Message(), timeout=1)
-
-
 def test_flows_decide_the_ports():
     base = base_port(1)
     with (
@@ -402,3 +390,14 @@ def test_process_always_ends(end, code):
     finally:
         process.kill()
         process.communicate()
+
+
+def test_a_turnstile_sends_requests_away_unread(pair):
+    server, client = pair
+    server.serve(
+        "congrasp/test/ticket/*",
+        lambda key, request: Message(meta={"read": True}),
+        turnstile=lambda key: Message(meta={"later": key}) if key.endswith("/b") else None,
+    )
+    assert client.query(KEYS.ticket("a"), Message(), timeout=5).meta == {"read": True}
+    assert client.query(KEYS.ticket("b"), Message(), timeout=5).meta == {"later": KEYS.ticket("b")}

@@ -15,7 +15,8 @@ from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
 from common.wire.messages import RolloutForm
-from learner.hub import LearnerHub, _Marks
+from learner.hub import LearnerHub
+from learner.marks import Marks
 from learner.staleness import StalenessManager
 from learner.update import collate
 
@@ -153,6 +154,7 @@ def test_batches_come_in_order_and_wait(bench):
     assert b.ledger() | {"capacity": 0} == {
         "granted": 0, "redeemed": 0, "returned": 0, "expired": 0, "accepted": 4, "consumed": 4, "dropped": 0,
         "stale": 0, "duplicate": 0, "damaged": 0, "undone": 0, "running": 0, "queued": 0, "capacity": 0, "missing": 0,
+        "turned_away": 0,
     }  # fmt: skip
 
 
@@ -356,7 +358,7 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 40), st.booleans()), max_size=120))
 def test_marks_are_exact_within_their_window(arrivals):
-    marks, decided = _Marks(), {}
+    marks, decided = Marks(), {}
     for sequence, accepted in arrivals:
         assert (sequence in marks) == (sequence in decided)
         assert (sequence in marks.refused) == (decided.get(sequence) is False)
@@ -368,7 +370,7 @@ def test_marks_are_exact_within_their_window(arrivals):
 
 
 def test_marks_stay_small_whatever_is_missing():
-    marks = _Marks()
+    marks = Marks()
     for sequence in range(1, 20_000, 2):
         marks.add(_header(sequence), sequence % 3 > 0)
         assert len(marks.ahead) <= 64 and len(marks.refused) <= 64

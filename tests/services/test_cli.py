@@ -46,6 +46,11 @@ def test_help_names_every_command_and_every_command_exists():
         (["actor", "--connect", "nonsense"], "endpoint"),
         (["query", "--connect", "tcp/127.0.0.1:1", "--repeat", "2"], "127.0.0.1:1"),
         (["plot", "/nonexistent-run"], "nonexistent-run"),
+        (["learner", "--run-dir", "/nonexistent-run", "--listen", "tcp/0.0.0.0:7447"], "other machines.*--certs"),
+        (["serve", "--listen", "tcp/[::]:7457"], "other machines.*--certs.*--insecure"),
+        (["train", "--listen", "tcp/10.0.0.5:7447"], "other machines.*--certs"),
+        (["actor", "--certs", "/nonexistent-certs"], "missing.*congrasp certs issue .*--role actor"),
+        (["certs", "issue", "/nonexistent-certs", "--role", "actor"], "no authority.*congrasp certs init"),
     ],
 )
 def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words):

@@ -1,0 +1,296 @@
+"""A private authority and the certificates that it issues: one for each role and number, such as `actor.3`.
+
+The common name of a certificate is `<role>.<number>`. Zenoh compares common names as a whole and reads its rules once,
+so those who listen allow all numbers below `NUMBERS` from the start, and a certificate that is issued later works at
+once. Keys are elliptic (P-256), in files that their owner alone can read.
+"""
+
+import datetime
+import ipaddress
+import os
+import pathlib
+import secrets
+import shutil
+import ssl
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from common.errors import CongraspError
+from common.transport.security import CA_FILE, CERTIFICATE_FILE, KEY_FILE, LISTENERS, NUMBERS, ROLES, Credentials
+
+CA_KEY_FILE = "ca.key"
+CA_DAYS, DAYS = 3650, 365
+_ORGANIZATION = "congrasp"
+_LOOPBACK = ("localhost", "127.0.0.1")
+_CLOCKS = datetime.timedelta(minutes=5)  # by which the clocks of two machines may differ
+
+
+class Certificate(NamedTuple):
+    """What a certificate says."""
+
+    role: str
+    """One of `ROLES`; `ca` for the authority."""
+    number: int
+    """Tells the certificates of a role apart."""
+    hosts: tuple[str, ...]
+    """Names and addresses under which its owner may listen."""
+    expires: datetime.datetime
+    """In UTC."""
+
+    @property
+    def name(self) -> str:
+        """The common name."""
+        return f"{self.role}.{self.number}" if self.role != "ca" else "ca"
+
+    @property
+    def days(self) -> float:
+        """Days that are left; negative once it has expired."""
+        return (self.expires - datetime.datetime.now(datetime.UTC)).total_seconds() / 86400
+
+
+def create_authority(folder: pathlib.Path, *, days: float = CA_DAYS, force: bool = False) -> Certificate:
+    """Makes an authority: `ca.crt`, which everyone gets, and `ca.key`, which stays where it is.
+
+    Args:
+      folder: made if it is not there.
+      days: until it expires.
+      force: replace an authority that is there, which makes all certificates that it issued useless.
+
+    Raises:
+      CongraspError: there is one already, or a value makes no sense.
+    """
+    if not force and ((folder / CA_FILE).exists() or (folder / CA_KEY_FILE).exists()):
+        raise CongraspError(
+            f"{folder} holds an authority already.", "Issue certificates with it, or replace it with --force."
+        )
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name(
+        [
+            x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION),
+            x509.NameAttribute(NameOID.SERIAL_NUMBER, secrets.token_hex(8)),  # tells authorities apart
+        ]
+    )
+    usage = x509.KeyUsage(
+        digital_signature=True, key_cert_sign=True, crl_sign=True, content_commitment=False, key_encipherment=False,
+        data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
+    )  # fmt: skip
+    made = (
+        _builder(name, name, key.public_key(), days)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_secret(folder / CA_KEY_FILE, key)
+    (folder / CA_FILE).write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    return Certificate("ca", 0, (), made.not_valid_after_utc)
+
+
+def issue(
+    folder: pathlib.Path,
+    role: str,
+    *,
+    number: int | None = None,
+    hosts: Sequence[str] = (),
+    days: float = DAYS,
+    force: bool = False,
+) -> pathlib.Path:
+    """Issues a certificate.
+
+    Args:
+      folder: holds the authority, and takes the new folder `<role>.<number>` with `ca.crt`, `tls.crt` and `tls.key`.
+      role: one of `ROLES`.
+      number: by default the lowest that has no folder yet.
+      hosts: names and addresses under which its owner may listen besides loopback.
+      days: until it expires; never later than the authority.
+      force: replace the one that is there.
+
+    Returns:
+      The new folder: copy it to the machine where the role runs.
+
+    Raises:
+      CongraspError: there is no authority, the certificate is there already, or a value makes no sense.
+    """
+    if role not in ROLES:
+        raise CongraspError(f"There is no role {ascii(role)[:40]}.", f"Choose one of: {', '.join(ROLES)}.")
+    if hosts and role not in LISTENERS:
+        raise CongraspError(f"A certificate for the role {role} names no hosts.", f"Only {' and '.join(LISTENERS)} do.")
+    if number is None:
+        number = next((i for i in range(NUMBERS) if not (folder / f"{role}.{i}").exists()), NUMBERS)
+    if not 0 <= number < NUMBERS:
+        raise CongraspError(f"{role}.{number} cannot be issued.", f"Numbers go from 0 to {NUMBERS - 1}.")
+    target = folder / f"{role}.{number}"
+    if target.exists() and not force:
+        raise CongraspError(f"{target} is there already.", "Choose another --number, or replace it with --force.")
+    ca, ca_key = _authority(folder)
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name(
+        [
+            x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION),
+            x509.NameAttribute(NameOID.COMMON_NAME, target.name),
+        ]
+    )
+    uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
+    builder = _builder(subject, ca.subject, key.public_key(), days, at_most=ca.not_valid_after_utc)
+    if role in LISTENERS:
+        uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
+        names = [_host(one) for one in dict.fromkeys((*_LOOPBACK, *hosts))]
+        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+    made = (
+        builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(ca_key.public_key()), critical=False)
+        .sign(ca_key, hashes.SHA256())
+    )
+    if target.exists():
+        shutil.rmtree(target)
+    target.mkdir(mode=0o700)
+    _write_secret(target / KEY_FILE, key)
+    (target / CERTIFICATE_FILE).write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    shutil.copyfile(folder / CA_FILE, target / CA_FILE)
+    return target
+
+
+def read(path: pathlib.Path) -> Certificate:
+    """What a certificate's file says.
+
+    Raises:
+      CongraspError: it cannot be read, or is no certificate of this project.
+    """
+    made = _load(path)
+    names = made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    if not names:
+        return Certificate("ca", 0, (), made.not_valid_after_utc)
+    role, _, number = str(names[0].value).partition(".")
+    if role not in ROLES or not number.isascii() or not number.isdigit() or int(number) >= NUMBERS:
+        raise CongraspError(
+            f"{path} is a certificate for {ascii(names[0].value)[:60]}, which is no role and number.",
+            "Issue one with 'congrasp certs issue'.",
+        )
+    hosts: list[str] = []
+    for extension in made.extensions:
+        if isinstance(extension.value, x509.SubjectAlternativeName):
+            hosts = [str(name.value) for name in extension.value]
+    return Certificate(role, int(number), tuple(hosts), made.not_valid_after_utc)
+
+
+def certificates(folder: pathlib.Path) -> list[Certificate]:
+    """All certificates in a folder, the authority's first.
+
+    Raises:
+      CongraspError: there are none, or one is damaged.
+    """
+    files = [folder / CA_FILE, folder / CERTIFICATE_FILE, *folder.glob(f"*.*/{CERTIFICATE_FILE}")]
+    found = [read(path) for path in files if path.exists()]
+    if not found:
+        raise CongraspError(f"{folder} holds no certificates.", f"Make them: congrasp certs init {folder}")
+    return sorted(found, key=lambda one: (one.role != "ca", one.role, one.number))
+
+
+def find_credentials(folder: pathlib.Path, role: str) -> tuple[Credentials, Certificate]:
+    """The credentials with which a command runs.
+
+    Args:
+      folder: one that was issued for the role, or the authority's, whose number 0 is then taken.
+      role: what the command runs as.
+
+    Raises:
+      CongraspError: they are missing, damaged, expired, or another role's.
+    """
+    if not (folder / CERTIFICATE_FILE).exists() and (folder / f"{role}.0").exists():
+        folder = folder / f"{role}.0"
+    credentials = Credentials(folder, role)
+    for path in (credentials.ca, credentials.certificate, credentials.key):
+        if not os.access(path, os.R_OK):
+            raise CongraspError(f"{path} is missing or cannot be read.", f"Run: {_hint(folder, role)}")
+    certificate = read(credentials.certificate)
+    if certificate.role != role:
+        raise CongraspError(
+            f"{credentials.certificate} is for the role {certificate.role}, not {role}.", f"Run: {_hint(folder, role)}"
+        )
+    for expires, path in (
+        (certificate.expires, credentials.certificate),
+        (read(credentials.ca).expires, credentials.ca),
+    ):
+        if expires <= datetime.datetime.now(datetime.UTC):
+            raise CongraspError(f"{path} expired on {expires:%Y-%m-%d %H:%M} UTC.", f"Run: {_hint(folder, role)}")
+    try:
+        ssl.create_default_context().load_cert_chain(credentials.certificate, credentials.key)
+    except (ssl.SSLError, OSError):
+        raise CongraspError(
+            f"{credentials.key} is not the key of {credentials.certificate}.", f"Run: {_hint(folder, role)}"
+        ) from None
+    return credentials, certificate
+
+
+def _hint(folder: pathlib.Path, role: str) -> str:
+    where = folder.parent if folder.name.partition(".")[0] in ROLES else folder
+    return f"congrasp certs issue {where} --role {role}"
+
+
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePublicKey,
+    days: float,
+    at_most: datetime.datetime | None = None,
+) -> x509.CertificateBuilder:
+    now = datetime.datetime.now(datetime.UTC)
+    if not -CA_DAYS <= days <= 2 * CA_DAYS:
+        raise CongraspError(f"A certificate cannot be good for {days:g} days.", f"Choose at most {2 * CA_DAYS}.")
+    end = now + datetime.timedelta(days=days)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(now, end) - _CLOCKS)
+        .not_valid_after(min(end, at_most) if at_most else end)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    )
+
+
+def _host(name: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        pass
+    labels = name.removeprefix("*.").split(".")
+    if len(name) > 253 or not all(
+        0 < len(label) < 64 and label.replace("-", "a").isalnum() and label.isascii() for label in labels
+    ):
+        raise CongraspError(f"{ascii(name)[:70]} is neither a host name nor an address.", "Correct --host.")
+    return x509.DNSName(name)
+
+
+def _authority(folder: pathlib.Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    try:
+        key = serialization.load_pem_private_key((folder / CA_KEY_FILE).read_bytes(), None)
+    except (OSError, ValueError):
+        raise CongraspError(f"{folder} holds no authority.", f"Make one: congrasp certs init {folder}") from None
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    return _load(folder / CA_FILE), key
+
+
+def _load(path: pathlib.Path) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(path.read_bytes())
+    except (OSError, ValueError):
+        raise CongraspError(
+            f"{path} is missing or is no certificate.", "Make it with 'congrasp certs', or correct the path."
+        ) from None
+
+
+def _write_secret(path: pathlib.Path, key: ec.EllipticCurvePrivateKey) -> None:
+    path.unlink(missing_ok=True)
+    text = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(text)

@@ -1,0 +1,297 @@
+"""Who may do what on the wire: mutual TLS, and what each role is allowed by the process that listens.
+
+Everyone shows a certificate of the run's authority whose common name is `<role>.<number>`. The listening process (the
+learner, or a policy server) denies everything but what `RIGHTS` gives that name, for its own end and for what it would
+forward. An actor's names on the wire begin with its certificate's number, so it cannot speak for another certificate's.
+
+Zenoh reads its rules once and compares common names as a whole; so all numbers are written into the rules, whether
+their certificates exist yet or not.
+"""
+
+import contextlib
+import dataclasses
+import ipaddress
+import pathlib
+import re
+import socket
+import ssl
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from common.errors import CongraspError
+from common.transport.keys import ROOT, Flow, flow
+
+ROLES = ("learner", "actor", "server", "client", "observer")
+LISTENERS = ("learner", "server")
+"""Roles whose certificates others connect to."""
+NUMBERS = 256
+"""Certificates of one role."""
+CA_FILE, CERTIFICATE_FILE, KEY_FILE = "ca.crt", "tls.crt", "tls.key"
+_PROBE_SECONDS = 1.0
+_ENDPOINT = re.compile(r"(?P<protocol>[a-z-]+)/(?P<host>\[[^]]*\]|[^/:]*)(:(?P<port>\d+))?.*")
+
+
+@dataclasses.dataclass(frozen=True)
+class Credentials:
+    """A folder with the authority's certificate, one's own, and its key, under the names that Kubernetes gives them."""
+
+    folder: pathlib.Path
+    role: str
+    """One of `ROLES`."""
+
+    @property
+    def ca(self) -> pathlib.Path:
+        """The authority's certificate."""
+        return self.folder / CA_FILE
+
+    @property
+    def certificate(self) -> pathlib.Path:
+        """One's own certificate."""
+        return self.folder / CERTIFICATE_FILE
+
+    @property
+    def key(self) -> pathlib.Path:
+        """Its private key."""
+        return self.folder / KEY_FILE
+
+    def settings(self, name: Flow, *, listens: bool) -> dict[str, Any]:
+        """Zenoh's configuration for the session of one flow that listens or connects with these."""
+        side = "listen" if listens else "connect"
+        tls = {
+            "root_ca_certificate": str(self.ca),
+            f"{side}_certificate": str(self.certificate),
+            f"{side}_private_key": str(self.key),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+        limits = {"access_control": _access_control(self.role, name), **_limits(self.role, name)} if listens else {}
+        return {"transport/link/protocols": ["tls"], "transport/link/tls": tls, **limits}
+
+
+@dataclasses.dataclass(frozen=True)
+class Rights:
+    """What a role may do at a listener; key expressions below the run, where `{name}` stands for names of its own."""
+
+    ask: tuple[str, ...] = ()
+    """Keys that it may query."""
+    publish: tuple[str, ...] = ()
+    """Keys under which it may publish."""
+    hear: tuple[str, ...] = ()
+    """Expressions to which it may subscribe."""
+    show: tuple[str, ...] = ()
+    """Liveliness tokens that it may declare."""
+
+
+RIGHTS: dict[str, dict[str, Rights]] = {
+    "learner": {
+        "actor": Rights(
+            ask=("config", "weights/latest", "ticket/{name}", "rollout/{name}"),
+            publish=("log/*/actor/{name}",),
+            hear=("weights/announce",),
+            show=("alive/actor/{name}/*",),
+        ),
+        "server": Rights(ask=("config", "weights/latest"), hear=("weights/announce",), show=("alive/server/*/*",)),
+        "observer": Rights(ask=("config", "status"), hear=("log/**",), show=("alive/recorder/*/*",)),
+    },
+    "server": {
+        "client": Rights(ask=("policy/act", "policy/health")),
+        "observer": Rights(ask=("policy/health",)),
+    },
+}
+"""By the role that listens and the role that connects; what is not here is denied."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Limit:
+    """What one connection may send under an expression; what exceeds it is dropped, and a query then has no answer."""
+
+    keys: str
+    """Expression below the run."""
+    size: int
+    """Bytes of a message."""
+    rate: float
+    """Messages a second, evenly spaced; those that come sooner after the one before are dropped. 0 for no limit."""
+
+
+_SMALL, _LOG = 64 << 10, 16 << 20
+LIMITS: dict[str, tuple[Limit, ...]] = {
+    "learner": (
+        Limit("config", _SMALL, 100.0),
+        Limit("status", _SMALL, 100.0),
+        Limit("weights/latest", _SMALL, 100.0),
+        Limit("ticket/*", _SMALL, 0.0),  # the hub counts these by actor
+        *(Limit(f"log/{channel}/**", _LOG, 100.0) for channel in ("metrics", "event", "version", "episode", "rollout")),
+    ),
+    "server": (Limit("policy/act", 1 << 20, 5000.0), Limit("policy/health", _SMALL, 100.0)),
+}
+"""By the role that listens. Rollouts are limited by the longest message and by the learner's hub."""
+
+
+def actor_name(number: int, name: str) -> str:
+    """The name on the wire of an actor that has the actors' certificate of this number."""
+    return f"{number}.{name}"
+
+
+def secured(endpoint: str, credentials: Credentials | None) -> str:
+    """The endpoint that is used: with credentials always TLS.
+
+    Raises:
+      CongraspError: the endpoint wants TLS and there are no credentials, or the other way round.
+    """
+    protocol, _, rest = endpoint.partition("/")
+    if credentials is None:
+        if protocol in ("tls", "quic"):
+            raise CongraspError(f"'{endpoint}' needs certificates.", "Give --certs; 'congrasp certs' makes them.")
+        return endpoint
+    if protocol not in ("tcp", "tls"):
+        raise CongraspError(f"'{endpoint}' does not go with certificates.", "Write it like tls/10.0.0.5:7447.")
+    return f"tls/{rest}"
+
+
+def check_exposure(endpoint: str, credentials: Credentials | None, *, insecure: bool) -> None:
+    """Refuses to listen where other machines can connect when nothing protects it.
+
+    Raises:
+      CongraspError: it would.
+    """
+    if credentials is None and not insecure and not _is_loopback(endpoint):
+        raise CongraspError(
+            f"'{endpoint}' could be reached from other machines, and nothing would protect it.",
+            "Give --certs ('congrasp certs' makes them), or --insecure in a network where you trust everyone.",
+        )
+
+
+def refusal(endpoint: str, credentials: Credentials | None) -> CongraspError | None:
+    """Why a connection cannot be made, if the reason is the certificates: tries once, and costs a second or two.
+
+    Zenoh says of every failure only that nobody can be connected to.
+    """
+    match = _ENDPOINT.fullmatch(endpoint)
+    if not match or not match["port"]:
+        return None
+    host = match["host"].strip("[]")
+    try:
+        with socket.create_connection((host, int(match["port"])), _PROBE_SECONDS) as raw:
+            return _handshake(raw, host, endpoint, credentials)
+    except OSError:
+        return None
+
+
+def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Credentials | None) -> CongraspError | None:
+    context = ssl.create_default_context()
+    if credentials is None:
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    else:
+        try:
+            context = ssl.create_default_context(cafile=str(credentials.ca))
+            context.load_cert_chain(credentials.certificate, credentials.key)
+        except OSError:  # an SSLError is one, too
+            return CongraspError(f"The credentials in {credentials.folder} cannot be used.", "Issue them anew.")
+    try:
+        with context.wrap_socket(raw, server_hostname=host) as connection:
+            if credentials is None:
+                return CongraspError(
+                    f"{endpoint} asks for certificates.", "Give --certs; 'congrasp certs' makes them on its machine."
+                )
+            with contextlib.suppress(TimeoutError):
+                connection.recv(1)  # in TLS 1.3 the other side judges our certificate after the handshake
+            return None
+    except ssl.SSLCertVerificationError as error:
+        what = f"{endpoint} shows a certificate that is not to be trusted: {error.verify_message}."
+        return CongraspError(what, "Use certificates of one authority, and name the host with --host when issuing.")
+    except ssl.SSLError as error:
+        if "ALERT" not in (error.reason or ""):
+            return None
+        why = "expired" if "EXPIRED" in error.reason else "missing" if "REQUIRED" in error.reason else "not accepted"
+        where = credentials.certificate if credentials else "none"
+        return CongraspError(
+            f"{endpoint} refuses: the certificate ({where}) is {why}.", "Issue one with its authority."
+        )
+
+
+def _is_loopback(endpoint: str) -> bool:
+    match = _ENDPOINT.fullmatch(endpoint)
+    if not match:
+        return False
+    host = match["host"].strip("[]")
+    if match["protocol"].startswith("unix") or host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _access_control(role: str, name_of_flow: Flow) -> dict[str, Any]:
+    rules: list[dict[str, Any]] = []
+    subjects: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+
+    def allow(who: str, names: list[str], rights: Rights) -> None:
+        mine = list(_rules(who, rights, name_of_flow))
+        if not mine:
+            return
+        rules.extend(mine)
+        subjects.append({"id": who, "cert_common_names": names})
+        policies.append({"rules": [rule["id"] for rule in mine], "subjects": [who]})
+
+    for other, rights in RIGHTS[role].items():
+        shared, own = _split(rights)
+        names = [f"{other}.{number}" for number in range(NUMBERS)]
+        allow(other, names, shared)
+        if own != Rights():
+            for number, name in enumerate(names):
+                allow(name, [name], _filled(own, actor_name(number, "$*")))
+    return {
+        "enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies,
+    }  # fmt: skip
+
+
+def _rules(who: str, rights: Rights, name: Flow) -> Iterator[dict[str, Any]]:
+    """Zenoh's rules for one flow: what comes in, and what goes out in answer to it."""
+    kinds = (
+        (rights.ask, "query", "reply"),
+        (rights.publish, "put", None),
+        (rights.hear, "declare_subscriber", "put"),
+        (rights.show, "liveliness_token", None),
+    )
+    for parts, comes, goes in kinds:
+        keys = _of_flow(parts, name)
+        for direction, message in (("ingress", comes), ("egress", goes)):
+            if keys and message:
+                yield {
+                    "id": f"{who} {direction} {comes}",
+                    "permission": "allow",
+                    "flows": [direction],
+                    "messages": [message],
+                    "key_exprs": keys,
+                }
+
+
+def _of_flow(parts: Iterable[str], name: Flow) -> list[str]:
+    """The keys of any run among these that belong to a flow."""
+    keys = [f"{ROOT}/*/{part}" for part in parts]
+    return [key for key in keys if flow(key) == name]
+
+
+def _split(rights: Rights) -> tuple[Rights, Rights]:
+    """The rights that all of a role share, and those that hold for own names."""
+    parts = dataclasses.asdict(rights)
+    return (
+        Rights(**{kind: tuple(key for key in keys if "{name}" not in key) for kind, keys in parts.items()}),
+        Rights(**{kind: tuple(key for key in keys if "{name}" in key) for kind, keys in parts.items()}),
+    )
+
+
+def _filled(rights: Rights, name: str) -> Rights:
+    parts = dataclasses.asdict(rights)
+    return Rights(**{kind: tuple(key.replace("{name}", name) for key in keys) for kind, keys in parts.items()})
+
+
+def _limits(role: str, name: Flow) -> dict[str, Any]:
+    both = {"flows": ["ingress"], "messages": ["query", "put"]}
+    limits = [(key, limit) for limit in LIMITS[role] for key in _of_flow([limit.keys], name)]
+    sizes = [{"id": key, **both, "key_exprs": [key], "size_limit": limit.size} for key, limit in limits]
+    rates = [{"key_expr": key, "freq": limit.rate} for key, limit in limits if limit.rate]
+    return {"low_pass_filter": sizes, "downsampling": [{"id": "rates", **both, "rules": rates}] if rates else []}

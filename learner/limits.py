@@ -1,0 +1,91 @@
+"""How much useless work an actor may cause: credit for each certificate.
+
+A request that helps training costs nothing: a ticket that is granted, a rollout that is accepted. All others (asked for
+in vain, refused, too old, sent twice) cost by their size. Whoever has no credit left is told to come again later before
+anything is decoded, so a flood costs the learner little, and the other actors nothing.
+"""
+
+import collections
+import threading
+import time
+from collections.abc import Callable
+
+from common.transport.base import Handler
+from common.wire.codec import Message
+
+DAMAGED = 1 << 20
+"""Bytes that a message is charged for which cannot be decoded."""
+_NAMES = 1024
+
+
+class Credit:
+    """Credit by who asks; safe to call from several threads."""
+
+    def __init__(
+        self,
+        *,
+        per_second: float = 200.0,
+        most: float = 2000.0,
+        unit: int = 256 << 10,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        """Starts with all credit for everyone.
+
+        Args:
+          per_second: credit that returns each second.
+          most: credit that can be saved up.
+          unit: bytes that cost as much as a request without any.
+          clock: seconds, monotonic.
+        """
+        self._per_second = per_second
+        self._most = most
+        self._unit = unit
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._levels: collections.OrderedDict[str, tuple[float, float]] = collections.OrderedDict()
+        self.turned_away = 0
+        """Requests that found no credit."""
+
+    def admits(self, key: str) -> bool:
+        """Whether a request under an actor's key may be looked at; counts it if not."""
+        with self._lock:
+            fine = self._level(_account(key)) > 0
+            self.turned_away += not fine
+            return fine
+
+    def charge(self, key: str, size: int) -> None:
+        """Notes a request of `size` bytes that helped nobody."""
+        name = _account(key)
+        with self._lock:
+            self._levels[name] = self._level(name) - 1 - size / self._unit, self._clock()
+            self._levels.move_to_end(name)
+            if len(self._levels) > _NAMES:
+                self._levels.popitem(last=False)
+
+    def charging(self, handler: Handler) -> Handler:
+        """A handler of tickets or rollouts that charges for what it does not grant or accept."""
+
+        def handle(key: str, request: Message) -> Message:
+            helped = False
+            try:
+                reply = handler(key, request)
+                helped = reply.meta.get("outcome") == "accepted" or bool(reply.meta.get("granted"))
+                return reply
+            finally:
+                if not helped:
+                    self.charge(key, sum(array.nbytes for array in request.arrays.values()))
+
+        return handle
+
+    def _level(self, name: str) -> float:
+        level, since = self._levels.get(name, (self._most, 0.0))
+        return min(self._most, level + (self._clock() - since) * self._per_second)
+
+
+def certificate(actor: str) -> str:
+    """What the names of all actors with one certificate have in common."""
+    return actor.partition(".")[0]
+
+
+def _account(key: str) -> str:
+    return certificate(key.rpartition("/")[2])

@@ -1,0 +1,81 @@
+"""Certificates for mutual TLS: a private authority, and a certificate for each process that joins a run."""
+
+import pathlib
+from typing import Annotated, Literal
+
+import tyro
+
+Folder = Annotated[pathlib.Path, tyro.conf.Positional]
+Role = Literal["learner", "actor", "server", "client", "observer"]
+
+
+def init(folder: Folder = pathlib.Path("certs"), host: tuple[str, ...] = (), force: bool = False) -> int:
+    """Make a private authority, and number 0 of every role: all that a run on one machine needs.
+
+    Its ca.key signs certificates: keep it where nobody else can read it. Commands on this machine take --certs FOLDER.
+
+    Args:
+      folder: Folder for the authority and the certificates.
+      host: Names and addresses of this machine, under which others will connect to its learner or policy server.
+      force: Replace an authority that is there; certificates that it issued are useless then.
+    """
+    from common.certificates import create_authority, issue
+    from common.transport.security import LISTENERS, ROLES
+
+    create_authority(folder, force=force)
+    for role in ROLES:
+        issue(folder, role, number=0, hosts=host if role in LISTENERS else (), force=force)
+    return show(folder)
+
+
+def issue(
+    folder: Folder = pathlib.Path("certs"),
+    *,
+    role: Role,
+    number: int | None = None,
+    host: tuple[str, ...] = (),
+    days: float = 365.0,
+    force: bool = False,
+) -> int:
+    """Issue a certificate: a folder to copy to the machine where the role runs, whose commands take --certs FOLDER.
+
+    Learners need not be told of new certificates. Several actors may share one, if they trust one another.
+
+    Args:
+      folder: Folder of the authority.
+      role: Learner, actor, server (of a policy), client (of a policy server) or observer (status, recorder).
+      number: Tells the certificates of a role apart; the lowest that is free by default.
+      host: Names and addresses under which others will connect to it (learner and server).
+      days: Days until it expires.
+      force: Replace the certificate of this number; the old one works until it expires.
+    """
+    from common.certificates import issue, read
+    from common.transport.security import CERTIFICATE_FILE
+
+    made = issue(folder, role, number=number, hosts=host, days=days, force=force)
+    print(f"{made}: good until {read(made / CERTIFICATE_FILE).expires:%Y-%m-%d}")
+    return 0
+
+
+def show(folder: Folder = pathlib.Path("certs")) -> int:
+    """Show the certificates of a folder and when they expire; the exit code is 1 if one has.
+
+    Args:
+      folder: Folder of an authority or of one certificate.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from common.certificates import certificates
+
+    table = Table("certificate", "expires (UTC)", "days left", "listens as")
+    found = certificates(folder)
+    for one in found:
+        style = "red" if one.days <= 0 else "yellow" if one.days < 30 else ""
+        left = f"{one.days:.0f}" if one.days > 0 else "expired"
+        table.add_row(one.name, f"{one.expires:%Y-%m-%d %H:%M}", left, ", ".join(one.hosts), style=style)
+    Console().print(table)
+    return int(any(one.days <= 0 for one in found))
+
+
+COMMANDS = {"init": init, "issue": issue, "show": show}

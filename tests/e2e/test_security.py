@@ -1,0 +1,385 @@
+"""Who gets in, and what those inside may do: real sessions over TLS, with good, bad and no certificates."""
+
+import contextlib
+import dataclasses
+import threading
+import time
+
+import numpy as np
+import pytest
+import zenoh
+from zenoh.handlers import FifoChannel, RingChannel
+
+from actors.link import ActorLink
+from common.certificates import create_authority, issue, read
+from common.errors import CongraspError, TransportError
+from common.transport.keys import Keys
+from common.transport.security import RIGHTS, Credentials
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message, encode
+from common.wire.messages import RolloutForm
+from learner.hub import LearnerHub
+from learner.staleness import StalenessManager
+from services.client import PolicyClient
+from services.train import free_port
+from tests.cluster import A, B, D, T, bundle, rollout
+
+pytestmark = pytest.mark.timeout(60)
+KEYS = Keys("safe")
+ME, OTHER = "0.a", "1.b"
+
+
+@pytest.fixture(scope="module")
+def certs(tmp_path_factory):
+    """An authority with a certificate of every role, a second actor's, and an expired one."""
+    folder = tmp_path_factory.mktemp("certs")
+    create_authority(folder)
+    for role in ("learner", "actor", "actor", "server", "client", "observer"):
+        issue(folder, role)
+    issue(folder, "actor", number=9, days=-1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def evil(tmp_path_factory):
+    """Another authority, which certifies everything."""
+    folder = tmp_path_factory.mktemp("evil")
+    create_authority(folder)
+    for role in ("learner", "actor"):
+        issue(folder, role)
+    return folder
+
+
+@dataclasses.dataclass
+class Run:
+    """A learner and a policy server that ask for certificates."""
+
+    certs: object
+    endpoint: str
+    policy: str
+    hub: LearnerHub
+    transport: ZenohTransport
+    stack: contextlib.ExitStack
+
+    def connect(self, name, endpoint=None, **options):
+        """A session of whoever has the certificate of this name."""
+        mine = Credentials(self.certs / name, name.split(".")[0])
+        options = {"flows": ("policy",)} | options if endpoint == self.policy else options
+        endpoint = endpoint or self.endpoint
+        return self.stack.enter_context(ZenohTransport(connect=[endpoint], credentials=mine, **options))
+
+
+@pytest.fixture
+def run(certs):
+    endpoint, policy = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
+    with contextlib.ExitStack() as stack:
+        learner, server = (Credentials(certs / f"{role}.0", role) for role in ("learner", "server"))
+        transport = stack.enter_context(ZenohTransport(listen=[endpoint], credentials=learner))
+        hub = LearnerHub(
+            transport, run="safe", config_json="{}", epoch="e", schema="s",
+            form=RolloutForm(T, B, D, A, half=True), staleness=StalenessManager(1, 2),
+        )  # fmt: skip
+        hub.publish_weights(bundle(0, "e"), 0)
+        serving = stack.enter_context(ZenohTransport(listen=[policy], credentials=server, flows=("policy",)))
+        for key in (KEYS.act, KEYS.health):
+            serving.serve(key, lambda key, request: Message(meta={"ready": True, "served": key}))
+        yield Run(certs, endpoint, policy, hub, transport, stack)
+
+
+def wait_for(condition, timeout=10.0):
+    deadline = time.monotonic() + timeout
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.02)
+    return found
+
+
+def heard(subscription, seconds=0.7):
+    """Keys of all that arrives within a while."""
+    found, deadline = [], time.monotonic() + seconds
+    while (rest := deadline - time.monotonic()) > 0:
+        if received := subscription.receive(rest):
+            found.append(received[0])
+    return found
+
+
+def answers(transport, key, message=None):
+    try:
+        return transport.query(key, message or Message(), timeout=5)
+    except TransportError as error:
+        assert "Nobody answers" in str(error)
+        return None
+
+
+# --- what is allowed works ---
+
+
+def test_with_the_right_certificates_a_run_works_from_end_to_end(run):
+    observer, server = run.connect("observer.0"), run.connect("server.0")
+    logs = observer.subscribe(KEYS.logs, depth=64)
+    transport = run.connect("actor.0")
+    with ActorLink(transport, "safe", ME, request_timeout=5.0) as link:
+        assert link.config(10).schema == "s"
+        assert link.weights(-1).meta["version"] == 0
+        for _ in range(2):
+            ticket = link.acquire_ticket(5)
+            assert link.upload(rollout(T, 0, 0), ticket).result(10) == "accepted"
+        assert len(run.hub.next_batch(2, 5)) == 2
+        run.hub.publish_weights(bundle(1, "e"), 1)
+        # The announcement arrives by itself: without one, a link that holds the newest version asks for nothing.
+        wait_for(lambda: (new := link.weights(0)) and new.meta["version"] == 1)
+        key = KEYS.log("metrics", "actor", ME)
+        transport.publish(key, Message(meta={"values": {}}))
+        wait_for(lambda: (received := logs.receive(5)) and received[0] == key)
+        status = wait_for(lambda: (now := observer.query(KEYS.status, Message(), timeout=5).meta) and now)
+        assert ("actor", ME) in {(role["role"], role["id"]) for role in status["roles"]}
+        assert status["ledger"]["accepted"] == 2 and status["ledger"]["turned_away"] == 0
+    assert server.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5).meta["version"] == 1
+    with PolicyClient(run.policy, "safe", certs=run.certs / "client.0") as client:
+        assert client.health()["ready"]
+    assert answers(run.connect("client.0", run.policy), KEYS.act).meta["served"] == KEYS.act
+    assert answers(run.connect("observer.0", run.policy), KEYS.health)
+
+
+def test_an_actor_whose_certificate_came_later_works_at_once(run):
+    made = issue(run.certs, "actor", number=77)
+    link = ActorLink(run.connect(made.name), "safe", "77.x", request_timeout=5.0)
+    with link:
+        link.config(10)
+        assert link.upload(rollout(T, 0, 0), link.acquire_ticket(5)).result(10) == "accepted"
+
+
+# --- what is not allowed ---
+
+EVERYTHING = {
+    "config": KEYS.config,
+    "weights": KEYS.weights,
+    "status": KEYS.status,
+    "my ticket": KEYS.ticket(ME),
+    "my rollout": KEYS.rollout(ME),
+    "another's ticket": KEYS.ticket(OTHER),
+    "another's rollout": KEYS.rollout(OTHER),
+    "everyone's": "congrasp/safe/rollout/*",
+    "whatever there is": "congrasp/**",
+    "the learner's innards": "@/{learner}/**",
+}
+
+
+@pytest.mark.parametrize(
+    ("who", "may"),
+    [
+        ("actor.0", {"config", "weights", "my ticket", "my rollout"}),
+        ("actor.1", {"config", "weights", "another's ticket", "another's rollout"}),
+        ("server.0", {"config", "weights"}),
+        ("observer.0", {"config", "status"}),
+        ("client.0", set()),
+        ("learner.0", set()),
+    ],
+)
+def test_each_role_can_ask_the_learner_for_its_own_and_nothing_else(run, who, may):
+    transport, learner = run.connect(who), str(run.transport._session(KEYS.config).info.zid())
+
+    def answered(key):
+        replies = transport._session(key).get(key.replace("{learner}", learner), FifoChannel(8), timeout=3.0)
+        return bool(list(replies))  # an empty question is answered with an error in words
+
+    assert {name for name, key in EVERYTHING.items() if answered(key)} == may
+
+
+@pytest.mark.parametrize(
+    ("who", "may"), [("client.0", {KEYS.act, KEYS.health}), ("observer.0", {KEYS.health}), ("actor.0", set())]
+)
+def test_only_clients_can_ask_the_policy(run, who, may):
+    session = run.connect(who, run.policy)
+    assert {key for key in (KEYS.act, KEYS.health) if answers(session, key)} == may
+
+
+@pytest.mark.parametrize("who", ["actor.0", "client.0", "observer.0", "server.0"])
+def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
+    """Forged weights, announcements, logs and answers reach neither the learner nor those connected to it."""
+    thief, victim, observer = run.connect(who), run.connect("actor.1"), run.connect("observer.0")
+    announcements, logs = victim.subscribe(KEYS.announcement, depth=64), observer.subscribe(KEYS.logs, depth=64)
+    here = run.transport.subscribe("congrasp/safe/**", depth=64), run.transport.subscribe(KEYS.logs, depth=64)
+    asked = []
+    for key in (KEYS.weights, KEYS.status, KEYS.config, KEYS.ticket(OTHER), KEYS.rollout(OTHER), KEYS.act):
+        thief.serve(key, lambda key, request: asked.append(key) or Message(meta={"forged": True}))
+    time.sleep(0.3)
+    for key in (KEYS.announcement, KEYS.log("metrics", "learner", "0"), KEYS.log("event", "actor", OTHER)):
+        thief.publish(key, Message(meta={"forged": True}))
+    assert heard(announcements) == heard(logs, 0.1) == heard(here[0], 0.1) == heard(here[1], 0.1) == []
+    assert "forged" not in observer.query(KEYS.status, Message(), timeout=5).meta
+    assert "forged" not in victim.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5).meta
+    assert answers(run.transport, KEYS.act) is None and asked == []
+
+
+def test_actors_do_not_speak_for_or_listen_to_one_another(run):
+    actor, victim, observer = run.connect("actor.0"), run.connect("actor.1"), run.connect("observer.0")
+    everything = [actor.subscribe(key, depth=64) for key in ("congrasp/**", KEYS.logs, "congrasp/safe/alive/**")]
+    seen = []
+    actor.watch_alive(KEYS.everyone, lambda key, alive: seen.append(key))
+    victim.declare_alive(KEYS.alive("actor", OTHER, "01"))
+    for name, session in ((OTHER, victim), ("1.c", victim), (ME, observer), (ME, victim), ("learner", victim)):
+        session.publish(KEYS.log("event", "actor", name), Message())
+    for role, name in (("actor", OTHER), ("learner", "0"), ("actor", "a"), ("actor", ME)):
+        actor.declare_alive(KEYS.alive(role, name, "66"))
+    roles = wait_for(lambda: (roles := run.hub.status()["roles"]) and len(roles) >= 3 and roles)
+    assert {(role["role"], role["id"], role["incarnation"]) for role in roles} == {
+        ("learner", "0", run.hub.life),
+        ("actor", OTHER, "01"),
+        ("actor", ME, "66"),
+    }
+    assert [heard(one, 0.3) for one in everything] == [[], [], []]
+    # Only its own tokens come back to it.
+    assert {key.split("/")[-1] for key in seen} <= {"66"}
+    # Its key is its own, but the message says another's name.
+    forged = Message(rollout(T, 0, 0).arrays, {**rollout(T, 0, 0).meta, "actor": OTHER, "incarnation": "01",
+                     "sequence": 0, "epoch": "e", "ticket": "t"})  # fmt: skip
+    reply = actor.query(KEYS.rollout(ME), forged, timeout=5).meta
+    assert reply["outcome"] == "refused" and "came under the key" in reply["why"]
+    assert run.hub.status()["ledger"]["accepted"] == 0
+
+
+def test_a_client_hears_no_logs(run):
+    logs = run.connect("client.0").subscribe(KEYS.logs, depth=64)
+    also = run.connect("client.0", run.policy, flows=("policy",)).subscribe("congrasp/*/policy/**", depth=64)
+    run.connect("actor.0").publish(KEYS.log("metrics", "actor", ME), Message())
+    run.transport.publish(KEYS.log("metrics", "learner", "0"), Message())
+    assert heard(logs) == heard(also, 0.1) == []
+
+
+@pytest.mark.parametrize("mode", ["peer", "router"])
+def test_another_mode_of_connecting_gives_no_more(run, mode):
+    """Zenoh's peers and routers exchange more than its clients; the same rules hold for them."""
+    folder = run.certs / "actor.0"
+    config = zenoh.Config.from_json5(
+        f"""{{mode: "{mode}", listen: {{endpoints: []}}, scouting: {{multicast: {{enabled: false}}}},
+             connect: {{endpoints: ["{run.endpoint.replace("tcp/", "tls/")}"], timeout_ms: 5000}},
+             transport: {{link: {{tls: {{root_ca_certificate: "{folder}/ca.crt", enable_mtls: true,
+             connect_certificate: "{folder}/tls.crt", connect_private_key: "{folder}/tls.key"}}}}}}}}"""
+    )
+    with zenoh.open(config) as session:
+        stolen = [session.declare_queryable(key, FifoChannel(8)) for key in (KEYS.status, KEYS.act)]
+        logs = session.declare_subscriber("congrasp/**", RingChannel(64))
+        time.sleep(0.5)
+        run.transport.publish(KEYS.log("metrics", "learner", "0"), Message())
+        observer = run.connect("observer.0")
+        assert "ledger" in observer.query(KEYS.status, Message(), timeout=5).meta
+        assert answers(run.transport, KEYS.act) is None
+        assert logs.try_recv() is None and all(one.try_recv() is None for one in stolen)
+        for key in (KEYS.status, KEYS.ticket(OTHER), "congrasp/**"):
+            assert not [reply for reply in session.get(key, FifoChannel(8), timeout=1.0) if reply.ok]
+
+
+def test_every_right_is_a_key_of_a_run():
+    """A right for a key that does not exist any more would be an open door without a room."""
+    real = {
+        KEYS.config, KEYS.status, KEYS.weights, KEYS.announcement, KEYS.act, KEYS.health, KEYS.logs,
+        KEYS.ticket("{name}".strip("{}")), KEYS.rollout("name"), KEYS.alive("actor", "name", "x"),
+        KEYS.alive("server", "x", "x"), KEYS.alive("recorder", "x", "x"), KEYS.log("x", "actor", "name"),
+    }  # fmt: skip
+    real = {key.removeprefix("congrasp/safe/").replace("/x", "/*") for key in real}
+    given = {
+        key.replace("{name}", "name")
+        for listener in RIGHTS.values()
+        for rights in listener.values()
+        for keys in dataclasses.asdict(rights).values()
+        for key in keys
+    }
+    assert given == real
+
+
+# --- who does not get in ---
+
+
+def _refused(endpoint, credentials, words):
+    """Connecting is refused in one line, long before the patience of who connects is spent."""
+    began = time.monotonic()
+    with pytest.raises(CongraspError, match=words) as caught:
+        ZenohTransport(connect=[endpoint], credentials=credentials, wait=50.0)
+    assert time.monotonic() - began < 40 and "\n" not in str(caught.value)
+
+
+def test_wrong_credentials_do_not_get_in(run, evil, tmp_path):
+    _refused(run.endpoint, Credentials(evil / "actor.0", "actor"), "not to be trusted: .*authority")
+    mixed = tmp_path / "mixed"  # knows the right authority, but is certified by another
+    mixed.mkdir()
+    for name, source in (("ca.crt", run.certs), ("tls.crt", evil / "actor.0"), ("tls.key", evil / "actor.0")):
+        (mixed / name).write_bytes((source / name).read_bytes())
+    _refused(run.endpoint, Credentials(mixed, "actor"), "refuses: the certificate .* is not accepted")
+    _refused(run.endpoint, Credentials(run.certs / "actor.9", "actor"), "refuses: the certificate .* is expired")
+    _refused(run.endpoint, None, "asks for certificates.*Give --certs")
+    _refused(run.endpoint, Credentials(tmp_path, "actor"), "cannot be used")
+
+
+@pytest.mark.parametrize(("folder", "who"), [("certs", "actor.0"), ("evil", "learner.0"), ("certs", "actor.9")])
+def test_nobody_is_taken_for_the_learner(folder, who, request, certs):
+    """A listener that another authority certified, or whose certificate is not for listening, gets no connection."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    mine = Credentials(request.getfixturevalue(folder) / who, "learner")
+    with ZenohTransport(listen=[endpoint], credentials=mine):
+        _refused(endpoint, Credentials(certs / "actor.1", "actor"), "not to be trusted")
+
+
+def test_a_certificate_for_another_host_is_not_trusted(certs):
+    """The learner's certificate names the loopback addresses alone; 127.0.0.2 is another host."""
+    port = free_port()
+    with ZenohTransport(listen=[f"tls/127.0.0.2:{port}"], credentials=Credentials(certs / "learner.0", "learner")):
+        _refused(f"tls/127.0.0.2:{port}", Credentials(certs / "actor.0", "actor"), "not to be trusted.*--host")
+
+
+def test_a_connection_ends_when_its_certificate_expires(run):
+    made = issue(run.certs, "actor", number=50, days=4 / 86400)
+    left = 86400 * read(made / "tls.crt").days
+    session = run.connect(made.name, flows=("control",))
+    assert answers(session, KEYS.config)
+    time.sleep(left + 0.5)
+    wait_for(lambda: not answers(session, KEYS.config))
+    _refused(run.endpoint, Credentials(made, "actor"), "expired")
+
+
+# --- floods ---
+
+
+def test_a_flood_is_turned_away_and_the_others_go_on(run):
+    """Useless requests, more than the learner could look at, from one certificate under many names."""
+    stop = threading.Event()
+
+    def flood(number):
+        session = run.connect("actor.1")
+        bad = Message({"x": np.zeros(1 << 18, np.float32)}, {"actor": f"1.{number}", "incarnation": "6", "ticket": "t"})
+        while not stop.is_set():
+            with contextlib.suppress(TransportError):
+                session.query(KEYS.rollout(f"1.{number}"), bad, timeout=5)
+
+    threads = [threading.Thread(target=flood, args=(number,)) for number in range(3)]
+    for thread in threads:
+        thread.start()
+    try:
+        wait_for(lambda: run.hub.status()["ledger"]["turned_away"] > 50, 30.0)
+        with ActorLink(run.connect("actor.0"), "safe", ME, request_timeout=5.0) as link:
+            link.config(10)
+            for version in range(20):
+                for _ in range(2):
+                    assert link.upload(rollout(T, 0, version), link.acquire_ticket(10)).result(10) == "accepted"
+                assert run.hub.next_batch(2, 5)
+                run.hub.publish_weights(bundle(version + 1, "e"), version + 1)
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join(10)
+    ledger = run.hub.status()["ledger"]
+    assert ledger["accepted"] == ledger["consumed"] == 40
+    assert ledger["damaged"] < ledger["turned_away"] + 1000
+
+
+def test_what_is_too_long_or_too_often_is_dropped(run):
+    observer, actor = run.connect("observer.0"), run.connect("actor.0")
+    long = Message({"x": np.zeros(100_000, np.uint8)})
+    assert answers(actor, KEYS.config, long) is None and answers(actor, KEYS.ticket(ME), long) is None
+    session = observer._session(KEYS.status)
+    question = encode(Message())
+    channels = [session.get(KEYS.status, FifoChannel(2), payload=question, timeout=5.0) for _ in range(300)]
+    answered = sum(reply.ok is not None for channel in channels for reply in channel)
+    assert 1 <= answered < 300
+    time.sleep(0.1)
+    assert answers(observer, KEYS.status)
