@@ -19,6 +19,7 @@ _GAUGES = {
         "Tickets that could be granted now; with those that run, the actors that it can use.",
     ),
     "missing": ("rollouts_missing", "Gaps in the counts of actors' rollouts."),
+    "turned_away": ("requests_turned_away", "Requests of actors that had made too many useless ones."),
 }
 _MILLISECONDS = (0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000)
 

@@ -2,6 +2,11 @@
 
 import contextlib
 import dataclasses
+import json
+import pathlib
+import re
+import subprocess
+import sys
 import threading
 import time
 
@@ -335,6 +340,37 @@ def test_a_connection_ends_when_its_certificate_expires(run):
     time.sleep(left + 0.5)
     wait_for(lambda: not answers(session, KEYS.config))
     _refused(run.endpoint, Credentials(made, "actor"), "expired")
+
+
+def test_the_command_line_says_why_in_one_line(run, evil, certs):
+    """A process of its own, for which nobody waits to the end of its patience."""
+    issue(evil, "observer", force=True, number=0)
+    for folder, words in ((evil, "not to be trusted"), (certs, None)):
+        command = ["status", "--connect", run.endpoint, "--run", "safe", "--certs", str(folder), "--json"]
+        done = subprocess.run(
+            [sys.executable, "-m", "services.cli.main", *command],
+            capture_output=True,
+            text=True,
+            timeout=50,
+            check=False,
+        )
+        if words is None:
+            assert done.returncode == 0 and json.loads(done.stdout)["run"] == "safe", done.stderr
+        else:
+            (line,) = done.stderr.splitlines()
+            assert done.returncode == 2 and line.startswith("congrasp: error: ") and words in line
+
+
+def test_nothing_unpickles():
+    """No module of the project imports what runs code out of data."""
+    forbidden = re.compile(
+        r"^\s*(from|import)\s+(pickle|cPickle|dill|cloudpickle|joblib|marshal|shelve|torch)\b|allow_pickle=True|\beval\(",
+        re.MULTILINE,
+    )
+    root = pathlib.Path(__file__).resolve().parents[2]
+    files = [path for folder in ("common", "actors", "learner", "services") for path in (root / folder).rglob("*.py")]
+    assert len(files) > 100
+    assert [str(path) for path in files if forbidden.search(path.read_text())] == []
 
 
 # --- floods ---

@@ -240,6 +240,34 @@ def test_nobody_speaks_for_another(bench):
     assert (ledger["running"], ledger["damaged"], ledger["accepted"]) == (1, 1, 0)  # a's ticket is still a's
 
 
+def test_nobody_makes_the_learner_forget_what_another_sent(bench):
+    b = bench()
+    b.hub.publish_weights(bundle(9), 9)
+    assert b.send(0, version=9, actor="0.a")["outcome"] == "accepted"
+    for i in range(1100):  # more starts of an actor than are remembered
+        assert b.send(0, actor=f"1.{i % 7}", incarnation=f"{i}")["outcome"] == "stale"
+    assert b.send(0, version=9, actor="0.a")["outcome"] == "duplicate"
+
+
+def test_floods_are_turned_away_and_cost_the_others_nothing(bench):
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    events = b.peer.subscribe(KEYS.logs, depth=8)
+    message = rollout(actor="1.b")
+    message.arrays["useless"] = np.zeros(16 << 20, np.uint8)
+    outcomes = [b.peer.query(KEYS.rollout("1.b"), message, timeout=5).meta["outcome"] for _ in range(100)]
+    assert outcomes[:20] == ["refused"] * 20 and "retry" in outcomes
+    reply = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
+    assert not reply["granted"] and reply["retry_after"] > 0
+    assert b.ticket()["granted"] and b.send(0)["outcome"] == "accepted"
+    ledger = b.ledger()
+    assert ledger["turned_away"] == outcomes.count("retry") + 1 and ledger["damaged"] == outcomes.count("refused")
+    texts = []
+    while received := events.receive(0.1):
+        texts.append(received[1].meta["text"])
+    assert any("useless requests of 1.b" in text for text in texts)
+
+
 def _sized(steps, worlds):
     """A rollout that agrees with itself, of so many control steps of so many worlds."""
     good = rollout()
