@@ -65,8 +65,12 @@ class Credentials:
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
         }
-        limits = {"access_control": _access_control(self.role, name), **_limits(self.role, name)} if listens else {}
-        return {"transport/link/protocols": ["tls"], "transport/link/tls": tls, **limits}
+        settings: dict[str, Any] = {"transport/link/protocols": ["tls"], "transport/link/tls": tls}
+        if not listens:
+            return settings
+        if name in LONGEST:
+            settings["transport/link/rx/max_message_size"] = LONGEST[name]
+        return {**settings, "access_control": _access_control(self.role, name), **_limits(self.role, name)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +118,8 @@ class Limit:
     """Messages a second, evenly spaced; those that come sooner after the one before are dropped. 0 for no limit."""
 
 
+LONGEST: dict[Flow, int] = {"control": 2 << 20, "log": 32 << 20, "policy": 2 << 20}
+"""Bytes of a message that is put together at all; every connection may have several in the making."""
 _SMALL, _LOG = 64 << 10, 16 << 20
 LIMITS: dict[str, tuple[Limit, ...]] = {
     "learner": (
