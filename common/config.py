@@ -173,6 +173,8 @@ class PPOConfig:
     """Clip of pi/pi_proximal."""
     importance_max: float = 4.0
     """Truncation of pi_proximal/pi_behaviour."""
+    decoupled: bool = True
+    """Clip around the policy at the update's start; else around the one that acted, as plain PPO does."""
     gamma: float = 0.98
     """Discount."""
     gae_lambda: float = 0.95

@@ -137,7 +137,7 @@ def update(
         arrays,
         normalizer.observation_affine(frozen, layout),
         normalizer.value_affine(state.value),
-        {name: value for name, value in dataclasses.asdict(ppo).items() if isinstance(value, float | tuple)},
+        {name: value for name, value in dataclasses.asdict(ppo).items() if isinstance(value, float | tuple | bool)},
         layout=layout,
         epochs=ppo.epochs,
         minibatches=ppo.minibatches,
@@ -193,9 +193,11 @@ def _optimise(
         # Normalised in each minibatch: gathering its rows in half precision is cheaper.
         batch["observation"],
         batch["action"],
-        network.log_probability(mean, log_std, batch["action"]),
+        jnp.where(
+            hyper["decoupled"], network.log_probability(mean, log_std, batch["action"]), batch["log_probability"]
+        ),
         mean,
-        weight,
+        jnp.where(hyper["decoupled"], weight, 1.0),
         (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8),
         (returns - returns_normalization.shift) * returns_normalization.scale,
     )

@@ -134,6 +134,8 @@ def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], 
             counts["undone"] += 1
         elif identity in waiting or rollout.answers[-1][1] in open_lives:
             counts["waiting"] += 1
+        elif holes:
+            counts["not in the journals"] += 1
         else:
             fault("lost", identity, "accepted, and never seen again")
     lags = [use.lag for uses in standing.values() for use in uses]

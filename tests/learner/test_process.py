@@ -41,16 +41,17 @@ CONFIG = RunConfig(
 class MadeUpActor(threading.Thread):
     """Sends rollouts of random observations until the run ends; keeps the versions that it acted with."""
 
-    def __init__(self, transport, name: str = "a", reward: float = 1.0, links: float = 3.0):
+    def __init__(self, transport, name: str = "a", reward: float = 1.0, links: float = 3.0, journal=None):
         super().__init__(daemon=True)
         self.versions: list[int] = []
         self.ended = ""
         self.stop = threading.Event()
         self._transport, self._actor, self._reward, self._links = transport, name, reward, links
+        self._journal = journal
         self.start()
 
     def run(self) -> None:
-        with ActorLink(self._transport, CONFIG.name, self._actor, patience=30.0) as link:
+        with ActorLink(self._transport, CONFIG.name, self._actor, patience=30.0, journal=self._journal) as link:
             try:
                 link.config(30.0)
                 self._act(link)

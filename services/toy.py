@@ -1,15 +1,18 @@
-"""A continuous-control task of a few numbers, for tests of learning: a point on a line moves to its goal.
+"""A continuous-control task of a few numbers, to see within seconds whether something learns: a point goes to its goal.
 
 The action in [-1, 1] moves the point by half of it; the reward is minus the distance after the move; an episode has ten
 steps. The goal is uniform in [-1, 1]. Standing still returns -10 E|g| = -5; halving the distance at every step returns
 -E|g| (1 - 2^-10), about -0.5; the best possible is -E[max(|g| - 1/2, 0)] = -0.125.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from common.config import NetworkConfig, PPOConfig, TaskConfig
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, PolicySpec
+from common.task.types import Array
 from learner.update import TrainState
 
 STANDING_STILL = -5.0
@@ -29,12 +32,15 @@ PPO = PPOConfig(epochs=4, minibatches=4, gamma=0.9, reward_scale=1.0, learning_r
 
 
 def observe(position: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Observations (B, D) of positions and goals (B,), in units that need normalising."""
     observation = np.zeros((len(position), sum(size for _, size in LAYOUT)), np.float32)
     observation[:, 0], observation[:, 1], observation[:, 2] = position, 7.0 + 100.0 * goal, goal - position
     return observation
 
 
-def episode(act, worlds: int, rng: np.random.Generator, reach: float = 1.0) -> dict[str, np.ndarray]:
+def episode(
+    act: Callable[[np.ndarray], tuple[Array, Array]], worlds: int, rng: np.random.Generator, reach: float = 1.0
+) -> dict[str, np.ndarray]:
     """A batch of whole episodes; `act` maps observations to actions and log probabilities, goals lie within `reach`."""
     goal, position = rng.uniform(-reach, reach, worlds), np.zeros(worlds)
     rows = []
@@ -50,13 +56,16 @@ def episode(act, worlds: int, rng: np.random.Generator, reach: float = 1.0) -> d
 
 
 def bundle_of(state: TrainState, epoch: str = "toy") -> PolicyBundle:
+    """The policy of a training state."""
     return PolicyBundle(
         SPEC, TaskConfig(), state.params, state.observation, state.value, state.version, epoch, state.transitions
     )
 
 
 def mean_return(bundle: PolicyBundle, worlds: int = 200) -> float:
-    def act(observation):
+    """Mean return of the policy's mean actions over fixed goals."""
+
+    def act(observation: np.ndarray) -> tuple[Array, Array]:
         return bundles.mean_action(SPEC.layout, bundle.acting, observation), np.zeros(len(observation))
 
     return float(episode(act, worlds, np.random.default_rng(123))["reward"].sum(0).mean())

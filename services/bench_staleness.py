@@ -1,0 +1,56 @@
+"""What old rollouts cost: the decoupled objective and plain PPO at an artificial lag, beside on-policy training."""
+
+import collections
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from common.config import PPOConfig
+from common.policy import bundle as bundles
+from learner import update as updates
+from services import toy
+
+PPO = dataclasses.replace(
+    toy.PPO, epochs=8, minibatches=4, learning_rate=3e-3, learning_rate_range=(1e-5, 1e-2), kl_target=0.05
+)
+"""A brisk pace: what is lost to old rollouts shows within a few updates."""
+
+
+class Setting(NamedTuple):
+    """One way to train."""
+
+    name: str
+    lag: int
+    decoupled: bool
+
+
+def settings(lag: int) -> list[Setting]:
+    """On-policy training, against which the others are measured, and both objectives at a lag."""
+    return [
+        Setting("on-policy", 0, True),
+        Setting(f"decoupled, lag {lag}", lag, True),
+        Setting(f"plain PPO, lag {lag}", lag, False),
+    ]
+
+
+def returns(setting: Setting, seed: int, count: int, worlds: int, ppo: PPOConfig = PPO) -> np.ndarray:
+    """Mean returns (count,) after each update of a training whose rollouts are all `setting.lag` versions old."""
+    ppo = dataclasses.replace(ppo, decoupled=setting.decoupled)
+    state = updates.init_state(seed, toy.LAYOUT, 1, toy.SPEC.network, ppo)
+    past = collections.deque([toy.bundle_of(state)], maxlen=setting.lag + 1)
+    rng, key = np.random.default_rng(seed), jax.random.PRNGKey(seed)
+    curve = []
+    for _ in range(count):
+        actor = past[0]
+
+        def act(observation: np.ndarray, actor: bundles.PolicyBundle = actor) -> tuple[jax.Array, jax.Array]:
+            nonlocal key
+            key, sample = jax.random.split(key)
+            return bundles.sample_action(toy.LAYOUT, actor.acting, observation, sample)
+
+        state, _ = updates.update(state, toy.episode(act, worlds, rng), toy.LAYOUT, ppo)
+        past.append(toy.bundle_of(state))
+        curve.append(toy.mean_return(past[-1]))
+    return np.array(curve)

@@ -1,0 +1,128 @@
+"""A disk that is full under a run: training goes on and says so in one line; with room again, nothing was lost."""
+
+import dataclasses
+import pathlib
+import shutil
+import subprocess
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from common.errors import CongraspError
+from common.journal import AUDIT, Journal, read_journal
+from common.logs.reader import read_metrics, read_records
+from common.logs.recorder import Recorder
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.wire.codec import Message
+from learner.process import LOGS, create_run, run_learner
+from services.audit import audit
+from tests.learner.test_process import CONFIG, MadeUpActor
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A file system of 400 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = shutil.which("mount") or "mount"
+    command = [mount, "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)]
+    if not shutil.which("mount") or subprocess.run(command, capture_output=True, timeout=10).returncode:
+        pytest.skip("file systems cannot be mounted here")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], timeout=10, check=True)
+
+
+def fill(place: pathlib.Path) -> pathlib.Path:
+    filler = place / "filler"
+    with filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
+        while True:
+            file.write(bytes(1024))
+    return filler
+
+
+def eventually(look):
+    deadline = time.monotonic() + 30.0
+    while not look():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def publish_noise(transport):
+    """More metrics than fit into what is left of a page."""
+    noise = {str(i): value for i, value in enumerate(np.random.default_rng().normal(size=500))}
+    meta = {"time": 0.0, "update": 8, "values": noise}
+    transport.publish(Keys(CONFIG.name).log("metrics", "test", "0"), Message(meta=meta))
+
+
+@pytest.mark.timeout(120)
+def test_training_goes_on_over_a_full_disk(disk, tmp_path):
+    config = dataclasses.replace(CONFIG, updates=12, checkpoint_every=2)
+    run_dir = disk / "run"
+    create_run(run_dir, config)
+    hub = MemoryHub()
+    journal = tmp_path / "actor.jsonl"
+    actor = MadeUpActor(MemoryTransport(hub), journal=Journal(journal))
+    said, complaints, filler = [], [], []
+    with MemoryTransport(hub) as transport:
+        recorder = Recorder(transport, config.name, run_dir / LOGS, complain=complaints.append)
+
+        def on_update(values):
+            if values["update"] == 4:
+                eventually(lambda: recorder.files and list(read_records(recorder.files[0])))
+                filler.append(fill(disk))
+            if values["update"] == 8:
+                eventually(lambda: publish_noise(transport) or recorder.error)
+                filler[0].unlink()
+
+        last = run_learner(
+            run_dir, config, transport, stop_event=threading.Event(), recorder=recorder,
+            on_update=on_update, on_event=lambda level, text: said.append((level, text)),
+        )  # fmt: skip
+    actor.join(10.0)
+    assert last.version == 12 and actor.ended == "The run is finished."
+    errors = [text for level, text in said if level == "error"]
+    for update in (6, 7):  # tried again after each update
+        assert any(f"checkpoint_00000000{update}.safetensors could not be written" in text for text in errors)
+    assert not any("\n" in text for text in errors)
+    assert complaints == [recorder.error] and "No space left" in recorder.error
+    assert (run_dir / "checkpoints" / "latest").resolve().name == "checkpoint_000000012.safetensors"
+    assert int((run_dir / "version").read_text()) == 12
+    assert len(read_metrics(run_dir)["learner/0/kl"][0]) >= 1  # what was recorded before
+    report = audit(run_dir, [journal])
+    assert not report.faults
+    assert report.holes or report.counts["used"] == 24
+
+
+def test_a_journal_says_how_many_lines_a_full_disk_cost_it(disk):
+    complaints = []
+    journal = Journal(disk / AUDIT / "x.jsonl", complaints.append)
+    journal.write(line=0)
+    filler = fill(disk)
+    for line in range(1, 400):
+        journal.write(line=line)
+    assert len(complaints) == 1 and "No space left" in complaints[0]
+    filler.unlink()
+    journal.write(line=400)
+    journal.write(line=401)
+    entries = list(read_journal(disk / AUDIT / "x.jsonl"))
+    *before, after, last = entries
+    assert [entry["line"] for entry in before] == [*range(len(before))]
+    assert (after, last) == ({"line": 400, "lost": 400 - len(before)}, {"line": 401})
+
+
+@pytest.mark.timeout(120)
+def test_a_run_that_cannot_leave_its_last_checkpoint_says_so(disk):
+    config = dataclasses.replace(CONFIG, updates=3, checkpoint_every=2)
+    create_run(disk / "run", config)
+    hub = MemoryHub()
+    MadeUpActor(MemoryTransport(hub))
+    with MemoryTransport(hub) as transport, pytest.raises(CongraspError, match=r"000000003\..*could not be") as caught:
+        run_learner(
+            disk / "run", config, transport, stop_event=threading.Event(),
+            on_update=lambda values: values["update"] == 3 and fill(disk),
+        )  # fmt: skip
+    assert "\n" not in str(caught.value)
+    assert (disk / "run" / "checkpoints" / "latest").resolve().name == "checkpoint_000000002.safetensors"
