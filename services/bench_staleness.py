@@ -6,16 +6,16 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
 from common.config import PPOConfig
 from common.policy import bundle as bundles
 from learner import update as updates
 from services import toy
 
-PPO = dataclasses.replace(
-    toy.PPO, epochs=8, minibatches=4, learning_rate=3e-3, learning_rate_range=(1e-5, 1e-2), kl_target=0.05
-)
-"""A brisk pace: what is lost to old rollouts shows within a few updates."""
+PPO = dataclasses.replace(toy.PPO, epochs=16, learning_rate=5e-3, learning_rate_range=(1e-5, 1e-2), kl_target=0.02)
+"""Many epochs over few samples, so that the trust region matters."""
 
 
 class Setting(NamedTuple):
@@ -54,3 +54,29 @@ def returns(setting: Setting, seed: int, count: int, worlds: int, ppo: PPOConfig
         past.append(toy.bundle_of(state))
         curve.append(toy.mean_return(past[-1]))
     return np.array(curve)
+
+
+def bench_staleness(lag: int, seeds: int, count: int, worlds: int) -> None:
+    """Prints returns after a quarter, half and all of the updates, and their share of the on-policy gain."""
+    marks = [count // 4, count // 2, count]
+    table = Table(
+        "", *(f"return after {mark} updates" for mark in marks), *(f"share after {mark}" for mark in marks),
+        title=f"Means of {seeds} seeds and their standard deviations; {worlds} episodes an update",
+    )  # fmt: skip
+    reference = None
+    for setting in settings(lag):
+        curves = np.array([returns(setting, seed, count, worlds) for seed in range(seeds)])
+        found = curves[:, np.array(marks) - 1]
+        mean = found.mean(0)
+        reference = mean if reference is None else reference
+        share = (mean - toy.STANDING_STILL) / (reference - toy.STANDING_STILL)
+        table.add_row(
+            setting.name,
+            *(f"{value:.3f} ± {spread:.3f}" for value, spread in zip(mean, found.std(0), strict=True)),
+            *(f"{100 * value:.1f} %" for value in share),
+        )
+    console = Console()
+    console.print(table)
+    console.print(
+        f"Standing still returns {toy.STANDING_STILL:g}; the share is of what on-policy training gains on it."
+    )

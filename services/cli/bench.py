@@ -99,4 +99,19 @@ def security(repeats: int = 5) -> int:
     return 0
 
 
-COMMANDS = {"physics": physics, "query": query, "shutdown": shutdown, "security": security}
+def staleness(lag: int = 4, seeds: int = 5, updates: int = 40, worlds: int = 32) -> int:
+    """Return of the decoupled objective and of plain PPO on old rollouts, beside on-policy training, on a small task.
+
+    Args:
+      lag: Versions by which every rollout is behind.
+      seeds: Trainings of each kind.
+      updates: Updates of each training.
+      worlds: Episodes in one update.
+    """
+    from services.bench_staleness import bench_staleness
+
+    bench_staleness(lag, seeds, updates, worlds)
+    return 0
+
+
+COMMANDS = {"physics": physics, "query": query, "shutdown": shutdown, "security": security, "staleness": staleness}

@@ -1,0 +1,120 @@
+"""Resume is resume: a learner that is killed with SIGKILL and goes on ends with the bits of one that was not."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from common.errors import TransportError
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.wire.codec import Message, decode
+from learner.audit import journal_path, replay
+from learner.process import create_run, open_run, run_learner
+from tests.learner.test_process import CONFIG
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+UPDATES, EVERY, KILLED_AFTER = 8, 3, 5
+RUN = dataclasses.replace(CONFIG, updates=UPDATES, checkpoint_every=EVERY)
+STEPS, WORLDS, BATCH = RUN.rollout_steps, RUN.environments, RUN.ppo.rollouts_per_update
+
+
+def rollout(number, bundle):
+    """The same whatever policy is asked for it."""
+    rng = np.random.default_rng(number)
+    size = sum(width for _, width in bundle.meta["layout"])
+    observation = rng.normal(size=(STEPS + 1, WORLDS, size)).astype(np.float16)
+    arrays = {
+        "observation": observation[:-1],
+        "last_observation": observation[-1],
+        "action": rng.normal(size=(STEPS, WORLDS, bundle.meta["action_size"])).astype(np.float32),
+        "log_probability": rng.normal(-40.0, 1.0, size=(STEPS, WORLDS)).astype(np.float32),
+        "reward": rng.normal(size=(STEPS, WORLDS)).astype(np.float32),
+        "terminal": rng.random((STEPS, WORLDS)) < 0.3,
+    }
+    who = {"actor": "a", "incarnation": "01", "sequence": number, "ticket": ""}
+    return Message(arrays, {**who, **{name: bundle.meta[name] for name in ("version", "epoch", "schema")}, "steps": 8})
+
+
+def feed(hub):
+    """Sends every update the rollouts of its number, and no others."""
+    keys, known, transport = Keys(RUN.name), None, MemoryTransport(hub)
+    while True:
+        try:
+            bundle = transport.query(keys.weights, Message(meta={"newer_than": -1}), timeout=5)
+            if not bundle.arrays or bundle.meta["version"] == known:
+                time.sleep(0.005)
+                continue
+            update = bundle.meta["transitions"] // (BATCH * STEPS * WORLDS)
+            for number in range(update * BATCH, (update + 1) * BATCH):
+                message = rollout(number, bundle)
+                while transport.query(keys.rollout("a"), message, timeout=5).meta["outcome"] != "accepted":
+                    time.sleep(0.005)
+            known = bundle.meta["version"]
+        except TransportError:
+            time.sleep(0.01)
+
+
+def train(run_dir, resume, killed_after):
+    """A learner's life; with `killed_after`, it ends by SIGKILL right after that update."""
+    hub = MemoryHub()
+    threading.Thread(target=feed, args=(hub,), daemon=True).start()
+    with MemoryTransport(hub) as transport:
+        run_learner(
+            run_dir, open_run(run_dir), transport, stop_event=threading.Event(), resume=resume,
+            on_update=lambda values: values["update"] == killed_after and os.kill(os.getpid(), signal.SIGKILL),
+        )  # fmt: skip
+
+
+def in_a_process(run_dir, resume, killed_after=0):
+    script = (
+        "import pathlib, sys; from tests.e2e.test_resume import train;"
+        "train(pathlib.Path(sys.argv[1]), sys.argv[2] == 'resume', int(sys.argv[3]))"
+    )
+    command = [sys.executable, "-c", script, str(run_dir), "resume" if resume else "begin", str(killed_after)]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, env=environment, timeout=120, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.timeout(300)
+def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
+    for name in ("straight", "killed"):
+        create_run(tmp_path / name, RUN)
+    straight = in_a_process(tmp_path / "straight", resume=False)
+    assert straight.returncode == 0, straight.stderr
+    assert in_a_process(tmp_path / "killed", resume=False, killed_after=KILLED_AFTER).returncode == -signal.SIGKILL
+    assert (tmp_path / "killed" / "checkpoints" / "latest").resolve().name.endswith(f"{EVERY}.safetensors")
+    resumed = in_a_process(tmp_path / "killed", resume=True)
+    assert resumed.returncode == 0, resumed.stderr
+
+    ends = []
+    for name in ("straight", "killed"):
+        data = (tmp_path / name / "checkpoints" / "latest").read_bytes()
+        arrays = dict(decode(data).arrays)
+        ends.append((json.loads(arrays.pop("meta").tobytes()), arrays))
+    (straight_meta, straight_arrays), (meta, arrays) = ends
+    # Parameters, the optimiser's moments, rate, random key, normalisers, and counters.
+    assert {name.split("/")[0] for name in arrays} >= {"params", "optimizer", "learning_rate", "key", "observation"}
+    assert arrays.keys() == straight_arrays.keys() and len(arrays) > 20
+    for name, array in arrays.items():
+        assert array.dtype == straight_arrays[name].dtype
+        assert array.tobytes() == straight_arrays[name].tobytes(), name
+    assert (arrays["version"], arrays["transitions"]) == (UPDATES, UPDATES * BATCH * STEPS * WORLDS)
+    books, straight_books = meta["hub"]["ledger"], straight_meta["hub"]["ledger"]
+    lost = (KILLED_AFTER - EVERY) * BATCH
+    assert (books["undone"], straight_books["undone"]) == (lost, 0)
+    assert {**books, "undone": 0} == straight_books  # all else as if nothing had happened
+    assert meta["skipped"] == KILLED_AFTER - EVERY + 1  # versions are never given out twice
+    standing, undone = replay(
+        json.loads(line) for line in journal_path(tmp_path / "killed", "0").read_text().split("\n") if line
+    )
+    assert [use.sequence for use in standing] == [*range(UPDATES * BATCH)]
+    assert len(undone) == lost
