@@ -60,8 +60,8 @@ def bench_staleness(lag: int, seeds: int, count: int, worlds: int) -> None:
     """Prints returns after a quarter, half and all of the updates, and their share of the on-policy gain."""
     marks = [count // 4, count // 2, count]
     table = Table(
-        "", *(f"return after {mark} updates" for mark in marks), *(f"share after {mark}" for mark in marks),
-        title=f"Means of {seeds} seeds and their standard deviations; {worlds} episodes an update",
+        "", *(f"after {mark} updates" for mark in marks),
+        title=f"Return: mean of {seeds} seeds ± standard deviation, share of the on-policy gain",
     )  # fmt: skip
     reference = None
     for setting in settings(lag):
@@ -70,10 +70,9 @@ def bench_staleness(lag: int, seeds: int, count: int, worlds: int) -> None:
         mean = found.mean(0)
         reference = mean if reference is None else reference
         share = (mean - toy.STANDING_STILL) / (reference - toy.STANDING_STILL)
+        rows = zip(mean, found.std(0), share, strict=True)
         table.add_row(
-            setting.name,
-            *(f"{value:.3f} ± {spread:.3f}" for value, spread in zip(mean, found.std(0), strict=True)),
-            *(f"{100 * value:.1f} %" for value in share),
+            setting.name, *(f"{value:.3f} ± {spread:.3f}, {100 * part:.1f} %" for value, spread, part in rows)
         )
     console = Console()
     console.print(table)

@@ -77,6 +77,11 @@ class Recorder:
         return self._subscription.dropped
 
     @property
+    def native_id(self) -> int | None:
+        """The kernel's number of the recorder's thread; None before it starts."""
+        return self._thread.native_id
+
+    @property
     def files(self) -> list[pathlib.Path]:
         """The files so far, the one being written last."""
         return list(self._writer.files) if self._writer else []

@@ -78,7 +78,8 @@ class LogWriter:
             self._writer.add_message(channel, entry.time, entry.data, entry.time, sequence)
 
     def _is_over(self, file: IO[bytes], time: int) -> bool:
-        return file.tell() > self._max_bytes or time - self._first > self._max_ns
+        # A clock that was set back must not keep a file open for ever.
+        return file.tell() > self._max_bytes or abs(time - self._first) > self._max_ns
 
     def flush(self) -> None:
         """Hands everything so far to the operating system; a killed writer loses only what comes after.

@@ -114,4 +114,39 @@ def staleness(lag: int = 4, seeds: int = 5, updates: int = 40, worlds: int = 32)
     return 0
 
 
-COMMANDS = {"physics": physics, "query": query, "shutdown": shutdown, "security": security, "staleness": staleness}
+def faults(actors: int = 3, repeats: int = 3) -> int:
+    """Seconds until a run notices and gets over killed and stopped actors and a killed learner, and its audit.
+
+    Args:
+      actors: Actor processes.
+      repeats: How often each is killed.
+    """
+    from services.bench_faults import bench_faults
+
+    bench_faults(actors, repeats)
+    return 0
+
+
+def recording(actors: int = 2, seconds: float = 20.0, turns: int = 3) -> int:
+    """Throughput of a small run with and without a recorder, in turns.
+
+    Args:
+      actors: Actor processes.
+      seconds: Length of a turn.
+      turns: Turns of each kind.
+    """
+    from services.bench_recording import bench_recording
+
+    bench_recording(actors, seconds, turns)
+    return 0
+
+
+COMMANDS = {
+    "physics": physics,
+    "query": query,
+    "shutdown": shutdown,
+    "security": security,
+    "staleness": staleness,
+    "faults": faults,
+    "recording": recording,
+}

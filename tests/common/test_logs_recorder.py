@@ -2,7 +2,9 @@
 
 import errno
 import json
+import os
 import pathlib
+import re
 import signal
 import subprocess
 import sys
@@ -222,6 +224,52 @@ def test_a_killed_recorder_leaves_a_readable_file_and_the_run_goes_on(
     steps, _ = read_metrics(tmp_path / "out")["learner/0/kl"]
     assert len(steps) > 20
     np.testing.assert_array_equal(np.diff(steps), 1)
+    assert doctor(path) <= CUT
+
+
+CUT = {
+    *("BAD_TRAILING_MAGIC", "MISSING_FOOTER", "MISSING_DATA_END", "MISSING_CHUNK_INDEXES", "MISSING_METADATA_INDEXES"),
+    *("MISSING_STATISTICS", "NO_ATTACHMENTS", "TRUNCATED_RECORD", "TRUNCATED_FILE"),
+}
+"""What `pymcap-cli doctor` may say about a file whose writer was killed: its end is missing, and nothing is wrong."""
+
+
+def doctor(path: pathlib.Path) -> set[str]:
+    """The codes of what it says."""
+    command = [sys.executable, "-m", "pymcap_cli.cli", "doctor", str(path)]
+    environment = {**os.environ, "COLUMNS": "400"}
+    said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=environment).stdout
+    return set(re.findall(r"\b[A-Z]+(?:_[A-Z]+)+\b", said))
+
+
+def test_a_stopped_recorder_holds_nobody_up(free_port: Callable[[], int], tmp_path: pathlib.Path) -> None:
+    """Twenty megabytes are published at it, more than it may keep; when it goes on, it says how much it missed."""
+    endpoint = free_endpoint(free_port)
+    big, big_size = Message({"x": np.zeros(250_000, np.float32)}, {"actor": "a"}), 1_000_000
+    rollouts = KEYS.log("rollout", "actor", "a")
+
+    def sizes() -> list[int]:
+        records = (record for path in log_files(tmp_path / "out") for record in read_records(path))
+        return [len(record.data) for record in records if record.topic.startswith("/rollout/")]
+
+    with ZenohTransport(listen=[endpoint]) as transport:
+        process = start_recorder(endpoint, tmp_path / "out")
+        try:
+            publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
+            process.send_signal(signal.SIGSTOP)
+            for _ in range(20):
+                transport.publish(rollouts, big)
+            process.send_signal(signal.SIGCONT)
+            small = Message({"x": np.zeros(1, np.float32)}, {"actor": "a"})  # by which a gap shows
+            wait_for(lambda: transport.publish(rollouts, small) or min(sizes(), default=big_size) < big_size)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=10)
+        finally:
+            process.kill()
+            process.wait(10)
+    found = re.search(r"lost (\d+)", errors.splitlines()[-1])
+    assert found is not None
+    assert sum(size >= big_size for size in sizes()) + int(found[1]) >= 20 and int(found[1]) > 0
 
 
 def test_a_recorder_without_a_run_says_so(free_port: Callable[[], int], tmp_path: pathlib.Path) -> None:
