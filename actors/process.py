@@ -119,6 +119,7 @@ class _Actor:
     def act(self, stop: threading.Event) -> None:
         """Rollouts until `stop` is set or the run ends."""
         try:
+            self._warm_up(stop)
             while not stop.is_set():
                 ticket = self._link.acquire_ticket(_TICKET_SECONDS)
                 if ticket is None:
@@ -132,6 +133,24 @@ class _Actor:
         finally:
             self._physics.close()
 
+    def _warm_up(self, stop: threading.Event) -> None:
+        """Compiles before the first ticket is asked for, whose rollout would be too old by the time that it is made."""
+        while not self._refresh():
+            if stop.is_set():
+                return
+            if ticket := self._link.acquire_ticket(_TICKET_SECONDS):  # waits for the learner, but not for ever
+                self._link.give_back(ticket)
+        assert self._bundle is not None
+        self._configure(self._bundle.version)
+        self._worker.collect(self._bundle.acting, self._config.rollout_steps)
+        self._worker.restart()
+
+    def _configure(self, version: int) -> None:
+        config = self._config
+        self._worker.configure(
+            config.curriculum.weights(config.task.reward, version), stationary=config.curriculum.stationary(version)
+        )
+
     def _refresh(self) -> bool:
         """Takes the newest policy; whether there is one at all."""
         message = self._link.weights(-1 if self._bundle is None else self._bundle.version)
@@ -144,10 +163,7 @@ class _Actor:
     def _rollout(self, bundle: PolicyBundle, ticket: Ticket) -> None:
         config, env = self._config, self._worker.env
         began = time.monotonic()
-        self._worker.configure(
-            config.curriculum.weights(config.task.reward, bundle.version),
-            stationary=config.curriculum.stationary(bundle.version),
-        )
+        self._configure(bundle.version)
         started_fresh = bool(np.asarray(env.time)[0] == 0)
         rollout = self._worker.collect(bundle.acting, config.rollout_steps)
         steps = config.rollout_steps * config.environments

@@ -85,6 +85,9 @@ class InventedWorker:
     def collect(self, parameters, steps):
         return self.rollout
 
+    def restart(self):
+        pass
+
 
 @pytest.fixture
 def heard(monkeypatch):
