@@ -154,6 +154,20 @@ def test_an_actor_whose_certificate_came_later_works_at_once(run):
         assert link.upload(rollout(T, 0, 0), link.acquire_ticket(5)).result(10) == "accepted"
 
 
+def test_an_actor_finds_a_learner_that_comes_back_and_its_rules_hold(certs):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    mine, learner = Credentials(certs / "actor.0", "actor"), Credentials(certs / "learner.0", "learner")
+    flows = ("control",)
+    server = ZenohTransport(listen=[endpoint], credentials=learner, flows=flows)
+    with ZenohTransport(connect=[endpoint], credentials=mine, flows=flows) as actor:
+        server.close()
+        with ZenohTransport(listen=[endpoint], credentials=learner, flows=flows) as server:
+            for keys in (KEYS.tickets, KEYS.status):
+                server.serve(keys, lambda key, request: Message(meta={"here": True}))
+            wait_for(lambda: answers(actor, KEYS.ticket(ME)))
+            assert answers(actor, KEYS.ticket(OTHER)) is None and answers(actor, KEYS.status) is None
+
+
 # --- what is not allowed ---
 
 EVERYTHING = {
