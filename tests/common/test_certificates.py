@@ -1,6 +1,7 @@
 """The authority and its certificates, as files and as OpenSSL sees them."""
 
 import datetime
+import shutil
 import stat
 import subprocess
 
@@ -27,6 +28,7 @@ def test_a_certificate_says_role_number_hosts_and_end(folder):
     assert [one.name for one in certificates(folder)] == ["ca", "actor.0", "learner.0", "learner.1"]
 
 
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="the command openssl is not here")
 def test_openssl_agrees_who_may_listen(folder, tmp_path):
     create_authority(tmp_path / "other")
 
