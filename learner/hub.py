@@ -179,10 +179,12 @@ class LearnerHub:
             for alive in sorted(self._alive):
                 marks = self._marks.get((alive.id, alive.incarnation)) if alive.role == "actor" else None
                 entry = {"rollouts": marks.rollouts, "version": marks.version} if marks else {}
+                entry |= {"lag": self.lag(marks.version)} if marks and marks.rollouts else {}
                 own = [steps for _, owner, steps in self._arrivals if owner == (alive.id, alive.incarnation)]
                 roles.append({**alive._asdict(), **entry, **(_rates(own, span) if alive.role == "actor" else {})})
             return {
                 **self._state(),
+                "time": time.time(),
                 "run": self.keys.run,
                 "schema": self._schema,
                 "roles": roles,

@@ -5,6 +5,7 @@ import pathlib
 import random
 import secrets
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -61,6 +62,16 @@ def attempts(tries: int, within: float, seed: int = 0) -> Iterator[Try]:
         with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
             command = [sys.executable, "-m", "services.cli.main", *SMALL, "--run-dir", str(pathlib.Path(folder, "run"))]
             yield attempt(command, moments.uniform(0.0, within), signal.SIGTERM if number % 2 else signal.SIGINT)
+
+
+def summary(tries: Sequence[Try]) -> str:
+    """What came of tries, in a line."""
+    seconds = [one.seconds for one in tries] or [0.0]
+    return (
+        f"{sum(one.fine for one in tries)} of {len(tries)} ended within {LIMIT:g} s with no orphan; "
+        f"median {statistics.median(seconds):.2f} s, longest {max(seconds):.2f} s, "
+        f"{sum(len(one.orphans) for one in tries)} orphan(s)"
+    )
 
 
 def attempt(command: Sequence[str], after: float, number: signal.Signals) -> Try:

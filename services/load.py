@@ -14,7 +14,7 @@ import numpy as np
 
 from common.errors import CongraspError, TransportError
 from services.client import PolicyClient
-from services.shutdown import PARENT_VARIABLE
+from services.shutdown import PARENT_VARIABLE, take_along
 from services.train import free_port
 
 
@@ -37,6 +37,7 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[str]:
             env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
             start_new_session=True,
         )
+    take_along(server)
     try:
         yield endpoint
     finally:

@@ -5,15 +5,19 @@ import ctypes
 import os
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 
-GRACE = 4.0
+GRACE = 3.5
 """Seconds between a signal and the end of the process at the latest."""
 PARENT_VARIABLE = "CONGRASP_PARENT"
 """Environment variable by which a process tells its children that they must not outlive it."""
+_REAP = 0.5  # seconds for all children to be gone
+_children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 
 
 class Stop(threading.Event):
@@ -61,7 +65,7 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
         with contextlib.suppress(TimeoutError):
             if not reader.recv(1):  # the block has ended; what follows it has the rest of the time
                 time.sleep(max(0.0, ends - time.monotonic()))
-        os._exit(stop.exit_code)
+        _end(stop.exit_code)
 
     def handle(number: int, frame: object) -> None:
         if interrupt:
@@ -77,6 +81,23 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
         for number, handler in previous.items():
             signal.signal(number, handler)
         writer.close()
+
+
+def take_along(child: subprocess.Popen[bytes]) -> None:
+    """Names a child that a forced end of this process ends, too."""
+    _children.add(child)
+
+
+def _end(code: int) -> None:
+    """Ends this process at once, and its children before it."""
+    children = list(_children)
+    for child in children:
+        child.kill()
+    deadline = time.monotonic() + _REAP
+    for child in children:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.wait(max(0.0, deadline - time.monotonic()))
+    os._exit(code)
 
 
 def follow_parent() -> None:

@@ -23,17 +23,13 @@ _ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/
 
 
 def ask(transport: Transport, run: str) -> dict[str, Any]:
-    """What the learner of a run says, with `lag` for each role and `warnings` in words.
+    """What the learner of a run says, with `warnings` in words.
 
     Raises:
       TransportError: nobody answers for this run.
     """
     found = dict(transport.query(Keys(run).status, Message({}, {}), timeout=_TIMEOUT).meta)
-    roles = [
-        {**role, "lag": found["version"] - role["version"]} if role.get("version", -1) >= 0 else role
-        for role in found["roles"]
-    ]
-    return {**found, "roles": roles, "warnings": warnings(found)}
+    return {**found, "warnings": warnings(found)}
 
 
 def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, Any] | None]:

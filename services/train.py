@@ -21,10 +21,10 @@ from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.security import Credentials
 from common.transport.zenoh_transport import ZenohTransport
 from services.access import credentials, nearby
-from services.shutdown import GRACE, PARENT_VARIABLE
+from services.shutdown import GRACE, PARENT_VARIABLE, take_along
 
 MAX_RESTARTS = 5
-CHILD_GRACE = 2.5
+CHILD_GRACE = 2.0
 """Seconds in which a child may drain; then this process has time to end it before it must end itself (`GRACE`)."""
 _BAD_INPUT = 2
 _POLL = 0.25
@@ -55,6 +55,7 @@ class Child:
                 env=environment,
                 start_new_session=True,
             )
+        take_along(self.process)
 
     def last_words(self) -> str:
         """The last line of its log."""

@@ -59,21 +59,18 @@ def shutdown(tries: int = 100, within: float = 45.0, seed: int = 0) -> int:
     """
     from rich.progress import track
 
-    from services.drain import LIMIT, attempts
+    from services.drain import Try, attempts, summary
 
-    results = []
-    for one in track(attempts(tries, within, seed), "shutting down", total=tries):
-        results.append(one)
-        if not one.fine:
-            left = f", left behind: {'; '.join(one.orphans)}" if one.orphans else ""
-            print(f"{one.signal} after {one.after:.1f} s: took {one.seconds:.1f} s{left}", flush=True)
-    seconds = sorted(one.seconds for one in results)
-    good = sum(one.fine for one in results)
-    print(
-        f"{good} of {tries} ended within {LIMIT:g} s with no orphan; median {seconds[len(seconds) // 2]:.2f} s, "
-        f"longest {seconds[-1]:.2f} s, {sum(len(one.orphans) for one in results)} orphan(s)"
-    )
-    return 0 if good == tries else 1
+    results: list[Try] = []
+    try:
+        for one in track(attempts(tries, within, seed), "shutting down", total=tries):
+            results.append(one)
+            if not one.fine:
+                left = f", left behind: {'; '.join(one.orphans)}" if one.orphans else ""
+                print(f"{one.signal} after {one.after:.1f} s: took {one.seconds:.1f} s{left}", flush=True)
+    finally:
+        print(summary(results), flush=True)
+    return 0 if all(one.fine for one in results) else 1
 
 
 def security(repeats: int = 5) -> int:

@@ -35,6 +35,8 @@ class Learner:
     """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
     resume: bool = False
     """Go on with the run in --run-dir, from its latest checkpoint if it has one."""
+    or_resume: bool = False
+    """Begin the run, or go on with it if --run-dir holds one: for supervisors that give the same command every time."""
     watch: Watched = dataclasses.field(default_factory=Watch)
     """How it is watched."""
 
@@ -83,4 +85,7 @@ def parse(arguments: list[str]) -> Callable[[], int]:
     name = preset_of(arguments)
     missing = tyro.MISSING
     default = Learner(config=get_preset(name), run_dir=missing, preset=name)
-    return tyro.cli(Learner, prog="congrasp learner", args=arguments, default=default).run
+    learner = tyro.cli(Learner, prog="congrasp learner", args=arguments, default=default)
+    if learner.or_resume and (learner.run_dir / "config.json").exists():
+        learner = dataclasses.replace(learner, resume=True)
+    return learner.run

@@ -8,6 +8,7 @@ import inspect
 import io
 import os
 import pathlib
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -38,6 +39,7 @@ COMMANDS = {
 """Commands in the order of the help; `services.cli.<name>` is the module."""
 
 USAGE_ERROR = 2
+SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXTRAS = {"foxglove": "viz", "imageio_ffmpeg": "viz", "matplotlib": "viz", "warp": "cuda"}
 
@@ -67,6 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug
         )
     _last_words(sys.stdout)
+    if code in SIGNALLED:  # no time for what an interpreter does at its end
+        os._exit(code)
     sys.exit(code)
 
 
@@ -153,10 +157,12 @@ def usage() -> str:
 
 
 def _prepare_environment() -> None:
-    """Keeps compiled programs between runs, and the compilers' chatter off the screen; what the user set stays."""
+    """Keeps compiled programs between runs, the compilers' chatter off the screen, and OpenGL, for which MuJoCo would
+    start processes, out; what the user set stays."""
     cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "jax"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    os.environ.setdefault("MUJOCO_GL", "disable")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 

@@ -14,6 +14,7 @@ def query(
     concurrency: int = 1,
     timeout: float = 1.0,
     certs: pathlib.Path | None = None,
+    health: bool = False,
     json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Ask a policy server for one action at the start of an episode, or measure its latency.
@@ -26,6 +27,7 @@ def query(
       concurrency: Clients that ask at the same time, each with a connection of its own.
       timeout: Seconds that one query may take.
       certs: Folder of a client's certificate (congrasp certs).
+      health: Ask only whether the server is ready; the exit code is 0 if it is, and 4 if it is not.
       json: Print JSON: p50_ms, p99_ms, answers_per_s, failed, overloaded.
     """
     import json as json_module
@@ -39,6 +41,10 @@ def query(
         raise CongraspError(f"--repeat {repeat} and --concurrency {concurrency} must be at least 1.")
     mine = credentials(certs, "client")
     certs = mine.folder if mine else None
+    if health:
+        with PolicyClient(connect, name, timeout=timeout, wait=timeout, certs=certs) as client:
+            print(json_module.dumps(client.health()))
+        return 0
     with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
         episode = example_episode(object_seed)
         if repeat == 1 and not json:

@@ -338,7 +338,9 @@ def test_status_names_everything(bench):
     status = b.ask(KEYS.status)
     assert status["run"] == "test" and status["version"] == 0 and status["queue"] == {"length": 1, "limit": 64}
     rates = {"rollouts_per_second": 1.0, "steps_per_second": T * B}
-    assert {"role": "actor", "id": "a", "incarnation": "01", "rollouts": 1, "version": 0, **rates} in status["roles"]
+    assert {"role": "actor", "id": "a", "incarnation": "01", "rollouts": 1, "version": 0, "lag": 0, **rates} in status[
+        "roles"
+    ]
     assert status["rates"] == rates
 
 

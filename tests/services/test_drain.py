@@ -29,6 +29,13 @@ def test_a_process_that_does_not_hear_is_a_failure(monkeypatch):
     assert found.seconds == float("inf") and not found.fine and found.processes == 1
 
 
+def test_a_summary_counts_what_was_not_fine():
+    tries = [drain.Try("SIGINT", 1.0, 4, seconds, (), 130) for seconds in (1.0, 2.0, 7.0)]
+    tries.append(drain.Try("SIGTERM", 1.0, 4, 3.0, ("actor", "learner"), 143))
+    words = "2 of 4 ended within 5 s with no orphan; median 2.50 s, longest 7.00 s, 2 orphan(s)"
+    assert drain.summary(tries) == words
+
+
 @pytest.mark.timeout(120)
 def test_a_run_that_starts_ends_when_it_is_told_to_and_leaves_nobody():
     for found in drain.attempts(2, within=8.0, seed=3):

@@ -73,6 +73,20 @@ def test_a_second_signal_ends_a_process_that_drains_for_long():
     assert process.returncode == 130
 
 
+def test_a_forced_end_takes_the_children_along():
+    child = "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'], start_new_session=True)"
+    code = STUCK.replace("import threading", "import subprocess, sys, threading").replace(
+        "    print(", f"    child = {child}\n    take_along(child)\n    print(child.pid, end=' ')\n    print("
+    )
+    with start(code.replace("import on_signal", "import on_signal, take_along")) as process:
+        pid, ready = process.stdout.readline().split()
+        child = psutil.Process(int(pid))
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=20)
+    assert ready == "ready" and process.returncode == 143
+    assert not child.is_running() or child.status() == psutil.STATUS_ZOMBIE
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="uses prctl")
 def test_a_child_dies_with_a_parent_that_was_killed():
     with start(PARENT) as parent:
