@@ -1,0 +1,171 @@
+"""What is in deploy/: valid by the published schemas, and made of command lines that this version understands."""
+
+import json
+import pathlib
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+
+import kubernetes_validate
+import pytest
+import yaml
+
+from services.cli.main import load
+from tests.conftest import ROOT
+
+DEPLOY = ROOT / "deploy"
+KUBERNETES = DEPLOY / "kubernetes"
+UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
+SCRIPTS = sorted(DEPLOY.rglob("*.sbatch"))
+VERSIONS = ("1.29", "1.37")  # of Kubernetes: the oldest and the newest
+
+
+def manifests(text=None):
+    files = [text] if text else [path.read_text() for path in KUBERNETES.glob("*.yaml")]
+    found = [document for file in files for document in yaml.safe_load_all(file) if "apiVersion" in document]
+    return [document for document in found if not document["apiVersion"].startswith("kustomize")]
+
+
+def compose_commands():
+    for name, service in yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"].items():
+        words = [re.sub(r"\$\{\w+:-(\w+)\}", r"\1", word) for word in service["command"]]
+        yield f"compose {name}", shlex.split(words[0].split("congrasp")[-1]) if name == "certs" else words
+        if test := service.get("healthcheck", {}).get("test"):
+            yield f"compose {name} health", test[2:]
+
+
+def kubernetes_commands():
+    for document in manifests():
+        if document["kind"] in ("StatefulSet", "Deployment"):
+            (container,) = document["spec"]["template"]["spec"]["containers"]
+            yield (
+                f"kubernetes {container['name']}",
+                [re.sub(r"\$\((\w+)\)", "human", word) for word in container["args"]],
+            )
+            if "exec" in container.get("readinessProbe", {}):
+                yield f"kubernetes {container['name']} probe", container["readinessProbe"]["exec"]["command"][1:]
+
+
+def unit_commands():
+    for unit in UNITS:
+        text = unit.read_text().replace("\\\n", "")
+        values = dict(
+            pair.split("=", 1) for line in re.findall("^Environment=(.*)", text, re.M) for pair in line.split()
+        )
+        command = re.search("^ExecStart=(.*)", text, re.M)[1]
+        for name, value in values.items():
+            command = command.replace(f"${{{name}}}", value).replace(f"${name}", value)
+        yield f"systemd {unit.name}", shlex.split(command.replace("%d", "/run/credentials"))[1:]
+
+
+def docker_commands():
+    text = (DEPLOY / "Dockerfile").read_text()
+    yield "docker", json.loads(re.search("^CMD (.*)", text, re.M)[1])
+    yield "docker health", json.loads(re.search("^HEALTHCHECK .* CMD (.*)", text, re.M)[1])[1:]
+
+
+COMMANDS = [*compose_commands(), *kubernetes_commands(), *unit_commands(), *docker_commands()]
+
+
+@pytest.mark.parametrize("arguments", [arguments for _, arguments in COMMANDS], ids=[name for name, _ in COMMANDS])
+def test_command_lines_are_understood(arguments):
+    """An option that no longer exists ends the parser, and so the test."""
+    assert callable(load(arguments[0])(arguments[1:]))
+
+
+def test_compose_file_fits_the_schema_of_compose():
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]
+    done = subprocess.run([*command, DEPLOY / "compose.yaml"], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_manifests_fit_the_schemas_of_kubernetes(version):
+    found = manifests()
+    for document in found:
+        kubernetes_validate.validate(document, version, strict=True)
+    assert {"StatefulSet", "Deployment", "Service", "HorizontalPodAutoscaler", "NetworkPolicy"} < {
+        document["kind"] for document in found
+    }
+
+
+def test_a_mistake_in_a_manifest_is_found():
+    (learner,) = (document for document in manifests() if document["kind"] == "StatefulSet")
+    learner["spec"]["replica"] = learner["spec"].pop("replicas")
+    with pytest.raises(kubernetes_validate.ValidationError, match="replica"):
+        kubernetes_validate.validate(learner, VERSIONS[-1], strict=True)
+
+
+def test_manifests_name_one_another_rightly():
+    found = manifests()
+    names = {(document["kind"], document["metadata"]["name"]) for document in found}
+    labels, ports = {}, {}
+    for document in found:
+        if document["kind"] in ("StatefulSet", "Deployment"):
+            template = document["spec"]["template"]
+            labels[document["metadata"]["name"]] = template["metadata"]["labels"]
+            assert document["spec"]["selector"]["matchLabels"] == template["metadata"]["labels"]
+            (container,) = template["spec"]["containers"]
+            ports[document["metadata"]["name"]] = {port["containerPort"] for port in container["ports"]}
+            mounted = {mount["name"] for mount in container["volumeMounts"]}
+            claims = {claim["metadata"]["name"] for claim in document["spec"].get("volumeClaimTemplates", ())}
+            assert mounted == {volume["name"] for volume in template["spec"]["volumes"]} | claims
+            assert template["spec"]["securityContext"]["runAsNonRoot"]
+    for document in found:
+        if document["kind"] == "Service":
+            assert document["spec"]["selector"] == labels[document["metadata"]["name"]]
+            assert {port["port"] for port in document["spec"]["ports"]} <= ports[document["metadata"]["name"]]
+        elif document["kind"] == "PodDisruptionBudget":
+            assert document["spec"]["selector"]["matchLabels"] in labels.values()
+        elif document["kind"] == "HorizontalPodAutoscaler":
+            target = document["spec"]["scaleTargetRef"]
+            assert (target["kind"], target["name"]) in names
+            (metric,) = document["spec"]["metrics"]
+            adapter = yaml.safe_load((KUBERNETES / "prometheus-adapter.yaml").read_text())["rules"]["external"]
+            assert metric["external"]["metric"]["name"] in {rule["name"]["as"] for rule in adapter}
+
+
+@pytest.mark.skipif(not shutil.which("kubectl"), reason="kubectl, which builds kustomizations, is not here")
+def test_kustomizations_build(tmp_path):
+    shutil.copytree(KUBERNETES, tmp_path / "k")
+    for name in ("learner.0", "actor.0", "server.0", "client.0"):
+        (tmp_path / "k" / "certificates" / name).mkdir()
+        for file in ("ca.crt", "tls.crt", "tls.key"):
+            (tmp_path / "k" / "certificates" / name / file).write_text("x")
+    built = []
+    for folder in (tmp_path / "k", tmp_path / "k" / "certificates"):
+        done = subprocess.run(["kubectl", "kustomize", folder], capture_output=True, text=True, timeout=60, check=True)
+        built += manifests(done.stdout)
+    secrets = {document["metadata"]["name"] for document in built if document["kind"] == "Secret"}
+    for document in built:
+        kubernetes_validate.validate(document, VERSIONS[-1], strict=True)
+        assert document["kind"] == "Namespace" or document["metadata"]["namespace"] == "congrasp"
+        if document["kind"] in ("StatefulSet", "Deployment"):
+            used = {
+                volume.get("secret", {}).get("secretName") for volume in document["spec"]["template"]["spec"]["volumes"]
+            }
+            assert used - {None} <= secrets
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="systemd-analyze is not here")
+def test_units_are_valid_and_confined(tmp_path):
+    copies = [tmp_path / unit.name for unit in UNITS]
+    for unit, copy in zip(UNITS, copies, strict=True):
+        copy.write_text(unit.read_text().replace("/opt/congrasp/bin/congrasp", sys.executable))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", *copies], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0 and not any(copy.name in done.stderr for copy in copies), done.stderr
+    for copy in copies:
+        confined = ["systemd-analyze", "security", "--offline=yes", "--threshold=25", "--no-pager", copy]
+        done = subprocess.run(confined, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+def test_scripts_pass_shellcheck(script):
+    for command in (["bash", "-n"], [str(pathlib.Path(sys.executable).with_name("shellcheck")), "--shell=bash"]):
+        done = subprocess.run([*command, script], capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
