@@ -142,8 +142,9 @@ class _Actor:
                 self._link.give_back(ticket)
         assert self._bundle is not None
         self._configure(self._bundle.version)
-        self._worker.collect(self._bundle.acting, self._config.rollout_steps)
-        self._worker.restart()
+        for _ in range(2):  # the second time, worlds have been restarted, which is traced apart
+            self._worker.collect(self._bundle.acting, self._config.rollout_steps)
+            self._worker.restart()
 
     def _configure(self, version: int) -> None:
         config = self._config
