@@ -107,6 +107,7 @@ def bench_faults(actors: int, repeats: int) -> None:
     """Prints seconds from a fault until it is noticed and until it is overcome, each time, and the run's audit."""
     seconds: dict[str, list[float]] = {}
     shares: list[float] = []
+    starts: list[float] = []
 
     def measure(what: str, since: float, look: Callable[[], Any]) -> None:
         _until(look)
@@ -116,7 +117,9 @@ def bench_faults(actors: int, repeats: int) -> None:
         run_dir = pathlib.Path(folder, "run")
         with _running(run_dir, actors) as run:
             for _ in range(repeats):
-                shares.append(_kill_actor(run, actors, measure))
+                share, busy = _kill_actor(run, actors, measure)
+                shares.append(share)
+                starts.append(busy)
                 _stop_actor(run, actors, measure)
                 _kill_learner(run, measure)
         table = Table("", "median, s", "longest, s", title=f"{actors} actors, {repeats} times each")
@@ -128,13 +131,17 @@ def bench_faults(actors: int, repeats: int) -> None:
             f"Throughput in the 5 s after a death, as a share of that before: "
             f"{', '.join(f'{share:.2f}' for share in shares)} ((N-1)/N is {(actors - 1) / actors:.2f})."
         )
+        console.print(
+            f"Processor seconds of a replacement until it contributed: {', '.join(f'{x:.1f}' for x in starts)}."
+        )
         report = audit(run_dir)
         console.print("Audit:", ", ".join(f"{name} {value}" for name, value in report.counts.items()))
         console.print(f"Lag: mean {report.lag_mean:.2f}, at most {report.lag_max} of {report.max_staleness}.")
 
 
-def _kill_actor(run: Victim, actors: int, measure: Measure) -> float:
-    """Kills the oldest actor; returns the throughput of the next seconds as a share of that before."""
+def _kill_actor(run: Victim, actors: int, measure: Measure) -> tuple[float, float]:
+    """Kills the oldest actor; returns the throughput of the next seconds as a share of that before, and the processor
+    seconds that its replacement took until it contributed."""
     before, known = run.rate(), run.actors()
     run.children("actor")[0].kill()
     killed = time.monotonic()
@@ -144,7 +151,8 @@ def _kill_actor(run: Victim, actors: int, measure: Measure) -> float:
     time.sleep(max(0.0, killed + _AFTER - time.monotonic()))
     share = (run.accepted() - counted) / (time.monotonic() - since) / before
     measure("actor killed: replacement contributes", killed, lambda: _new_contributes(run, known))
-    return share
+    times = run.children("actor")[-1].cpu_times()
+    return share, times.user + times.system
 
 
 def _stop_actor(run: Victim, actors: int, measure: Measure) -> None:
