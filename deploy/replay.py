@@ -24,6 +24,7 @@ from collections.abc import Iterator
 HERE = pathlib.Path(__file__).resolve().parent
 RELEASE = "bookworm"
 PACKAGES = "python3,python3-venv,ca-certificates"
+CHROOT = shutil.which("chroot") or "/usr/sbin/chroot"
 HEALTHY_SECONDS, END_SECONDS = 300.0, 5.0
 NETWORK = re.compile(r"PIP_(?!FIND_LINKS).*|.*_proxy|SSL_CERT_FILE|REQUESTS_CA_BUNDLE", re.IGNORECASE)
 """Settings of this machine without which the registry cannot be reached."""
@@ -50,7 +51,7 @@ class Stage:
 
     def start(self, command: list[str], extra: dict[str, str] | None = None) -> subprocess.Popen:
         """A process in the root, by the stage's user and in its folder."""
-        inside = ["chroot", f"--userspec={self.user}", str(self.root), "sh", "-c", 'cd "$0" && exec "$@"', self.cwd]
+        inside = [CHROOT, f"--userspec={self.user}", str(self.root), "sh", "-c", 'cd "$0" && exec "$@"', self.cwd]
         return subprocess.Popen([*inside, *command], env={**self.env, **(extra or {})})
 
 

@@ -12,6 +12,7 @@ import kubernetes_validate
 import pytest
 import yaml
 
+from services.cli.learner import Learner
 from services.cli.main import load
 from tests.conftest import ROOT
 
@@ -169,3 +170,24 @@ def test_scripts_pass_shellcheck(script):
     for command in (["bash", "-n"], [str(pathlib.Path(sys.executable).with_name("shellcheck")), "--shell=bash"]):
         done = subprocess.run([*command, script], capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.skipif(not hasattr(Learner, "rank"), reason="this version has no learner ranks")
+def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
+    """With stand-ins for Slurm's commands, the script starts the learner's ranks with arguments that it understands."""
+    stubs = {
+        "scontrol": "echo node-7; echo node-8",
+        "srun": 'while [ "$1" != bash ]; do shift; done; for i in 0 1; do SLURM_PROCID=$i "$@"; done',
+        "congrasp": 'for word in "$@"; do echo "$word"; done >> "$OUT/$SLURM_PROCID"',
+    }
+    for name, body in stubs.items():
+        (tmp_path / name).write_text(f"#!/usr/bin/env bash\n{body}\n")
+        (tmp_path / name).chmod(0o755)
+    environment = {"SLURM_NTASKS": "2", "SLURM_JOB_NODELIST": "node-[7-8]", "OUT": str(tmp_path), "HOME": str(tmp_path)}
+    script = ["bash", DEPLOY / "slurm" / "train.sbatch", "human", tmp_path / "a run", "--updates", "9"]
+    subprocess.run(script, env={**environment, "PATH": f"{tmp_path}:/usr/bin:/bin"}, timeout=60, check=True)
+    for rank in range(2):
+        arguments = (tmp_path / str(rank)).read_text().splitlines()
+        learner = load(arguments[0])(arguments[1:]).__self__
+        assert (learner.rank, learner.ranks, learner.coordinator) == (rank, 2, "node-7:7440")
+        assert learner.run_dir == tmp_path / "a run" and learner.config.updates == 9 and learner.inside
