@@ -114,23 +114,29 @@ class LearnerHub:
         transport.watch_alive(self.keys.everyone, self._on_alive)
         transport.declare_alive(self.keys.alive("learner", name, self.life))
 
-    def next_batch(self, count: int, timeout: float) -> list[Message] | None:
-        """The `count` rollouts of the oldest policies that are fresh enough; None if `timeout` seconds bring fewer."""
+    def has_batch(self, count: int, timeout: float) -> bool:
+        """Whether `next_batch` would find a batch; waits for it for at most `timeout` seconds, and takes nothing."""
         deadline = time.monotonic() + timeout
         with self._changed:
             while True:
                 self._drop_stale()
                 held = max(0.0, self._held_until - time.monotonic())
                 if len(self._queue) >= count and not held:
-                    waiting = sorted(self._queue, key=lambda entry: -self.lag(entry[0].version))
-                    batch, self._queue = waiting[:count], collections.deque(waiting[count:])
-                    for header, _ in batch:
-                        self._staleness.take(header.version)
-                    break
+                    return True
                 rest = deadline - time.monotonic()
                 if rest <= 0:
-                    return None
+                    return False
                 self._changed.wait(min(rest, held or rest))
+
+    def next_batch(self, count: int, timeout: float) -> list[Message] | None:
+        """The `count` rollouts of the oldest policies that are fresh enough; None if `timeout` seconds bring fewer."""
+        with self._changed:
+            if not self.has_batch(count, timeout):
+                return None
+            waiting = sorted(self._queue, key=lambda entry: -self.lag(entry[0].version))
+            batch, self._queue = waiting[:count], collections.deque(waiting[count:])
+            for header, _ in batch:
+                self._staleness.take(header.version)
         messages = [message for _, message in batch]
         if self._audit is not None:
             self._audit.used(self._staleness.version, [self.lag(header.version) for header, _ in batch], messages)

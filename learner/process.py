@@ -4,22 +4,28 @@ A run directory holds `config.json`, `initial.safetensors` where training does n
 `checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (what became of every rollout),
 `version` (the newest version that was ever published, so that versions rise over a crash, too) and, after an update
 that was not finite, `failure/`.
+
+Several ranks (`learner.ranks`) train one policy, each with actors of its own. The run directory is rank 0's; the others
+take configuration, state and versions from it, and write only journals and what failed. All are at the same update.
 """
 
 import contextlib
+import dataclasses
 import os
 import pathlib
 import secrets
 import threading
 import time
+import zlib
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from common.config import RunConfig, run_config_from_json, to_json
-from common.errors import CongraspError, PhysicsError
+from common.errors import CongraspError, PhysicsError, TransportError
 from common.files import write_atomically
 from common.logs.channels import finite
 from common.policy import bundle as bundles
@@ -30,12 +36,13 @@ from common.wire.codec import Message, encode
 from common.wire.messages import RolloutForm
 from learner import update as updates
 from learner.audit import AuditLog
-from learner.checkpoint import Checkpoints, flatten
+from learner.checkpoint import Checkpoints, flatten, restore
 from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
-from learner.statistics import Pace, episode_means, staleness
-from learner.update import NonFiniteUpdate
+from learner.ranks import Ranks, ended_by
+from learner.staleness import Ledger, StalenessManager
+from learner.statistics import Pace, overall, summary
+from learner.update import NonFiniteUpdate, TrainState
 
 POLICY_FILE = "policy.safetensors"
 INITIAL_FILE = "initial.safetensors"
@@ -45,9 +52,14 @@ _VERSION_FILE = "version"
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0
 _FAREWELL_SECONDS = 3.0
+_LEDGERS = "ledgers and marks of ranks that are gone are dropped, new ones begin with none"
 
 Notify = Callable[[str, str], None]
 """(level, text) of an event."""
+
+
+class ReplicasDiffer(CongraspError):
+    """The ranks have not come to the same weights."""
 
 
 def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle | None = None) -> None:
@@ -91,7 +103,7 @@ def run_learner(
     *,
     stop_event: threading.Event,
     resume: bool = False,
-    name: str = "0",
+    ranks: Ranks | None = None,
     audit: bool = True,
     recorder: contextlib.AbstractContextManager[object] | None = None,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
@@ -102,12 +114,13 @@ def run_learner(
     The run can be resumed in both cases, and after a crash from its last checkpoint.
 
     Args:
-      run_dir: made by `create_run`.
-      config: the run; when resuming, it may differ from the one that began it in what changes no array.
+      run_dir: made by `create_run`, if this is rank 0.
+      config: the run, the same for all ranks; when resuming, it may differ from the one that began it in what changes
+        no array.
       transport: the learner's endpoint; it stays the caller's.
       stop_event: ends training after the update that is under way.
-      resume: go on from the latest checkpoint.
-      name: the learner's name on the wire.
+      resume: go on from the latest checkpoint (of rank 0), which any number of ranks may have written.
+      ranks: the learner's processes, where there are several.
       audit: keep the journal in `audit/`; it needs rollouts on the host, so not where they stay on a device.
       recorder: entered while the learner runs, for example one that writes the run's logs.
       on_update: given the figures of every update.
@@ -115,17 +128,23 @@ def run_learner(
 
     Raises:
       CongraspError: the directory is not a run's; the checkpoint does not fit; the disk is full; a thread of this
-        process died; training collapsed.
+        process died; training collapsed; another rank ended the run.
       PhysicsError: a value was not finite; state and batch are in `failure/`.
     """
-    open_run(run_dir)
-    with _watch_threads() as deaths, recorder or contextlib.nullcontext():
-        learner = _Learner(run_dir, config, transport, name, resume, audit, on_event)
-        try:
-            learner.train(stop_event, deaths, on_update)
-        finally:
-            learner.close()
-        return learner.bundle()
+    ranks = ranks or Ranks()
+    try:
+        if ranks.rank == 0:
+            open_run(run_dir)
+        with _watch_threads() as deaths, recorder or contextlib.nullcontext():
+            learner = _Learner(run_dir, config, transport, ranks, resume, audit, on_event)
+            try:
+                learner.train(stop_event, deaths, on_update)
+            finally:
+                learner.close()
+            return learner.bundle()
+    except BaseException as error:
+        ranks.fail(error)
+        raise
 
 
 @contextlib.contextmanager
@@ -154,12 +173,12 @@ class _Learner:
         run_dir: pathlib.Path,
         config: RunConfig,
         transport: Transport,
-        name: str,
+        ranks: Ranks,
         resume: bool,
         audit: bool,
         on_event: Notify,
     ):
-        self._run_dir, self._config, self._transport, self._name = run_dir, config, transport, name
+        self._run_dir, self._config, self._transport, self._ranks = run_dir, config, transport, ranks
         self._keys = Keys(config.name)
 
         def tell(level: str, text: str) -> None:
@@ -169,19 +188,18 @@ class _Learner:
         self._on_event = tell
         self._spec: PolicySpec = bundles.policy_spec(config.task, config.network)
         self._checkpoints = Checkpoints(run_dir / "checkpoints")
-        self._state = updates.init_state(
-            config.seed, self._spec.layout, self._spec.action_size, config.network, config.ppo
-        )
-        self._epoch, self._skipped, hub_state = secrets.token_hex(8), 0, None
-        if resume:
-            self._state, meta = self._checkpoints.load(self._state)
-            self._epoch, self._skipped, hub_state = meta["epoch"], meta["skipped"], meta["hub"]
-            self._skip_lost_versions()
-            write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
-        elif (run_dir / INITIAL_FILE).exists():
-            initial = bundles.load(run_dir / INITIAL_FILE)
-            params = jax.tree.map(jnp.asarray, initial.params)
-            self._state = self._state._replace(params=params, observation=initial.observation, value=initial.value)
+        state = updates.init_state(config.seed, self._spec.layout, self._spec.action_size, config.network, config.ppo)
+        meta: dict[str, Any] = {"epoch": secrets.token_hex(8), "skipped": 0, "hubs": []}
+        if ranks.rank == 0:
+            state, meta = self._begin(state, meta, resume)
+        if ranks.count > 1:
+            message = ranks.exchange(meta, flatten(state) if ranks.rank == 0 else None)
+            state, meta = restore(message.arrays, state, "The state of rank 0"), message.meta["entries"][0]
+        self._state: TrainState = state
+        self._epoch, self._skipped, hubs = meta["epoch"], meta["skipped"], meta["hubs"]
+        if ranks.count > 1:
+            # Before there is a hub, and so before an actor in this process captures its engine's graphs.
+            self._warm_up()
         self._hub = LearnerHub(
             transport,
             run=config.name,
@@ -196,11 +214,25 @@ class _Learner:
                 config.half_observations,
             ),
             staleness=StalenessManager(config.ppo.max_staleness, config.ppo.rollouts_per_update),
-            name=name,
-            durable=hub_state,
+            name=str(ranks.rank),
+            durable=_durable(hubs, ranks.rank),
             on_event=tell,
-            audit=AuditLog(run_dir, name, lambda text: self._event("error", text)) if audit else None,
+            audit=AuditLog(run_dir, str(ranks.rank), lambda text: self._event("error", text)) if audit else None,
         )
+        if hubs and len(hubs) != ranks.count:
+            self._event("warning", f"The checkpoint is of {len(hubs)} rank(s), this run has {ranks.count}: {_LEDGERS}.")
+
+    def _begin(self, state: TrainState, meta: dict[str, Any], resume: bool) -> tuple[TrainState, dict[str, Any]]:
+        """The first state and what belongs to it: of a checkpoint, of a given policy, or as it is."""
+        if resume:
+            state, meta = self._checkpoints.load(state)
+            meta = {**meta, "skipped": self._skip_lost_versions(state.version + meta["skipped"]) + meta["skipped"]}
+            write_atomically(self._run_dir / CONFIG_FILE, to_json(self._config).encode())
+        elif (self._run_dir / INITIAL_FILE).exists():
+            initial = bundles.load(self._run_dir / INITIAL_FILE)
+            params = jax.tree.map(jnp.asarray, initial.params)
+            state = state._replace(params=params, observation=initial.observation, value=initial.value)
+        return state, meta
 
     def close(self) -> None:
         """Notes what is left; the transport stays open."""
@@ -228,24 +260,27 @@ class _Learner:
     def train(self, stop: threading.Event, deaths: list[str], on_update: Callable[[dict[str, float]], None]) -> None:
         """Updates until the end, a stop, or a thread's death; leaves a checkpoint behind in each case."""
         self._publish()
-        self._warm_up()
+        if self._ranks.count == 1:
+            self._warm_up()
         pace, watch = Pace(), CollapseWatch(self._config.collapse_patience)
-        saved, due = -1, False
-        while self._state.version < self._config.updates and not stop.is_set() and not deaths:
+        end, saved, due = None, -1, False
+        while self._state.version < self._config.updates and end is None:
             began = time.monotonic()
-            messages = self._next_batch(stop, deaths)
-            if messages is None:
+            end = self._wait(stop, deaths)
+            if end is not None:
                 break
             arrived = time.monotonic()
-            values = self._update(messages)
+            values, steps = self._update()
             values["wait_seconds"], values["update_seconds"] = arrived - began, time.monotonic() - arrived
-            values["steps_per_second"] = pace.steps_per_second(sum(message.meta["steps"] for message in messages))
+            values["steps_per_second"] = pace.steps_per_second(steps)
             values["transitions"] = float(self._state.transitions)
-            self._log("metrics", {"update": self._state.version, "version": self.version, "values": values})
+            if self._ranks.rank == 0:
+                self._log("metrics", {"update": self._state.version, "version": self.version, "values": values})
             on_update({"update": float(self._state.version), "version": float(self.version), **values})
             # What is learnt on stationary objects is expected to fall when they are let go.
             stationary = self._config.curriculum.stationary(self.version)
             if not stationary and (collapse := watch.add(values)):
+                self._ranks.close()
                 self._event("fatal", f"Training collapsed: {collapse}.")
                 raise CongraspError(
                     f"Training collapsed: {collapse}.",
@@ -256,40 +291,72 @@ class _Learner:
                 saved, due = self._state.version, False
         if saved != self._state.version:
             self._save()
-        if deaths:
-            raise CongraspError(f"The learner stopped: {deaths[0]}.", "A checkpoint was written; use --resume.")
-        if not stop.is_set():
+        if end is None:
             self._event("info", f"The run is complete after {self._state.version} updates.")
             self._say_goodbye()
+        self._ranks.close()
+        if deaths:
+            raise CongraspError(f"The learner stopped: {deaths[0]}.", "A checkpoint was written; use --resume.")
+        if end is not None and end[0] != self._ranks.rank and not stop.is_set():
+            raise TransportError(f"Rank {end[0]} ended the run: {end[1]}.", "A checkpoint was written; use --resume.")
 
-    def _next_batch(self, stop: threading.Event, deaths: list[str]) -> list[Message] | None:
-        """The next batch; None when training is to end. A long silence is an event, not an end: actors may return."""
-        silent_since = time.monotonic()
-        while not stop.is_set() and not deaths:
-            messages = self._hub.next_batch(self._config.ppo.rollouts_per_update, _POLL_SECONDS)
-            if messages is not None:
-                return messages
+    def _wait(self, stop: threading.Event, deaths: list[str]) -> tuple[int, str] | None:
+        """Waits until every rank has a batch; returns the rank that ends training instead, and why.
+
+        A long silence is an event, not an end: actors may return.
+        """
+        posted, silent_since = "", time.monotonic()
+        while True:
+            end = deaths[0] if deaths else "it was stopped" if stop.is_set() else ""
+            found = bool(posted) or self._hub.has_batch(
+                self._config.ppo.rollouts_per_update, 0 if end else _POLL_SECONDS
+            )
+            state = end or ("ready" if found else "")
+            if state != posted:
+                self._ranks.post({"end": end}, urgent=bool(end))
+                posted = state
+            decision = self._ranks.poll(_POLL_SECONDS if posted else 0.0)
+            if decision is not None:
+                return ended_by(decision.meta["entries"])
             if time.monotonic() - silent_since > _STALL_SECONDS:
-                self._event("warning", f"No batch of rollouts for {_STALL_SECONDS:.0f} s.")
+                whose = "of another rank " if posted else ""
+                self._event("warning", f"No batch of rollouts {whose}for {_STALL_SECONDS:.0f} s.")
                 silent_since = time.monotonic()
-        return None
 
-    def _update(self, messages: list[Message]) -> dict[str, float]:
-        figures = {**staleness(messages, self._hub.lag), **episode_means(messages)}
+    def _update(self) -> tuple[dict[str, float], int]:
+        """An update of all ranks together; its figures and its environment steps."""
+        messages = self._hub.next_batch(self._config.ppo.rollouts_per_update, 0.0)
+        assert messages is not None, "a batch that was there cannot go away"
+        mine = summary(messages, self._hub.lag)
         batch = updates.collate([message.arrays for message in messages])
         try:
-            self._state, metrics = updates.update(self._state, batch, self._spec.layout, self._config.ppo)
+            with self._ranks.together():
+                self._state, metrics = updates.update(
+                    self._state, batch, self._spec.layout, self._config.ppo, self._ranks.mesh
+                )
         except NonFiniteUpdate as error:
-            folder = self._run_dir / "failure"
+            self._ranks.close()
+            folder, number = self._run_dir / "failure", f"-{self._ranks.rank}" if self._ranks.count > 1 else ""
             with contextlib.suppress(CongraspError):
-                write_atomically(folder / "state.safetensors", encode(Message(flatten(error.state), {})))
-                write_atomically(folder / "batch.safetensors", encode(Message(batch, {})))
+                write_atomically(folder / f"batch{number}.safetensors", encode(Message(batch, {})))
+                if self._ranks.rank == 0:
+                    write_atomically(folder / "state.safetensors", encode(Message(flatten(error.state), {})))
             self._event("fatal", str(error))
             raise PhysicsError(str(error), f"State and batch are in {folder}.") from None
         self._publish()
-        return {**metrics, **figures}
+        everyone = self._ranks.exchange(mine).meta["entries"]
+        return {**metrics, **overall(everyone)}, sum(entry["steps"] for entry in everyone)
 
     def _publish(self) -> None:
+        if self._ranks.rank == 0:
+            self._note_version()
+        self._hub.publish_weights(self.bundle().to_message(), self.version)
+        if self._ranks.rank:
+            return
+        meta = {"version": self.version, "epoch": self._epoch, "schema": self._spec.schema}
+        self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
+
+    def _note_version(self) -> None:
         # Overwritten in place, which needs no space on a disk that is full, and not flushed: this must survive the
         # process, and a power cut costs no more than a version.
         try:
@@ -297,19 +364,17 @@ class _Learner:
                 file.write(f"{self.version:020d}\n".encode())
         except OSError as error:
             self._event("error", f"{self._run_dir / _VERSION_FILE} could not be written: {error.strerror}.")
-        self._hub.publish_weights(self.bundle().to_message(), self.version)
-        meta = {"version": self.version, "epoch": self._epoch, "schema": self._spec.schema}
-        self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
 
-    def _skip_lost_versions(self) -> None:
-        """Versions that were published after the checkpoint and died with the process are not given out again."""
+    def _skip_lost_versions(self, version: int) -> int:
+        """Versions that were published after the checkpoint's died with the process; they are not given out again."""
         try:
             published = int((self._run_dir / _VERSION_FILE).read_text())
         except (OSError, ValueError):
-            return
-        if published > self.version:
-            self._event("warning", f"{published - self.version} update(s) after the checkpoint were lost.")
-            self._skipped += published + 1 - self.version
+            return 0
+        if published <= version:
+            return 0
+        self._event("warning", f"{published - version} update(s) after the checkpoint were lost.")
+        return published + 1 - version
 
     def _warm_up(self) -> None:
         """Compiles the update while the actors make the first rollouts."""
@@ -326,19 +391,37 @@ class _Learner:
             "terminal": np.zeros((steps, worlds), bool),
         }
         copy = self._state._replace(optimizer=jax.tree.map(jnp.copy, self._state.optimizer))
-        updates.update(copy, batch, spec.layout, config.ppo)
+        with self._ranks.together():
+            updates.update(copy, batch, spec.layout, config.ppo, self._ranks.mesh)
 
     def _save(self) -> None:
+        """A checkpoint, which rank 0 writes; all ranks call this, and their replicas are compared."""
         durable = self._hub.durable()
-        meta = {"epoch": self._epoch, "skipped": self._skipped, "hub": durable}
-        self._checkpoints.save(self._state, meta, self._state.version)
+        state = _checksum(self._state) if self._ranks.count > 1 else 0
+        everyone = self._ranks.exchange({"hub": durable, "state": state}).meta["entries"]
+        if odd := [rank for rank, entry in enumerate(everyone) if entry["state"] != everyone[0]["state"]]:
+            raise ReplicasDiffer(
+                f"The weights of ranks {odd} differ from those of rank 0 after update {self._state.version}.",
+                "All ranks need the same GPUs and versions; --resume goes on from the last checkpoint.",
+            )
+        failure = ""
+        if self._ranks.rank == 0:
+            meta = {"epoch": self._epoch, "skipped": self._skipped, "hubs": [entry["hub"] for entry in everyone]}
+            try:
+                self._checkpoints.save(self._state, meta, self._state.version)
+                bundles.save(self.bundle(), self._run_dir / POLICY_FILE)
+            except CongraspError as error:
+                failure = str(error)
+        if failure := self._ranks.exchange({"failure": failure}).meta["entries"][0]["failure"]:
+            raise CongraspError(failure)
         self._hub.note_saved(durable)
-        bundles.save(self.bundle(), self._run_dir / POLICY_FILE)
 
     def _save_if_possible(self) -> bool:
         """A checkpoint on the way; one that fails is tried again after the next update, and training goes on."""
         try:
             self._save()
+        except ReplicasDiffer:
+            raise
         except CongraspError as error:
             self._event("error", f"{error} Training goes on; the next update tries again.")
             return False
@@ -357,4 +440,19 @@ class _Learner:
 
     def _log(self, kind: str, meta: dict[str, object]) -> None:
         message = Message(meta=finite({"time": time.time(), **meta}))
-        self._transport.publish(self._keys.log(kind, "learner", self._name), message)
+        self._transport.publish(self._keys.log(kind, "learner", str(self._ranks.rank)), message)
+
+
+def _durable(hubs: list[dict[str, Any]], rank: int) -> dict[str, Any] | None:
+    """What a checkpoint kept of this rank's hub; that of one that it does not know begins anew at its version."""
+    if not hubs or rank < len(hubs):
+        return hubs[rank] if hubs else None
+    return {**hubs[0], "ledger": dataclasses.asdict(Ledger()), "forgotten_missing": 0, "marks": []}
+
+
+def _checksum(state: TrainState) -> int:
+    """CRC-32 of all that a checkpoint holds."""
+    crc = 0
+    for array in flatten(jax.device_get(state)).values():
+        crc = zlib.crc32(np.ascontiguousarray(array).tobytes(), crc)
+    return crc

@@ -2,7 +2,8 @@
 
 import collections
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,13 +14,43 @@ _CONSTRAINTS = {"affordance": "affordance", "pose": "pose_wrist", "trajectory": 
 """Mask bit that says whether an episode had the constraint; without any of them it had the heading alone."""
 
 
-def episode_means(messages: Sequence[Message]) -> dict[str, float]:
-    """Means over all episodes that ended in the batch, and their number.
+def summary(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str, Any]:
+    """What one rank tells the others of its batch, as JSON, so that `overall` finds the means over all of them.
+
+    Args:
+      messages: the rollouts of the batch.
+      lag: that of a policy version.
+    """
+    sums, episodes = _episode_sums(messages)
+    steps = [int(message.meta["steps"]) for message in messages]
+    lags = [lag(int(message.meta["version"])) for message in messages]
+    sums["staleness_mean"] = [float(np.dot(lags, steps)), float(sum(steps))]
+    return {"sums": sums, "episodes": episodes, "steps": sum(steps), "staleness_max": max(lags)}
+
+
+def overall(summaries: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Means over all episodes that ended in the batches of all ranks, their number, and the transitions' lag.
 
     `episode/…` metrics and `term/…` sums over all of them, but errors of a constraint over those that had it; and
     `success/heading` over episodes with the heading alone, `success/pose` and so on over those with that constraint,
     whatever others they had. A rollout in which no episode ended contributes nothing; what no episode has is absent.
     """
+    totals: dict[str, list[float]] = {}
+    for part in summaries:
+        for name, (value, weight) in part["sums"].items():
+            total = totals.setdefault(name, [0.0, 0.0])
+            total[0] += value
+            total[1] += weight
+    means = {name: value / weight for name, (value, weight) in totals.items()}
+    return {
+        **means,
+        "episodes": float(sum(part["episodes"] for part in summaries)),
+        "staleness_max": float(max(part["staleness_max"] for part in summaries)),
+    }
+
+
+def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], int]:
+    """Sum and number of each figure's values, and the number of episodes."""
     columns: dict[str, list[np.ndarray]] = collections.defaultdict(list)
     for message in messages:
         for name, values in message.arrays.items():
@@ -35,15 +66,11 @@ def episode_means(messages: Sequence[Message]) -> dict[str, float]:
         constraint = name.removeprefix("episode/").partition("_")[0]
         if constraint in active:
             joined[name] = np.where(active[constraint], values, np.nan)
-    means = {name: float(np.nanmean(values)) for name, values in joined.items() if not np.isnan(values).all()}
-    return {**means, "episodes": float(count)}
-
-
-def staleness(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str, float]:
-    """Lag of each transition of the batch, mean and maximum; `lag` gives that of a policy version."""
-    lags = np.array([lag(int(message.meta["version"])) for message in messages], np.float64)
-    weights = np.array([int(message.meta["steps"]) for message in messages], np.float64)
-    return {"staleness_mean": float(np.average(lags, weights=weights)), "staleness_max": float(lags.max())}
+    return {
+        name: [float(np.nansum(values)), float(np.sum(~np.isnan(values)))]
+        for name, values in joined.items()
+        if not np.isnan(values).all()
+    }, count
 
 
 class Pace:

@@ -5,6 +5,10 @@ they were made. Everything between the batch and the new weights is one compiled
 that other settings need no other compilation. The optimiser's moments are donated to it, the weights are not: the
 bundle that was published with them may still be in use in this process. The host keeps the running statistics
 (`common.policy.normalizer`) and the counters, and sees scalars alone.
+
+Several processes, each with a batch of its own, make one update together over a mesh of their devices: gradients,
+advantages' statistics and metrics are averaged inside the program, once in each minibatch, and moments are gathered in
+rank order, so that all of them come to the same weights and statistics, bit for bit.
 """
 
 import dataclasses
@@ -16,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh, PartitionSpec
 
 from common.config import NetworkConfig, PPOConfig
 from common.errors import CongraspError, PhysicsError
@@ -24,9 +29,11 @@ from common.policy.network import Layout, Params
 from common.policy.normalizer import Affine, Statistics
 from common.task.types import Array
 from learner import gae, losses
+from learner.across import AXIS, REPLICATED, Across, local, over, spread
 
 FIELDS = ("observation", "last_observation", "action", "log_probability", "reward", "terminal")
 """Arrays of a batch: (T, N, D), (N, D), (T, N, A), (T, N), (T, N) and (T, N)."""
+_WORLDS = {name: PartitionSpec(AXIS) if name == "last_observation" else PartitionSpec(None, AXIS) for name in FIELDS}
 _CHECKED_INPUTS = FIELDS[:-1]
 _CHECKED = (
     *_CHECKED_INPUTS,
@@ -58,6 +65,9 @@ class TrainState(NamedTuple):
     """Updates so far."""
     transitions: int
     """Environment steps consumed so far."""
+
+
+_ON_DEVICE = 4  # entries of a TrainState
 
 
 class NonFiniteUpdate(PhysicsError):
@@ -102,7 +112,7 @@ def collate(rollouts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
 
 
 def update(
-    state: TrainState, batch: Mapping[str, Array], layout: Layout, ppo: PPOConfig
+    state: TrainState, batch: Mapping[str, Array], layout: Layout, ppo: PPOConfig, mesh: Mesh | None = None
 ) -> tuple[TrainState, dict[str, float]]:
     """Runs PPO on a batch and returns the next state with the update's metrics.
 
@@ -116,6 +126,8 @@ def update(
       batch: arrays `FIELDS`; others are ignored. Rewards are not scaled yet.
       layout: of the observation.
       ppo: hyperparameters.
+      mesh: of the ranks' devices along `AXIS`, each of which calls this with the same state and a batch of the same
+        shape; None if this process is alone.
 
     Raises:
       NonFiniteUpdate: naming the first term that was not finite.
@@ -127,13 +139,13 @@ def update(
             f"A batch of {arrays['reward'].size} transitions does not make {ppo.minibatches} minibatches.",
             "Use fewer minibatches, more environments or longer rollouts.",
         )
-    seen = normalizer.moments(arrays["observation"], event_axes=1)
-    frozen = state.observation if state.observation.count else normalizer.merge(seen)
+    first = state[:_ON_DEVICE]
+    if mesh is not None:
+        arrays, first = spread(arrays, mesh, _WORLDS), spread(first, mesh)
+    seen = _observed(arrays["observation"], mesh=mesh)
+    frozen = state.observation if state.observation.count else normalizer.merge(*_ranks(local(seen, mesh)))
     learnt, returns, failure, scalars = _optimise(
-        state.params,
-        state.optimizer,
-        state.learning_rate,
-        state.key,
+        *first,
         arrays,
         normalizer.observation_affine(frozen, layout),
         normalizer.value_affine(state.value),
@@ -141,15 +153,17 @@ def update(
         layout=layout,
         epochs=ppo.epochs,
         minibatches=ppo.minibatches,
+        mesh=mesh,
     )
+    learnt, seen, returns, failure, scalars = local((learnt, seen, returns, failure, scalars), mesh)
     seen, returns, failure, scalars = jax.device_get((seen, returns, failure, scalars))
-    state = TrainState(*learnt, *state[len(learnt) :])
+    state = TrainState(*learnt, *state[_ON_DEVICE:])
     if failure != _FINE:
         raise NonFiniteUpdate(_CHECKED[failure], state)
-    value = normalizer.merge(state.value, returns)
+    value = normalizer.merge(state.value, *_ranks(returns))
     state = state._replace(
         params=_preserve_values(state.params, normalizer.value_affine(state.value), normalizer.value_affine(value)),
-        observation=normalizer.merge(state.observation, seen),
+        observation=normalizer.merge(state.observation, *_ranks(seen)),
         value=value,
         version=state.version + 1,
         transitions=state.transitions + arrays["reward"].size,
@@ -157,7 +171,22 @@ def update(
     return state, {name: float(scalar) for name, scalar in scalars.items()}
 
 
-@functools.partial(jax.jit, static_argnames=("layout", "epochs", "minibatches"), donate_argnames="optimizer")
+def _ranks(gathered: Statistics) -> list[Statistics]:
+    """The statistics of each rank from those that `Across.gather` stacked."""
+    return [Statistics(*(entry[i] for entry in gathered)) for i in range(len(gathered.count))]
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def _observed(observation: Array, *, mesh: Mesh | None) -> Statistics:
+    """Moments of each rank's observations, stacked."""
+
+    def program(observation: Array) -> Statistics:
+        return Across(mesh).gather(normalizer.moments(observation, event_axes=1))
+
+    return over(mesh, program, _WORLDS["observation"])(observation)
+
+
+@functools.partial(jax.jit, static_argnames=("layout", "epochs", "minibatches", "mesh"), donate_argnames="optimizer")
 def _optimise(
     params: Params,
     optimizer: optax.OptState,
@@ -171,8 +200,31 @@ def _optimise(
     layout: Layout,
     epochs: int,
     minibatches: int,
+    mesh: Mesh | None,
 ) -> tuple[tuple[Params, optax.OptState, Array, Array], Statistics, Array, dict[str, Array]]:
     """Epochs over the batch; returns the state's first entries, moments of the returns, the failed term and metrics."""
+    program = functools.partial(_program, across=Across(mesh), layout=layout, epochs=epochs, minibatches=minibatches)
+    specs = (*[REPLICATED] * _ON_DEVICE, _WORLDS, *[REPLICATED] * 3)
+    given = params, optimizer, learning_rate, key, batch, normalization, returns_normalization, hyper
+    return over(mesh, program, specs)(*given)
+
+
+def _program(
+    params: Params,
+    optimizer: optax.OptState,
+    learning_rate: Array,
+    key: Array,
+    batch: dict[str, Array],
+    normalization: Affine,
+    returns_normalization: Affine,
+    hyper: dict[str, Array],
+    *,
+    across: Across,
+    layout: Layout,
+    epochs: int,
+    minibatches: int,
+) -> tuple[tuple[Params, optax.OptState, Array, Array], Statistics, Array, dict[str, Array]]:
+    """What `_optimise` compiles, for one rank."""
     log_std = params["actor"]["log_std"]
     observation = normalizer.apply(normalization, batch["observation"])
     exact, _ = network.policy(params, layout, observation)
@@ -189,6 +241,7 @@ def _optimise(
     advantage, returns = gae.advantages(
         reward, value, last_value, batch["terminal"], hyper["gamma"], hyper["gae_lambda"]
     )
+    advantage_std = jnp.sqrt(across.variance(advantage))
     samples = losses.Sample(
         # Normalised in each minibatch: gathering its rows in half precision is cheaper.
         batch["observation"],
@@ -198,23 +251,24 @@ def _optimise(
         ),
         mean,
         jnp.where(hyper["decoupled"], weight, 1.0),
-        (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8),
+        (advantage - across.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
         (returns - returns_normalization.shift) * returns_normalization.scale,
     )
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
     inputs = [batch[name] for name in _CHECKED_INPUTS]
-    failure = _first_failure(jnp.int32(_FINE), 0, *inputs, value)
+    failure = across.max(_first_failure(jnp.int32(_FINE), 0, *inputs, value))
     key, epochs_key = jax.random.split(key)
     params, optimizer, failure, (terms, norms) = _epochs(
         params,
         optimizer,
         learning_rate,
-        jax.random.split(epochs_key, epochs),
+        jax.random.split(across.own_key(epochs_key), epochs),
         failure,
         flat,
         normalization,
         log_std,
         hyper,
+        across,
         layout,
         minibatches,
     )
@@ -227,18 +281,22 @@ def _optimise(
         "kl": kl,
         "learning_rate": learning_rate,
         "action_std": jnp.mean(jnp.exp(params["actor"]["log_std"])),
-        "importance_mean": jnp.mean(weight),
-        "importance_max": jnp.max(weight),
-        "importance_truncated": jnp.mean((log_weight > jnp.log(hyper["importance_max"])).astype(jnp.float32)),
-        "behaviour_kl": -jnp.mean(log_weight),
-        "explained_variance": 1.0 - jnp.var(returns - value) / (jnp.var(returns) + 1e-8),
-        "reward_mean": jnp.mean(batch["reward"]),
-        "return_mean": jnp.mean(returns),
-        "value_mean": jnp.mean(value),
-        "advantage_std": jnp.std(advantage),
+        "importance_max": across.max(jnp.max(weight)),
+        "explained_variance": 1.0 - across.variance(returns - value) / (across.variance(returns) + 1e-8),
+        "advantage_std": advantage_std,
     }
+    metrics |= across.mean(
+        {
+            "importance_mean": jnp.mean(weight),
+            "importance_truncated": jnp.mean((log_weight > jnp.log(hyper["importance_max"])).astype(jnp.float32)),
+            "behaviour_kl": -jnp.mean(log_weight),
+            "reward_mean": jnp.mean(batch["reward"]),
+            "return_mean": jnp.mean(returns),
+            "value_mean": jnp.mean(value),
+        }
+    )
     learnt = params, optimizer, _adapt_rate(learning_rate, kl, hyper), key
-    return learnt, normalizer.moments(returns), failure, metrics
+    return learnt, across.gather(normalizer.moments(returns)), failure, metrics
 
 
 def _epochs(
@@ -251,6 +309,7 @@ def _epochs(
     normalization: Affine,
     log_std_proximal: Array,
     hyper: dict[str, Array],
+    across: Across,
     layout: Layout,
     minibatches: int,
 ) -> tuple[Params, optax.OptState, Array, tuple[losses.Terms, dict[str, Array]]]:
@@ -268,6 +327,7 @@ def _epochs(
         minibatch = jax.tree.map(lambda x: x[rows], samples)
         minibatch = minibatch._replace(observation=normalizer.apply(normalization, minibatch.observation))
         (_, terms), gradients = gradient(params, layout, log_std_proximal, minibatch, coefficients)
+        terms, gradients = across.mean((terms, gradients))
         # The networks share no weight, so one's large gradient must not shrink the other's.
         norms = {name: optax.tree.norm(tree) for name, tree in gradients.items()}
         shrink = {

@@ -13,7 +13,6 @@ from typing import Any, Self
 import numpy as np
 from rich.console import Console
 
-from actors.physics import resolve_physics
 from common.config import ObjectsConfig, RunConfig
 from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
@@ -33,7 +32,7 @@ from services.scores import Row
 from services.sheets import save_png
 from services.showcase import CONSTRAINTS, showcase
 from services.shutdown import on_signal
-from services.train import train, train_in_process
+from services.train import engine_of, leave_gpus_to, train, train_in_process
 
 EPISODE, SHIPPED = "episode.png", "shipped.png"
 _EVALUATION_OBJECTS = 12
@@ -55,8 +54,12 @@ def run_training(
     listen: str | None = None,
     certs: pathlib.Path | None = None,
     insecure: bool = False,
+    ranks: int = 1,
 ) -> int:
-    """Trains, evaluates and shows; returns the exit code. With no actor processes everything is in this one."""
+    """Trains, evaluates and shows; returns the exit code. With no actor processes everything is in this one.
+
+    With several ranks each of them has so many actors.
+    """
     if actors is not None and actors < 0:
         raise CongraspError(f"--actors is {actors}.", "Name a number of actor processes, or 0 for none of their own.")
     if listen is not None or certs is not None:
@@ -64,7 +67,10 @@ def run_training(
         if actors == 0:
             raise CongraspError("With --actors 0 nothing listens.", "Leave out --listen and --certs, or --actors.")
         actors = actors or 2
-    physics = resolve_physics(config.physics)
+    if ranks < 1:
+        raise CongraspError(f"--ranks is {ranks}.", "Name a number of learners from 1 on.")
+    gpus = ranks > 1 and leave_gpus_to(ranks)
+    physics = engine_of(config.physics, gpus)
     if actors is None:
         actors = 0 if physics == "warp" else 2
     if resume:
@@ -78,8 +84,8 @@ def run_training(
         start = None if initial is None else bundles.load(initial)
         create_run(run_dir, config, start)
     console.print(
-        f"[bold]{config.name}[/]: {config.updates} updates of {_steps_per_update(config)} steps, "
-        f"{actors or 1} actor(s) with {config.environments} hands each on '{physics}' in {run_dir}",
+        f"[bold]{config.name}[/]: {config.updates} updates of {ranks * _steps_per_update(config)} steps, "
+        f"{ranks * (actors or 1)} actor(s) with {config.environments} hands each on '{physics}' in {run_dir}",
         soft_wrap=True,
     )
     if words := easier(config):
@@ -90,8 +96,8 @@ def run_training(
     with on_signal() as stop:
         before = _evaluate(untrained(config), config, evaluation, "before training") if evaluation else []
         began = time.monotonic()
-        with _Progress(config) as progress:
-            if actors == 0:
+        with _Progress(config, ranks) as progress:
+            if actors == 0 and ranks == 1:
                 train_in_process(
                     run_dir,
                     config,
@@ -111,6 +117,8 @@ def run_training(
                         actors=actors,
                         physics=physics,
                         stop=stop,
+                        ranks=ranks,
+                        gpus=gpus,
                         metrics_port=metrics_port,
                         endpoint=listen,
                         certs=certs,
@@ -166,8 +174,8 @@ def untrained(config: RunConfig) -> PolicyBundle:
 class _Progress:
     """One line that is rewritten on a terminal; elsewhere a line about every ten seconds."""
 
-    def __init__(self, config: RunConfig):
-        self._config = config
+    def __init__(self, config: RunConfig, ranks: int = 1):
+        self._config, self._steps = config, ranks * _steps_per_update(config)
         self._began = time.monotonic()
         self._last = 0.0
         self._first: tuple[float, float] | None = None
@@ -207,7 +215,7 @@ class _Progress:
     def _progress(self, status: dict[str, Any], now: float) -> str:
         """One line of numbers; the time left counts from the first update, so that compiling is not part of it."""
         values, updates = status["values"], self._config.updates
-        update = values["transitions"] / _steps_per_update(self._config)
+        update = values["transitions"] / self._steps
         self._first = self._first or (now, update)
         pace = (update - self._first[1]) / max(now - self._first[0], 1e-6)
         left = (updates - update) / pace if pace > 0 else float("nan")

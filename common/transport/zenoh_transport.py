@@ -74,7 +74,7 @@ class ZenohTransport:
         if bool(connect) == bool(listen):
             raise CongraspError("A transport needs endpoints either to connect to or to listen on.")
         wanted = [secured(one, credentials) for one in (connect or listen)]
-        endpoints = {name: [_shifted(one, i) for one in wanted] for i, name in enumerate(flows)}
+        endpoints = {name: [shifted(one, i) for one in wanted] for i, name in enumerate(flows)}
         self._max_message = max_message
         self._sender = secrets.token_bytes(8)
         self._counts: dict[str, int] = {}
@@ -256,7 +256,8 @@ class _Work:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
 
-def _shifted(endpoint: str, offset: int) -> str:
+def shifted(endpoint: str, offset: int) -> str:
+    """The endpoint with a port `offset` above; a CongraspError if it is none."""
     match = _ENDPOINT.fullmatch(endpoint)
     if not match or not 0 < int(match["port"]) + offset < 1 << 16:
         raise CongraspError(f"'{endpoint}' is not an endpoint.", f"Write it like {DEFAULT_ENDPOINT}.")

@@ -1,5 +1,9 @@
 """Benchmarks, as ratios against a reference in the same run, and what a run does when it is told to end."""
 
+import pathlib
+
+from common.config import PhysicsName
+
 
 def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines: tuple[str, ...] = ()) -> int:
     """Actors' control steps a second beside the bare engine's, for each engine that the machine has.
@@ -25,7 +29,6 @@ def query(repeat: int = 1000, concurrency: int = 1) -> int:
       repeat: Queries in all.
       concurrency: Clients at the same time.
     """
-    import pathlib
     import tempfile
 
     from common.policy import bundle as bundles
@@ -138,6 +141,42 @@ def recording(actors: int = 2, seconds: float = 20.0, turns: int = 3) -> int:
     return 0
 
 
+def scaling(
+    ranks: tuple[int, ...] = (1, 2),
+    seconds: float = 90.0,
+    preset: str = "human",
+    environments: int = 0,
+    physics: PhysicsName = "auto",
+    actors: int | None = None,
+    deadline: float = 600.0,
+    out: pathlib.Path = pathlib.Path("scaling.json"),
+) -> int:
+    """Trained steps a second of several learner ranks beside one: weak scaling, every rank with a batch of its own.
+
+    Starts real processes for each number of ranks in turn; starting, compiling and the first updates are not measured.
+    On GPUs every rank needs one of its own.
+
+    Args:
+      ranks: Numbers of ranks, for example 1 2 4; efficiency is against the first.
+      seconds: Seconds of measurement, for each number of ranks.
+      preset: Named configuration of the run.
+      environments: Environments in one actor; 0: those of the preset.
+      physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
+      actors: Actor processes of each rank; by default none on GPUs, where one lives inside each rank, otherwise one.
+      deadline: Seconds that one number of ranks may take in all.
+      out: File for the results as JSON.
+    """
+    import dataclasses
+
+    from services.presets import get_preset
+    from services.scaling import bench_scaling
+
+    config = get_preset(preset)
+    config = dataclasses.replace(config, physics=physics, environments=environments or config.environments)
+    bench_scaling(config, ranks, seconds=seconds, actors=actors, deadline=deadline, out=out)
+    return 0
+
+
 COMMANDS = {
     "physics": physics,
     "query": query,
@@ -146,4 +185,5 @@ COMMANDS = {
     "staleness": staleness,
     "faults": faults,
     "recording": recording,
+    "scaling": scaling,
 }

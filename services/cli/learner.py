@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from common.config import RunConfig
+from common.config import RunConfig, run_config_from_json, to_json
 from services.cli.train import preset_of
 from services.cli.watch import Watch, Watched
 from services.presets import get_preset
@@ -37,46 +37,86 @@ class Learner:
     """Go on with the run in --run-dir, from its latest checkpoint if it has one."""
     or_resume: bool = False
     """Begin the run, or go on with it if --run-dir holds one: for supervisors that give the same command every time."""
+    rank: int = 0
+    """Number of this process among several that train together; each needs a GPU of its own (CUDA_VISIBLE_DEVICES)."""
+    ranks: int = 1
+    """Learner processes that train together: data parallel, each with actors of its own. The run is that in the
+    --run-dir of rank 0; rank r listens 4 r ports above --listen."""
+    coordinator: str = "127.0.0.1:7440"
+    """Where the ranks find rank 0: its host and a port, which and the next of which must be free there."""
+    inside: bool = False
+    """An actor lives in this process, too, so that its rollouts never leave the device."""
     watch: Watched = dataclasses.field(default_factory=Watch)
     """How it is watched."""
 
     def run(self) -> int:
         """Runs the command."""
+        from common.errors import CongraspError
+        from learner.ranks import end_process
+
+        try:
+            return self._learn()
+        except CongraspError as error:
+            if self.ranks > 1:
+                end_process(str(error), error.exit_code)
+            raise
+
+    def _learn(self) -> int:
         import functools
 
         from common.logs.recorder import Recorder
         from common.policy import bundle as bundles
-        from common.transport.zenoh_transport import ZenohTransport
+        from common.transport.keys import FLOWS
+        from common.transport.zenoh_transport import ZenohTransport, shifted
         from learner.process import LOGS, create_run, open_run, run_learner
+        from learner.ranks import Ranks
         from services.access import listening
         from services.logs import say
         from services.metrics import LearnerMetrics
         from services.shutdown import on_signal
         from services.status import ask
+        from services.train import train_in_process
 
-        has_checkpoint = (self.run_dir / "checkpoints" / "latest").exists()
-        config = open_run(self.run_dir) if self.resume else self.config
-        credentials = listening(self.listen, self.certs, "learner", insecure=self.insecure)
-        with on_signal() as stop, ZenohTransport(listen=[self.listen], credentials=credentials) as transport:
+        resume = self.resume and (self.run_dir / "checkpoints" / "latest").exists()
+        config = open_run(self.run_dir) if self.resume and self.rank == 0 else self.config
+        listen = shifted(self.listen, self.rank * len(FLOWS))
+        credentials = listening(listen, self.certs, "learner", insecure=self.insecure)
+        with on_signal() as stop, ZenohTransport(listen=[listen], credentials=credentials) as transport:
+            if not self.resume and self.rank == 0:
+                create_run(self.run_dir, config, None if self.initial is None else bundles.load(self.initial))
+            ranks = Ranks.join(self.rank, self.ranks, self.coordinator)
+            config = run_config_from_json(ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
             metrics = LearnerMetrics(functools.partial(ask, transport, config.name))
 
             def updated(values: dict[str, float]) -> None:
                 metrics.update(values)
                 say("info", f"Update {values['update']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
 
-            if not self.resume:
-                create_run(self.run_dir, config, None if self.initial is None else bundles.load(self.initial))
-            with self.watch.watched("learner", "0", config.name, metrics):
-                run_learner(
-                    self.run_dir,
-                    config,
-                    transport,
-                    stop_event=stop,
-                    resume=self.resume and has_checkpoint,
-                    recorder=Recorder(transport, config.name, self.run_dir / LOGS),
-                    on_update=updated,
-                    on_event=say,
-                )
+            with self.watch.watched("learner", str(self.rank), config.name, metrics):
+                if self.inside:
+                    train_in_process(
+                        self.run_dir,
+                        config,
+                        physics=config.physics,
+                        stop=stop,
+                        resume=resume,
+                        ranks=ranks,
+                        wire=transport,
+                        on_update=updated,
+                        on_event=say,
+                    )
+                else:
+                    run_learner(
+                        self.run_dir,
+                        config,
+                        transport,
+                        stop_event=stop,
+                        resume=resume,
+                        ranks=ranks,
+                        recorder=Recorder(transport, config.name, self.run_dir / LOGS) if self.rank == 0 else None,
+                        on_update=updated,
+                        on_event=say,
+                    )
             return stop.exit_code
 
 

@@ -27,6 +27,9 @@ class Train:
     actors: int | None = None
     """Actor processes. By default two; on a GPU none: a single actor then lives in the learner's process, and rollouts
     never leave the device."""
+    ranks: int = 1
+    """Learners that train together, data parallel; each has a GPU of its own where there are GPUs, and --actors actors.
+    The batch grows with them."""
     initial: pathlib.Path | None = None
     """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
     resume: bool = False
@@ -54,6 +57,7 @@ class Train:
             resume=self.resume,
             initial=self.initial,
             evaluation=self.evaluation,
+            ranks=self.ranks,
             metrics_port=self.metrics_port,
             listen=self.listen,
             certs=self.certs,

@@ -14,17 +14,16 @@ import jax
 import numpy as np
 import pytest
 
-from actors.link import ActorLink, RunFinished
 from common.config import NetworkConfig, PPOConfig, RunConfig
-from common.errors import CongraspError, PhysicsError, TransportError
+from common.errors import CongraspError, PhysicsError
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.zenoh_transport import ZenohTransport
-from common.wire.codec import Message
 from learner import update as updates
 from learner.process import create_run, open_run, run_learner
+from tests.learner.made_up_actor import MadeUpActor
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 CONFIG = RunConfig(
@@ -36,53 +35,6 @@ CONFIG = RunConfig(
     network=NetworkConfig(hidden=(8,), encoder=2),
     ppo=PPOConfig(epochs=1, minibatches=2),
 )
-
-
-class MadeUpActor(threading.Thread):
-    """Sends rollouts of random observations until the run ends; keeps the versions that it acted with."""
-
-    def __init__(self, transport, name: str = "a", reward: float = 1.0, links: float = 3.0, journal=None):
-        super().__init__(daemon=True)
-        self.versions: list[int] = []
-        self.ended = ""
-        self.stop = threading.Event()
-        self._transport, self._actor, self._reward, self._links = transport, name, reward, links
-        self._journal = journal
-        self.start()
-
-    def run(self) -> None:
-        with ActorLink(self._transport, CONFIG.name, self._actor, patience=30.0, journal=self._journal) as link:
-            try:
-                link.config(30.0)
-                self._act(link)
-            except (RunFinished, TransportError) as error:
-                self.ended = str(error)
-
-    def _act(self, link: ActorLink) -> None:
-        rng, bundle = np.random.default_rng(0), None
-        while not self.stop.is_set():
-            ticket = link.acquire_ticket(0.5)
-            newer = link.weights(-1 if bundle is None else bundle.version)
-            bundle = bundle if newer is None else PolicyBundle.from_message(newer)
-            if ticket is None or bundle is None:
-                continue
-            observation = rng.normal(size=(5, 2, sum(size for _, size in bundle.spec.layout))).astype(np.float16)
-            action, log_probability = bundles.sample_action(
-                bundle.spec.layout, bundle.acting, observation[:-1], jax.random.PRNGKey(len(self.versions))
-            )
-            arrays = {
-                "observation": observation[:-1],
-                "last_observation": observation[-1],
-                "action": np.asarray(action),
-                "log_probability": np.asarray(log_probability),
-                "reward": self._reward * rng.normal(size=(4, 2)).astype(np.float32),
-                "terminal": rng.random((4, 2)) < 0.3,
-                "episode/success": np.array([0.0, 1.0, 1.0, 1.0], np.float32),
-                "episode/links_at_removal": np.full(4, self._links, np.float32),
-            }
-            meta = {"version": bundle.version, "schema": bundle.spec.schema, "steps": 8}
-            link.upload(Message(arrays, meta), ticket)
-            self.versions.append(bundle.version)
 
 
 @pytest.fixture

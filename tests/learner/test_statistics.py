@@ -2,12 +2,20 @@ import numpy as np
 import pytest
 
 from common.wire.codec import Message
-from learner.statistics import Pace, episode_means, staleness
+from learner.statistics import Pace, overall, summary
 
 
 def rollout(version: int = 0, steps: int = 1, **episodes: list[float]) -> Message:
     arrays = {name.replace("_", "/", 1): np.array(values, np.float32) for name, values in episodes.items()}
     return Message({**arrays, "reward": np.zeros((1, steps))}, {"version": version, "steps": steps})
+
+
+def figures(*batches: list[Message]) -> dict[str, float]:
+    return overall([summary(messages, lambda version: 9 - version) for messages in batches])
+
+
+def episode_means(messages: list[Message]) -> dict[str, float]:
+    return {name: value for name, value in figures(messages).items() if not name.startswith("staleness")}
 
 
 def test_means_are_over_episodes_and_not_over_rollouts():
@@ -50,8 +58,22 @@ def test_errors_and_success_count_where_their_constraint_was_active():
 
 
 def test_staleness_weighs_transitions():
-    lags = staleness([rollout(version=9, steps=300), rollout(version=7, steps=100)], lambda version: 9 - version)
-    assert lags == {"staleness_mean": 0.5, "staleness_max": 2.0}
+    lags = figures([rollout(version=9, steps=300), rollout(version=7, steps=100)])
+    assert lags == {"staleness_mean": 0.5, "staleness_max": 2.0, "episodes": 0.0}
+
+
+def test_the_batches_of_several_ranks_count_as_one():
+    """The error of a constraint is over the episodes that had it, whichever rank they were on."""
+    first = [rollout(7, 300, episode_success=[1], episode_pose_rad=[0.1], episode_mask_pose_wrist=[1])]
+    second = [
+        rollout(9, 100, episode_success=[0, 0], episode_pose_rad=[9.0, 0.4], episode_mask_pose_wrist=[0, 1]),
+        rollout(9, 200, episode_success=[1], episode_pose_rad=[9.0], episode_mask_pose_wrist=[0]),
+    ]
+    means, joint = figures(first, second), figures([*first, *second])
+    assert means == pytest.approx(joint)
+    expected = {"episode/success": 0.5, "episode/pose_rad": 0.25, "success/pose": 0.5, "episodes": 4.0}
+    expected |= {"staleness_mean": 1.0, "staleness_max": 2.0}
+    assert {name: means[name] for name in expected} == pytest.approx(expected)
 
 
 def test_pace_forgets_what_is_outside_its_window():

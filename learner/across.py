@@ -1,0 +1,78 @@
+"""Data parallelism: arrays over a mesh of the learner processes' devices, and reductions over them inside a program.
+
+Each process holds its own worlds and a replica of everything else. A process that is alone has no mesh (None), and the
+same code then costs it nothing.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from common.task.types import Array
+
+AXIS = "rank"
+"""Axis of a mesh with one device of each learner process."""
+REPLICATED = PartitionSpec()
+
+
+def spread(tree: Any, mesh: Mesh, specs: Any = REPLICATED) -> Any:
+    """Arrays over all of the mesh from this process's part of them; `specs` are those of `jax.shard_map`."""
+    devices = [device for device in mesh.devices.flat if device.process_index == jax.process_index()]
+
+    def place(spec: PartitionSpec, array: Array) -> Array:
+        axis = spec.index(AXIS) if AXIS in spec else None
+        parts = [array] * len(devices) if axis is None or len(devices) == 1 else jnp.split(array, len(devices), axis)
+        shape = tuple(size * (mesh.size // len(devices) if i == axis else 1) for i, size in enumerate(np.shape(array)))
+        placed = [jax.device_put(part, device) for part, device in zip(parts, devices, strict=True)]
+        return jax.make_array_from_single_device_arrays(shape, NamedSharding(mesh, spec), placed)
+
+    return jax.tree.map(lambda spec, part: jax.tree.map(lambda x: place(spec, x), part), specs, tree)
+
+
+def over(mesh: Mesh | None, program: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
+    """The program run by every process on its own part, for `jax.jit`; what it returns is the same for all of them."""
+    if mesh is None:
+        return program
+    return jax.shard_map(program, mesh=mesh, in_specs=in_specs, out_specs=REPLICATED, check_vma=False)
+
+
+def local(tree: Any, mesh: Mesh | None) -> Any:
+    """Replicated arrays on this process's first device alone."""
+    return tree if mesh is None else jax.tree.map(lambda x: x.addressable_data(0), tree)
+
+
+class Across:
+    """Reductions over the mesh, for code inside `jax.shard_map`; without a mesh they leave everything as it is."""
+
+    def __init__(self, mesh: Mesh | None):
+        """Over the mesh that the code runs on."""
+        self._alone = mesh is None
+
+    def mean(self, tree: Any) -> Any:
+        """The mean of every leaf, in one message for all of them: its latency is what it costs."""
+        if self._alone:
+            return tree
+        flat, unravel = ravel_pytree(tree)
+        return unravel(jax.lax.pmean(flat, AXIS))
+
+    def max(self, x: Array) -> Array:
+        """The largest of every entry."""
+        return x if self._alone else jax.lax.pmax(x, AXIS)
+
+    def variance(self, x: Array) -> Array:
+        """Of all entries together."""
+        centred = x - self.mean(jnp.mean(x))
+        return self.mean(jnp.mean(centred * centred))
+
+    def gather(self, tree: Any) -> Any:
+        """Every leaf with a leading axis over the processes."""
+        return jax.tree.map(lambda x: x[None] if self._alone else jax.lax.all_gather(x, AXIS), tree)
+
+    def own_key(self, key: Array) -> Array:
+        """A random key for what every process does in a way of its own."""
+        return key if self._alone else jax.random.fold_in(key, jax.lax.axis_index(AXIS))

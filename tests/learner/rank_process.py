@@ -1,0 +1,53 @@
+"""One rank of a run with a made-up actor in its process, to be started, killed and resumed by tests.
+
+Arguments: rank, ranks, port of the coordinator, run directory, number of updates, `fresh` or `resume`.
+"""
+
+import dataclasses
+import pathlib
+import sys
+import threading
+import zlib
+
+from common.config import NetworkConfig, PPOConfig, RunConfig
+from common.errors import CongraspError
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.wire.codec import encode
+from learner.process import run_learner
+from learner.ranks import Ranks, end_process
+from tests.learner.made_up_actor import MadeUpActor
+
+CONFIG = RunConfig(
+    name="t",
+    environments=2,
+    rollout_steps=4,
+    checkpoint_every=2,
+    network=NetworkConfig(hidden=(8,), encoder=2),
+    ppo=PPOConfig(epochs=2, minibatches=2),
+)
+
+
+def main() -> None:
+    rank, count, port, run_dir, goal, mode = sys.argv[1:]
+    ranks = Ranks.join(int(rank), int(count), f"127.0.0.1:{port}")
+    broker = MemoryHub()
+    MadeUpActor(MemoryTransport(broker), f"actor-{rank}", seed=int(rank))
+    with MemoryTransport(broker) as transport:
+        last = run_learner(
+            pathlib.Path(run_dir),
+            dataclasses.replace(CONFIG, updates=int(goal)),
+            transport,
+            stop_event=threading.Event(),
+            resume=mode == "resume",
+            ranks=ranks,
+            on_update=lambda values: print("update", int(values["update"]), flush=True),
+            on_event=lambda level, text: print(level, text, flush=True),
+        )
+    print("bundle", zlib.crc32(encode(last.to_message())), last.transitions, flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except CongraspError as error:
+        end_process(str(error), error.exit_code)

@@ -1,0 +1,249 @@
+"""Ranks that talk, in threads; and ranks that train and die, in processes of their own."""
+
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+import jax
+import numpy as np
+import pytest
+
+from common.errors import CongraspError, TransportError
+from learner import ranks as ranks_module
+from learner.process import create_run
+from learner.ranks import Ranks, ended_by
+from tests.learner.rank_process import CONFIG
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+
+
+class Party:
+    """Three ranks in this process; `said[r]` is what rank r ended with."""
+
+    def __init__(self, port: int, count: int = 3):
+        self.said: dict[int, str] = {}
+        self.links: dict[int, dict] = {}
+        deadline = time.monotonic() + 20.0
+
+        def meet(rank: int) -> None:
+            address = "127.0.0.1", port
+            self.links[rank] = (
+                {0: ranks_module._reach(rank, count, *address, deadline)}
+                if rank
+                else ranks_module._gather(count, *address, deadline)
+            )
+
+        self.everywhere(meet, count)
+        self.ranks = [
+            Ranks(r, count, self.links[r], lambda text, r=r: self.said.update({r: text})) for r in range(count)
+        ]
+
+    @staticmethod
+    def everywhere(call: Callable[[int], object], count: int = 3) -> None:
+        threads = [threading.Thread(target=call, args=(rank,)) for rank in range(count)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(30.0)
+            assert not thread.is_alive()
+
+    def end(self, rank: int) -> None:
+        """Its process is no more: nothing in it runs on, and the kernel ends its connections."""
+        self.ranks[rank]._parting.set()
+        for link in self.links[rank].values():
+            link.close()
+
+    def all_said(self, ranks: set[int]) -> bool:
+        deadline = time.monotonic() + 10.0
+        while time.monotonic() < deadline and not ranks <= self.said.keys():
+            time.sleep(0.02)
+        return ranks <= self.said.keys()
+
+
+@pytest.fixture
+def party(free_port, monkeypatch):
+    monkeypatch.setattr(ranks_module, "_RELAY_SECONDS", 0.2)
+    party = Party(free_port())
+    yield party
+    for rank in range(3):
+        party.end(rank)
+
+
+def test_everyone_is_given_the_same_entries_in_rank_order_and_the_arrays_of_rank_0(party):
+    decisions = {}
+
+    def exchange(rank: int) -> None:
+        for turn in range(20):
+            arrays = {"x": np.arange(3) + turn} if rank == 0 else None
+            decisions[rank, turn] = party.ranks[rank].exchange({"rank": rank, "turn": turn}, arrays)
+
+    party.everywhere(exchange)
+    for (_, turn), decision in decisions.items():
+        assert decision.meta["entries"] == [{"rank": rank, "turn": turn} for rank in range(3)]
+        np.testing.assert_array_equal(decision.arrays["x"], np.arange(3) + turn)
+
+
+def test_an_urgent_entry_ends_the_round_for_those_who_wait_and_those_who_come_late(party):
+    first, second, third = party.ranks
+    second.post({"end": ""})
+    assert second.poll(0.2) is None
+    third.post({"end": "a signal"}, urgent=True)
+    for rank in (second, third):
+        assert ended_by(rank.poll(10.0).meta["entries"]) == (2, "a signal")
+    assert first.poll(10.0).meta["entries"][0] is None
+    party.everywhere(lambda rank: party.ranks[rank].exchange({}))  # and the next round is whole again
+
+
+def test_a_dead_rank_ends_the_others_who_are_told_why(party):
+    party.ranks[1].fail(CongraspError("The disk is full."))
+    party.end(1)
+    assert party.all_said({0, 2})
+    for rank in (0, 2):
+        assert party.said[rank].startswith("Rank 1 ended: The disk is full. ")
+        assert "\n" not in party.said[rank]
+    assert 1 not in party.said
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_rank_ends_the_others(party, victim):
+    party.end(victim)
+    others = {0, 1, 2} - {victim}
+    assert party.all_said(others)
+    assert all(f"Rank {victim} ended" in party.said[rank] for rank in others)
+
+
+def test_a_silent_rank_ends_the_others(free_port, monkeypatch):
+    monkeypatch.setattr(ranks_module, "_SILENCE_SECONDS", 0.5)
+    party = Party(free_port())  # whose hearts beat every two seconds only
+    assert party.all_said({0, 1, 2})
+    assert any("silent" in text for text in party.said.values())
+
+
+def test_ranks_that_part_in_peace_miss_nobody(party, monkeypatch):
+    monkeypatch.setattr(jax.distributed, "shutdown", lambda: None)
+    party.everywhere(lambda rank: party.ranks[rank].close())
+    for rank in (1, 0, 2):
+        party.end(rank)
+    time.sleep(0.5)
+    assert not party.said
+
+
+def test_a_process_alone_agrees_with_itself():
+    alone = Ranks.join(0, 1, "")
+    alone.post({"end": ""})
+    assert ended_by(alone.poll(0.0).meta["entries"]) is None
+    assert alone.exchange({"x": 1}).meta["entries"] == [{"x": 1}]
+    alone.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ((2, 2, "127.0.0.1:7000"), "no rank 2 of 2"),
+        ((0, 2, "127.0.0.1"), "no address"),
+        ((0, 2, "127.0.0.1:99999"), "no address"),
+    ],
+)
+def test_ranks_and_addresses_that_make_no_sense(arguments, complaint):
+    with pytest.raises(CongraspError, match=complaint):
+        Ranks.join(*arguments)
+
+
+def test_nobody_waits_for_ever_for_a_rank_that_never_comes(free_port, monkeypatch):
+    monkeypatch.setattr(ranks_module, "JOIN_SECONDS", 0.5)
+    with pytest.raises(TransportError, match=r"Ranks \[1\] of 2 did not come"):
+        Ranks.join(0, 2, f"127.0.0.1:{free_port()}")
+    with pytest.raises(TransportError, match="Rank 0 does not answer"):
+        Ranks.join(1, 2, f"127.0.0.1:{free_port()}")
+
+
+class Job:
+    """Real processes of `tests.learner.rank_process`."""
+
+    def __init__(self, run_dir: pathlib.Path, port: int):
+        self.run_dir, self._port = run_dir, port
+        self.processes: list[subprocess.Popen[str]] = []
+
+    def start(self, goal: int, mode: str, count: int = 2) -> None:
+        self._port += 2
+        command = [sys.executable, "-m", "tests.learner.rank_process"]
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+        environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(self.run_dir / "compiled"))
+        environment |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
+        self.processes = [
+            subprocess.Popen(
+                [*command, str(rank), str(count), str(self._port), str(self.run_dir), str(goal), mode],
+                env=environment,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            for rank in range(count)
+        ]
+
+    def reach(self, update: int) -> None:
+        """Reads what rank 0 says until it has done this update."""
+        for line in self.processes[0].stdout:
+            if line.startswith("update ") and int(line.split()[1]) >= update:
+                return
+        pytest.fail(f"rank 0 ended early: {self.processes[0].stderr.read()}")
+
+    def finish(self) -> list[str]:
+        """What the ranks print to their end, which must be a good one."""
+        output = [process.communicate(timeout=300.0) for process in self.processes]
+        assert [process.returncode for process in self.processes] == [0] * len(output), output
+        return [text for text, _ in output]
+
+    def kill(self, victim: int) -> str:
+        """The last words of the other rank."""
+        self.processes[victim].send_signal(signal.SIGKILL)
+        other = self.processes[1 - victim]
+        _, words = other.communicate(timeout=15.0)
+        assert other.returncode == TransportError.exit_code
+        return words
+
+
+@pytest.fixture
+def job(tmp_path, free_port):
+    create_run(tmp_path, CONFIG)
+    job = Job(tmp_path, free_port())
+    yield job
+    for process in job.processes:
+        process.kill()
+        process.wait(10.0)
+
+
+@pytest.mark.timeout(600)
+def test_two_processes_train_die_and_resume_as_one_or_two(job):
+    job.start(10**6, "fresh")
+    job.reach(5)
+    words = job.kill(1)
+    assert re.findall(r"congrasp: error: .*", words) == [words.strip().splitlines()[-1]]
+    assert "Rank 1 ended. Rank 0 cannot go on alone: start all ranks with --resume." in words
+
+    job.start(10**6, "resume")
+    job.reach(6)
+    words = job.kill(0)
+    assert "Rank 0 ended. Rank 1 cannot go on alone: start all ranks with --resume." in words
+
+    kept = int((job.run_dir / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
+    assert kept >= 4 and kept % CONFIG.checkpoint_every == 0
+    job.start(kept + 3, "resume")
+    first, second = job.finish()
+    steps = 2 * CONFIG.ppo.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
+    (said,), (other,) = (
+        [line.split()[1:] for line in text.splitlines() if "bundle" in line] for text in (first, second)
+    )
+    assert said == other  # weights, normalisers and versions, bit for bit, though the rollouts were not the same
+    assert int(said[1]) == steps * (kept + 3)
+
+    job.start(kept + 5, "resume", count=1)
+    (alone,) = job.finish()
+    assert "The checkpoint is of 2 rank(s), this run has 1" in alone
+    assert int(alone.split()[-1]) == steps * (kept + 3) + steps // 2 * 2
