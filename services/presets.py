@@ -12,6 +12,9 @@ from common.config import (
 from common.errors import CongraspError
 from common.objects.procedural import PRIMITIVE_FAMILIES
 
+HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
+"""Families that the human hand fails most often to hold by a part; twice as many of them are trained on."""
+
 PRESETS = {
     # Minutes on two CPU cores; `easier` says what that takes.
     "quickstart": RunConfig(
@@ -30,13 +33,14 @@ PRESETS = {
         name="human",
         environments=4096,
         updates=600,
-        task=TaskConfig(hold_steps_max=200, mass_range=(0.8, 1.25), friction_range=(0.8, 1.2)),
+        task=TaskConfig(hold_steps_max=200, p_affordance=0.6, mass_range=(0.8, 1.25), friction_range=(0.8, 1.2)),
         # Grasps first, then the precision with which constraints are met: with the second weights from the beginning
         # trajectories are not learnt.
         curriculum=CurriculumConfig(
-            ramp=(100, 200),
+            ramp=(80, 160),
             reward=RewardWeights(
                 force=0.8,
+                force_excess=0.02,
                 object_position=80.0,
                 object_rotation=6.0,
                 drop=5.0,
@@ -46,13 +50,13 @@ PRESETS = {
                 pose_link=8.0,
                 pose_wrist_position=150.0,
                 pose_wrist_rotation=3.0,
-                trajectory_position=400.0,
-                trajectory_rotation=12.0,
+                trajectory_position=500.0,
+                trajectory_rotation=18.0,
                 affordance_distance=0.15,
                 affordance_force=0.3,
             ),
         ),
-        objects=ObjectsConfig(families=PRIMITIVE_FAMILIES, count=768),
+        objects=ObjectsConfig(families=PRIMITIVE_FAMILIES + HARD_FAMILIES, count=800),
         ppo=PPOConfig(rollouts_per_update=1, gamma=0.99),
     ),
 }

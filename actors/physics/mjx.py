@@ -67,6 +67,11 @@ class MjxPhysics:
             # MJX-JAX has no contact sensor between bodies; its contacts are read from the contact list instead.
             pool.model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
             pool.model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN
+        else:
+            # Measured: more iterations of either kind hold no more grasps there. Dense Jacobians cost elliptic cones
+            # twice the whole solver's time.
+            pool.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+            pool.model.opt.iterations, pool.model.opt.ls_iterations, pool.model.opt.tolerance = 4, 10, 1e-5
         self._host_model = pool.model
         self._body_of_geom = np.array(pool.model.geom_bodyid)
         self._model = self._blind = mjx.put_model(pool.model, impl=implementation)
