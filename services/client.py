@@ -1,13 +1,16 @@
 """The client of a policy server, for a robot's control loop: needs nothing but numpy and zenoh."""
 
+import math
 import os
 import pathlib
 import time
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from common.errors import CongraspError
+from common.transport.base import RefusedError
 from common.transport.keys import Keys
 from common.transport.security import Credentials
 from common.transport.zenoh_transport import ZenohTransport
@@ -31,6 +34,37 @@ class Answer(NamedTuple):
     """From asking to the answer."""
     server_ms: float
     """The server's share of it."""
+
+
+class _Packer:
+    """Queries as one vector, in which only what changes from step to step is written anew."""
+
+    def __init__(self, layout: Mapping[str, Any], episode: Mapping[str, np.ndarray], fingers: int):
+        self._digest, self._fields, self._fingers = layout["layout"], layout["fields"], fingers
+        self._vector = np.zeros(layout["size"], np.float32)
+        points = self._fields["surface_points"][1]
+        for name, value in episode.items():
+            if name in ("surface_points", "surface_minus") and len(value) != points:
+                value = np.asarray(value)[np.arange(points) * len(value) // points]
+            self._write(name, value)
+
+    def pack(self, moment: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> Message:
+        """The episode's query at a moment."""
+        for name, value in moment.items():
+            self._write(name, value)
+        return Message({"packed": self._vector}, {**meta, "layout": self._digest})
+
+    def unpack(self, reply: Message) -> list[np.ndarray]:
+        """Action, finger targets and wrist targets."""
+        return np.split(reply.arrays["packed"], [self._fingers + 6, 2 * self._fingers + 6])
+
+    def _write(self, name: str, value: np.ndarray) -> None:
+        if name not in self._fields:
+            raise CongraspError(f"The query has an unknown field '{name}'.", f"Known: {', '.join(self._fields)}.")
+        offset, *shape = self._fields[name]
+        if list(np.shape(value)) != shape:
+            raise CongraspError(f"The field '{name}' has shape {np.shape(value)}; it must be {tuple(shape)}.")
+        self._vector[offset : offset + math.prod(shape)] = np.ravel(value)
 
 
 class PolicyClient:
@@ -69,6 +103,7 @@ class PolicyClient:
         self._episode: dict[str, np.ndarray] = {}
         self._constraints: list[str] = []
         self._time = 0
+        self._packer: _Packer | None = None
 
     def health(self) -> dict[str, object]:
         """Readiness, version, hand and queue of the server."""
@@ -110,6 +145,7 @@ class PolicyClient:
             **goal,
         }
         self._time = 0
+        self._packer = None
 
     def act(self, state: Mapping[str, np.ndarray]) -> Answer:
         """Joint targets for the present moment.
@@ -122,29 +158,46 @@ class PolicyClient:
         Raises:
           TransportError: the server is away, overloaded, or refuses the query; its words say why.
         """
-        arrays = {**self._episode, "time": np.float32(self._time), "table": np.bool_(True), **state}
-        request = Message(
-            {
-                name: np.asarray(value, bool if np.asarray(value).dtype == bool else np.float32)
-                for name, value in arrays.items()
-            },
-            {"hand": self._hand, "constraints": self._constraints, "timeout": self._timeout},
-        )
         began = time.perf_counter()
-        reply = self._transport.query(self._keys.act, request, timeout=self._timeout)
+        meta = {"hand": self._hand, "constraints": self._constraints, "timeout": self._timeout}
+        moment = {"time": np.asarray(self._time, np.float32), "table": np.asarray(True), **state}
+        try:
+            reply = self._ask(meta, moment)
+        except RefusedError as error:
+            if self._packer is None or "layout" not in str(error):
+                raise
+            self._packer = None  # another server has taken the place of the one that this layout was of
+            reply = self._ask(meta, moment)
+        if self._packer is None:
+            fingers = len(reply.arrays["q_target"])
+            self._packer = _Packer(reply.meta, self._episode, fingers)
+            action, q_target, u_target = (reply.arrays[name] for name in ("action", "q_target", "u_target"))
+        else:
+            action, q_target, u_target = self._packer.unpack(reply)
+        self._episode["q_target"], self._episode["u_target"] = q_target, u_target
+        self._time += 1
         spent = 1e3 * (time.perf_counter() - began)
-        answer = Answer(
-            reply.arrays["q_target"],
-            reply.arrays["u_target"],
-            reply.arrays["action"],
+        return Answer(
+            q_target,
+            u_target,
+            action,
             int(reply.meta["version"]),
             tuple(reply.meta["active"]),
             spent,
             float(reply.meta["total_ms"]),
         )
-        self._episode["q_target"], self._episode["u_target"] = answer.q_target, answer.u_target
-        self._time += 1
-        return answer
+
+    def _ask(self, meta: dict[str, Any], moment: Mapping[str, np.ndarray]) -> Message:
+        """A query of names at an episode's begin, which is checked field by field; packed ones from then on."""
+        if self._packer is None:
+            arrays = {**self._episode, **moment}
+            dtypes = {name: bool if np.asarray(value).dtype == bool else np.float32 for name, value in arrays.items()}
+            named = {name: np.asarray(value, dtypes[name]) for name, value in arrays.items()}
+            request = Message(named, {**meta, "layout": True})
+        else:
+            targets = {name: self._episode[name] for name in ("q_target", "u_target")}
+            request = self._packer.pack({**targets, **moment}, meta)
+        return self._transport.query(self._keys.act, request, timeout=self._timeout)
 
     def close(self) -> None:
         """Disconnects."""

@@ -24,12 +24,8 @@ BATCH_SIZES = (1, 8, 64)
 class Answer(NamedTuple):
     """What the policy says to one query."""
 
-    action: np.ndarray
-    """(A,) mean of the policy, in units of action."""
-    q_target: np.ndarray
-    """(F,) finger joint targets, rad."""
-    u_target: np.ndarray
-    """(6,) virtual wrist joint targets, m and rad."""
+    vector: np.ndarray
+    """(A + F + 6,): the policy's mean action in units of action, finger targets (rad), wrist targets (m and rad)."""
     words: tuple[str, ...]
     """Which constraints are active, and why."""
 
@@ -52,11 +48,12 @@ class PolicyFunction:
 
     def __call__(self, weights: Acting, queries: Sequence[Query]) -> list[Answer | Exception]:
         """Answers at most `BATCH_SIZES[-1]` queries; a query that cannot be answered gets its own error."""
-        size = next(size for size in BATCH_SIZES if size >= len(queries))
-        batch = np.zeros((size, self.layout.size), np.float32)
-        batch[: len(queries)] = [query.vector for query in queries]
-        rows = np.asarray(self._compiled(weights, batch))[: len(queries)]
-        return [self._answer(query, row) for query, row in zip(queries, rows, strict=True)]
+        count = len(queries)
+        batch = np.zeros((next(size for size in BATCH_SIZES if size >= count), self.layout.size), np.float32)
+        batch[:count] = [query.vector for query in queries]
+        errors = self.layout.complete(batch[:count], [query.asked for query in queries])
+        rows = np.asarray(self._compiled(weights, batch))[:count]
+        return [error or self._answer(query, row) for query, row, error in zip(queries, rows, errors, strict=True)]
 
     def _infer(self, weights: Acting, vectors: jax.Array) -> jax.Array:
         """(B, A + F + 6 + 2): action, targets, and the flags redirected and aligned, of flat queries (B, S)."""
@@ -76,8 +73,7 @@ class PolicyFunction:
         return jnp.concatenate([mean, action.q_target, action.u_target, notes], -1)
 
     def _answer(self, query: Query, row: np.ndarray) -> Answer | Exception:
-        fingers = len(self.layout.hand.joints)
-        action, q_target, u_target, (redirected, aligned) = np.split(row, np.cumsum([fingers + 6, fingers, 6]))
+        vector, (redirected, aligned) = row[:-2], row[-2:]
         if not np.isfinite(row).all():
             return CongraspError("The policy's answer to this query is not finite.", "Check the state's magnitudes.")
         if not aligned:
@@ -86,4 +82,4 @@ class PolicyFunction:
                 "Change the trajectory or the affordance.",
             )
         asked = {name: name in query.asked for name in ("affordance", "pose", "trajectory")}
-        return Answer(action, q_target, u_target, tuple(explain(**asked, redirected=bool(redirected))))
+        return Answer(vector, tuple(explain(**asked, redirected=bool(redirected))))

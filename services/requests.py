@@ -3,9 +3,15 @@
 A query names its constraints in the metadata and carries, without batch axis, the fields of
 `common.task.types.SceneState`, the object's surface points and the goal fields of its constraints. The whole query
 travels to the device as one float32 vector, since one transfer costs as much as thirty times its size.
+
+A query may also be packed: the vector itself as its one array, and in the metadata the digest of the layout that it
+follows. Whoever asks a query of names for the `layout` gets it with the answer. Packed queries cost both ends a fourth.
 """
 
+import hashlib
+import json
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +34,17 @@ GOAL_FIELDS = {
 """Goal fields that each constraint needs; `heading_cross` may come along."""
 SURFACE_LIMIT = 4096
 """Most surface points in one query; the policy looks at `TaskConfig.surface_points` of them."""
+PACKED = "packed"
+"""The one array of a packed query."""
 _UNIT_TOLERANCE = 0.02
+_UNIT = {
+    **dict.fromkeys(("base_quaternion", "object_quaternion", "object_quaternion_initial"), ""),
+    "heading_direction": "heading",
+    "pose_quaternion": "pose",
+    "trajectory_quaternion": "trajectory",
+}
+"""Fields of unit length, and the constraint that they belong to."""
+_DOWN, _IDENTITY = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0)
 _OPTIONAL_STATE = (
     "q_velocity",
     "u_velocity",
@@ -41,10 +57,10 @@ _OPTIONAL_STATE = (
 
 
 class Query(NamedTuple):
-    """A checked query."""
+    """A query whose fields are all there."""
 
     vector: np.ndarray
-    """(S,) float32, laid out by `Layout`."""
+    """(S,) float32, laid out by `Layout`; its values are checked by `Layout.complete`."""
     asked: tuple[str, ...]
     """Names of the constraints that were asked for."""
 
@@ -55,6 +71,7 @@ class Layout:
     Attributes:
       shapes: field name to shape; the fields of the state, then of the goal, then the surface and the asked bits.
       size: S, length of the flat vector.
+      digest: identifies the layout.
     """
 
     def __init__(self, hand: Hand, task: TaskConfig):
@@ -79,6 +96,12 @@ class Layout:
         for name, shape in self.shapes.items():
             self.offsets[name] = self.size
             self.size += math.prod(shape)
+        self.digest = hashlib.sha256(json.dumps(self.description()).encode()).hexdigest()[:16]
+
+    def description(self) -> dict[str, Any]:
+        """For packers: the vector's size, and offset and shape of every field but those that the server fills in."""
+        fields = {name: [self.offsets[name], *shape] for name, shape in self.shapes.items() if name != "asked"}
+        return {"size": self.size, "fields": fields}
 
     def unpack(self, vectors: Any) -> dict[str, Any]:
         """Fields (B, ...) of flat vectors (B, S); works on NumPy arrays and on traced ones."""
@@ -88,13 +111,26 @@ class Layout:
         }
 
     def parse(self, message: Message) -> Query:
-        """Checks a query and lays it out; a CongraspError says what is wrong with it."""
-        arrays, meta = message.arrays, message.meta
+        """Lays a query out, unless it is packed already; a CongraspError says what is wrong with its form."""
+        meta = message.meta
         hand = meta.get("hand", self.hand.name)
         if hand != self.hand.name:
             get_hand(hand)
             raise CongraspError(f"This server's policy is for the hand '{self.hand.name}', not '{hand}'.")
         asked = _asked(meta.get("constraints", ["heading"]))
+        vector = self._packed(message) if PACKED in message.arrays else self._named(message.arrays, asked)
+        vector[self.offsets["asked"] :] = [name in asked for name in CONSTRAINTS[1:]]
+        return Query(vector, asked)
+
+    def _packed(self, message: Message) -> np.ndarray:
+        vector, digest = message.arrays[PACKED], message.meta.get("layout")
+        if digest != self.digest or len(message.arrays) > 1 or vector.shape != (self.size,):
+            raise CongraspError(
+                "The packed query does not follow this server's layout.", "Ask for the layout with a query of names."
+            )
+        return np.array(vector, np.float32)
+
+    def _named(self, arrays: Mapping[str, Any], asked: tuple[str, ...]) -> np.ndarray:
         unknown = sorted(arrays.keys() - self.shapes.keys() | arrays.keys() & {"asked"})
         if unknown:
             raise CongraspError(f"The query has an unknown field '{unknown[0]}'.", f"Known: {', '.join(self.shapes)}.")
@@ -106,21 +142,45 @@ class Layout:
                 raise CongraspError(f"The query lacks the field '{name}'.")
         vector = np.zeros(self.size, np.float32)
         given = dict(arrays)
-        given["surface_points"], given["surface_minus"] = self._surface(given, "affordance" in asked)
+        given["surface_points"], given["surface_minus"] = self._surface(given)
         for name, value in given.items():
             shape = self.shapes[name]
             if np.shape(value) != shape:
                 raise CongraspError(f"The field '{name}' has shape {np.shape(value)}; it must be {shape}.")
             vector[self.offsets[name] : self.offsets[name] + math.prod(shape)] = np.ravel(value)
-        if not np.isfinite(vector).all():
-            bad = next(name for name, value in given.items() if not np.isfinite(value).all())
-            raise CongraspError(f"The field '{bad}' is not finite.")
-        self._directions(vector, asked)
-        bits = self.offsets["asked"]
-        vector[bits:] = [name in asked for name in CONSTRAINTS[1:]]
-        return Query(vector, asked)
+        return vector
 
-    def _surface(self, arrays: dict[str, Any], affordance: bool) -> tuple[np.ndarray, np.ndarray]:
+    def complete(self, vectors: np.ndarray, asked: Sequence[tuple[str, ...]]) -> list[CongraspError | None]:
+        """Checks the values of queries (B, S), makes quaternions and directions unit, fills in what nobody asked for.
+
+        Returns:
+          What is wrong with each query; the vectors of such are zero afterwards.
+        """
+        errors: list[CongraspError | None] = [None] * len(vectors)
+        wanted = {name: np.array([name in names for names in asked]) for name in CONSTRAINTS}
+        wanted[""] = np.ones(len(vectors), bool)
+        fields = self.unpack(vectors)
+        for row in np.flatnonzero(~np.isfinite(vectors).all(1)):
+            bad = next(name for name, value in fields.items() if not np.isfinite(value[row]).all())
+            errors[row] = CongraspError(f"The field '{bad}' is not finite.")
+            vectors[row] = 0.0
+        minus = fields["surface_minus"] > 0.5
+        for row in np.flatnonzero(wanted["affordance"] & (minus.all(1) | ~minus.any(1))):
+            text = "An affordance needs surface points on both sides."
+            errors[row] = errors[row] or CongraspError(text, "Set some of 'surface_minus'.")
+        for name, constraint in _UNIT.items():
+            value, need = fields[name], wanted[constraint].reshape(-1, *([1] * (fields[name].ndim - 1)))
+            norm = np.linalg.norm(value, axis=-1, keepdims=True)
+            wrong = need & (np.abs(norm - 1.0) > _UNIT_TOLERANCE)
+            for row in np.flatnonzero(wrong.reshape(len(vectors), -1).any(1)):
+                length = norm[row].flat[np.abs(norm[row] - 1.0).argmax()]
+                errors[row] = errors[row] or CongraspError(f"The field '{name}' has length {length:.3f}, not 1.")
+            default = _IDENTITY if "quaternion" in name else _DOWN
+            value[...] = np.where(need & ~wrong, value / np.where(wrong | ~need, 1.0, norm), default)
+        fields["heading_cross"][...] = _orthogonal(fields["heading_cross"], fields["heading_direction"])
+        return errors
+
+    def _surface(self, arrays: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Points and labels, brought to the number that the policy looks at."""
         points = np.asarray(arrays["surface_points"])
         if points.ndim != 2 or points.shape[1] != 3 or not 1 <= len(points) <= SURFACE_LIMIT:
@@ -130,33 +190,10 @@ class Layout:
         minus = np.asarray(arrays.get("surface_minus", np.zeros(len(points), bool)))
         if minus.shape != (len(points),):
             raise CongraspError(f"The field 'surface_minus' has shape {minus.shape}; it must be ({len(points)},).")
-        if affordance and (minus.all() or not minus.any()):
-            raise CongraspError("An affordance needs surface points on both sides.", "Set some of 'surface_minus'.")
         if len(points) == self.task.surface_points:
             return points, minus
         index = np.arange(self.task.surface_points) * len(points) // self.task.surface_points
         return points[index], minus[index]
-
-    def _directions(self, vector: np.ndarray, asked: tuple[str, ...]) -> None:
-        """Makes quaternions and directions unit, and completes the goal fields that nobody asked for."""
-        fields = {name: field[0] for name, field in self.unpack(vector[None]).items()}
-        goal = {name for constraint in asked for name in GOAL_FIELDS[constraint]}
-        for name, value in fields.items():
-            if name in Goal._fields and name not in goal:
-                continue
-            if "quaternion" in name or name == "heading_direction":
-                norm = np.linalg.norm(value, axis=-1, keepdims=True)
-                if np.abs(norm - 1).max() > _UNIT_TOLERANCE:
-                    raise CongraspError(
-                        f"The field '{name}' has length {norm.flat[np.abs(norm - 1).argmax()]:.3f}, not 1."
-                    )
-                value /= norm
-        for name in ("pose_quaternion", "trajectory_quaternion"):
-            if name not in goal:
-                fields[name][..., 0] = 1.0
-        if "heading_direction" not in goal:
-            fields["heading_direction"][2] = -1.0
-        fields["heading_cross"][:] = _orthogonal(fields["heading_cross"], fields["heading_direction"])
 
 
 def _asked(names: Any) -> tuple[str, ...]:
@@ -171,9 +208,9 @@ def _asked(names: Any) -> tuple[str, ...]:
 
 
 def _orthogonal(cross: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """The cross-finger direction made orthogonal to the heading; any orthogonal one where it is absent or parallel."""
-    cross = cross - (cross @ direction) * direction
-    if np.linalg.norm(cross) < 1e-3:
-        axis = np.eye(3, dtype=np.float32)[np.abs(direction).argmin()]
-        cross = axis - (axis @ direction) * direction
-    return cross / np.linalg.norm(cross)
+    """(B, 3) unit cross-finger directions orthogonal to the heading; any such where one is absent or parallel to it."""
+    cross = cross - np.sum(cross * direction, -1, keepdims=True) * direction
+    axis = np.eye(3, dtype=np.float32)[np.abs(direction).argmin(-1)]
+    other = axis - np.sum(axis * direction, -1, keepdims=True) * direction
+    cross = np.where(np.linalg.norm(cross, axis=-1, keepdims=True) < 1e-3, other, cross)
+    return cross / np.linalg.norm(cross, axis=-1, keepdims=True)

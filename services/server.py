@@ -1,10 +1,14 @@
 """The live policy server: follows a run or a policy file, and answers queries on `policy/act` and `policy/health`."""
 
+import functools
 import pathlib
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from common.errors import CongraspError, TransportError
 from common.hands import get_hand
@@ -16,7 +20,7 @@ from common.wire.codec import Message, encode
 from services.batching import Batcher, Late, Overloaded
 from services.inference import BATCH_SIZES, Answer, PolicyFunction
 from services.logs import say
-from services.requests import Query
+from services.requests import PACKED, Query
 
 Source = Callable[[int], PolicyBundle | None]
 """(version that is held, -1 for none) -> a newer bundle, or None."""
@@ -24,7 +28,6 @@ WINDOW = 0.001
 """Seconds that a query may wait for others to join its batch."""
 DEPTH = 64
 """Queries that wait for the next batch; one more is refused at once."""
-_WORKERS = DEPTH + BATCH_SIZES[-1] + 8  # enough that some are free to refuse while all others wait for their answers
 _MAX_TIMEOUT = 60.0
 _FOLLOW_SECONDS = 0.5
 
@@ -35,6 +38,10 @@ class _Held(NamedTuple):
     bundle: PolicyBundle
     hash: str
     acting: Acting
+
+
+_Answered = tuple[Answer, _Held, float, float]
+"""An answer, the policy it is of, and the seconds that it waited and was computed in."""
 
 
 class PolicyServer:
@@ -74,12 +81,12 @@ class PolicyServer:
         self._answered = 0
         self._trouble = ""
         self._closed = threading.Event()
-        self._batcher: Batcher[Query, tuple[Answer, _Held, float, float]] = Batcher(
+        self._batcher: Batcher[Query, _Answered] = Batcher(
             self._infer, size=BATCH_SIZES[-1], window=WINDOW, depth=DEPTH
         )
         keys = Keys(run)
         transport.serve(keys.health, lambda key, request: Message({}, self.health()))
-        transport.serve(keys.act, self._act, workers=_WORKERS, depth=_WORKERS)
+        transport.serve(keys.act, self._act, depth=DEPTH)
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
 
@@ -104,36 +111,49 @@ class PolicyServer:
         self._batcher.close()
         self._follower.join(2 * _FOLLOW_SECONDS)
 
-    def _act(self, key: str, request: Message) -> Message:
-        began, outcome = time.monotonic(), "refused"
+    def _act(self, key: str, request: Message) -> "Future[Message]":
+        began = time.monotonic()
         try:
-            answer = self._answer(request, began)
-            outcome = "answered"
-            return answer
-        except (Overloaded, Late) as error:
-            outcome = type(error).__name__.lower()
+            query = self._function.layout.parse(request)
+            future = self._batcher.submit(query, self._deadline(request.meta.get("timeout", self._timeout)))
+        except CongraspError as error:
+            self._count(error, began)
             raise
-        finally:
-            self._on_answer(outcome, time.monotonic() - began)
+        answer: Future[Message] = Future()
+        future.add_done_callback(functools.partial(self._finish, request, began, answer))
+        return answer
 
-    def _answer(self, request: Message, began: float) -> Message:
-        query = self._function.layout.parse(request)
-        timeout = self._deadline(request.meta.get("timeout", self._timeout))
-        future = self._batcher.submit(query, timeout)
-        try:
-            answer, held, queued, inferred = future.result(timeout + 1.0)
-        except TimeoutError:
-            raise Late(f"The policy did not answer within {timeout:g} s.", "Ask again later.") from None
-        self._answered += 1
-        meta = {
+    def _finish(self, request: Message, began: float, answer: "Future[Message]", done: "Future[_Answered]") -> None:
+        error = done.exception()
+        self._count(error, began)
+        if error is None:
+            answer.set_result(self._message(request, done.result(), time.monotonic() - began))
+        else:
+            answer.set_exception(error)
+
+    def _count(self, error: BaseException | None, began: float) -> None:
+        outcome = type(error).__name__.lower() if isinstance(error, Overloaded | Late) else "refused"
+        self._answered += error is None
+        self._on_answer("answered" if error is None else outcome, time.monotonic() - began)
+
+    def _message(self, request: Message, answered: "_Answered", seconds: float) -> Message:
+        (vector, words), held, queued, inferred = answered
+        layout = self._function.layout
+        meta: dict[str, Any] = {
             "version": held.bundle.version,
             "hash": held.hash,
-            "active": list(answer.words),
+            "active": list(words),
             "queue_ms": round(1e3 * queued, 3),
             "infer_ms": round(1e3 * inferred, 3),
-            "total_ms": round(1e3 * (time.monotonic() - began), 3),
+            "total_ms": round(1e3 * seconds, 3),
         }
-        return Message({"action": answer.action, "q_target": answer.q_target, "u_target": answer.u_target}, meta)
+        if PACKED in request.arrays:
+            return Message({PACKED: vector}, meta)
+        if request.meta.get("layout"):
+            meta |= {"layout": layout.digest, **layout.description()}
+        fingers = len(layout.hand.joints)
+        parts = np.split(vector, [fingers + 6, 2 * fingers + 6])
+        return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
 
     @staticmethod
     def _deadline(seconds: Any) -> float:
@@ -143,9 +163,7 @@ class PolicyServer:
             )
         return float(seconds)
 
-    def _infer(
-        self, queries: Sequence[Query], queued: Sequence[float]
-    ) -> list[tuple[Answer, _Held, float, float] | Exception]:
+    def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[_Answered | Exception]:
         held, began = self._held, time.monotonic()
         self._on_batch(len(queries))
         answers = self._function(held.acting, queries)

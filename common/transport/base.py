@@ -4,6 +4,7 @@ import collections
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Protocol, Self
 
 from common.errors import CongraspError, TransportError
@@ -11,6 +12,8 @@ from common.wire.codec import Message
 
 Handler = Callable[[str, Message], Message]
 """(key, request) -> reply."""
+Answerer = Callable[[str, Message], "Message | Future[Message]"]
+"""A handler that may also return a future of the reply: its thread then goes on with the next request."""
 Damage = Callable[[str, CongraspError], None]
 """(key, what is wrong): a request arrived that could not be decoded."""
 Turnstile = Callable[[str], Message | None]
@@ -79,7 +82,7 @@ class Transport(Protocol):
     def serve(
         self,
         key: str,
-        handler: Handler,
+        handler: Answerer,
         *,
         workers: int = 1,
         depth: int = 4,

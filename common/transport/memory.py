@@ -4,6 +4,7 @@ Arrays may stay on a device. All endpoints of a `MemoryHub` see each other.
 """
 
 import contextlib
+import functools
 import logging
 import queue
 import threading
@@ -13,7 +14,7 @@ from concurrent.futures import Future
 from typing import NamedTuple, Self
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Damage, Handler, RefusedError, Subscription, Turnstile
+from common.transport.base import Answerer, Damage, RefusedError, Subscription, Turnstile
 from common.transport.keys import matches
 from common.wire.codec import Message
 
@@ -70,7 +71,7 @@ class MemoryTransport:
     def serve(
         self,
         key: str,
-        handler: Handler,
+        handler: Answerer,
         *,
         workers: int = 1,
         depth: int = 4,
@@ -191,19 +192,29 @@ def _refuse_waiting(server: _Server) -> None:
             server.questions.put_nowait(None)
 
 
-def _serve(server: _Server, handler: Handler, turnstile: Turnstile) -> None:
+def _serve(server: _Server, handler: Answerer, turnstile: Turnstile) -> None:
     while not server.ended.is_set():
         question = server.questions.get()
-        if question is None:
-            continue
-        try:
-            turned_away = turnstile(question.key)
-            question.answer.set_result(turned_away or handler(question.key, question.request))
-        except CongraspError as error:
-            question.answer.set_exception(RefusedError(str(error)))
-        except Exception as error:
-            _log.exception("The answer to %s failed.", question.key)
-            question.answer.set_exception(RefusedError(f"The peer failed on {question.key}: {type(error).__name__}."))
+        if question is not None:
+            _answer(question, functools.partial(_ask, question, handler, turnstile))
+
+
+def _ask(question: _Question, handler: Answerer, turnstile: Turnstile) -> "Message | Future[Message]":
+    return turnstile(question.key) or handler(question.key, question.request)
+
+
+def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message]]") -> None:
+    try:
+        result = outcome()
+        if isinstance(result, Future):
+            result.add_done_callback(lambda done: _answer(question, done.result))
+        else:
+            question.answer.set_result(result)
+    except CongraspError as error:
+        question.answer.set_exception(RefusedError(str(error)))
+    except Exception as error:
+        _log.exception("The answer to %s failed.", question.key)
+        question.answer.set_exception(RefusedError(f"The peer failed on {question.key}: {type(error).__name__}."))
 
 
 def _watch(watcher: _Watcher, on_change: Callable[[str, bool], None]) -> None:

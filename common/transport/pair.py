@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, Self
 
-from common.transport.base import Handler, Subscription, Transport
+from common.transport.base import Answerer, Subscription, Transport
 from common.wire.codec import Message
 
 
@@ -14,7 +14,7 @@ class PairTransport:
         """Joins the two."""
         self._first, self._both = first, (first, second)
 
-    def serve(self, key: str, handler: Handler, **options: Any) -> None:
+    def serve(self, key: str, handler: Answerer, **options: Any) -> None:
         """See `Transport.serve`; each of the two has workers of its own."""
         for transport in self._both:
             transport.serve(key, handler, **options)

@@ -18,13 +18,14 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from typing import Any, Self
 
 import zenoh
 from zenoh.handlers import FifoChannel
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Damage, Handler, RefusedError, Subscription, Turnstile
+from common.transport.base import Answerer, Damage, RefusedError, Subscription, Turnstile
 from common.transport.keys import FLOWS, Flow, flow
 from common.transport.security import Credentials, refusal, secured
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
@@ -97,7 +98,7 @@ class ZenohTransport:
     def serve(
         self,
         key: str,
-        handler: Handler,
+        handler: Answerer,
         *,
         workers: int = 1,
         depth: int = 4,
@@ -334,28 +335,44 @@ def _received(channel: Any) -> Iterator[Any]:
             yield channel.recv()
 
 
-def _serve(queries: Any, handler: Handler, on_damage: Damage, turnstile: Turnstile, max_message: int) -> None:
+def _serve(queries: Any, handler: Answerer, on_damage: Damage, turnstile: Turnstile, max_message: int) -> None:
     for query in _received(queries):
-        with contextlib.suppress(zenoh.ZError), query:
-            key = str(query.key_expr)
-            if (turned_away := turnstile(key)) is not None:
-                query.reply(key, encode(turned_away))
-                continue
-            try:
-                request = decode(query.payload.to_bytes() if query.payload else b"", max_bytes=max_message)
-            except CongraspError as error:
-                on_damage(key, error)
-                query.reply_err(str(error).encode())
-                continue
-            try:
-                query.reply(key, encode(handler(key, request)))
-            except CongraspError as error:
-                query.reply_err(str(error).encode(errors="replace"))
-            except zenoh.ZError:
-                raise
-            except Exception as error:
-                _log.exception("The answer to %s failed.", key)
-                query.reply_err(f"The peer failed on {key}: {type(error).__name__}.".encode())
+        key = str(query.key_expr)
+        _reply(query, key, functools.partial(_ask, query, key, handler, on_damage, turnstile, max_message))
+
+
+def _ask(
+    query: Any, key: str, handler: Answerer, on_damage: Damage, turnstile: Turnstile, max_message: int
+) -> Message | Future[Message]:
+    if (turned_away := turnstile(key)) is not None:
+        return turned_away
+    try:
+        request = decode(query.payload.to_bytes() if query.payload else b"", max_bytes=max_message)
+    except CongraspError as error:
+        on_damage(key, error)
+        raise
+    return handler(key, request)
+
+
+def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]]) -> None:
+    """Answers a query with what a function returns, once it is there, or in words with what it raises."""
+    payload, words = b"", ""
+    try:
+        result = outcome()
+        if isinstance(result, Future):
+            result.add_done_callback(lambda done: _reply(query, key, done.result))
+            return
+        payload = encode(result)
+    except CongraspError as error:
+        words = str(error)
+    except Exception as error:
+        _log.exception("The answer to %s failed.", key)
+        words = f"The peer failed on {key}: {type(error).__name__}."
+    with contextlib.suppress(zenoh.ZError), query:
+        if words:
+            query.reply_err(words.encode(errors="replace"))
+        else:
+            query.reply(key, payload)
 
 
 def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:

@@ -31,7 +31,14 @@ def arrays(**changes):
 
 
 def parse(constraints=("heading",), meta=None, **changes):
-    return LAYOUT.parse(Message(arrays(**changes), {"constraints": list(constraints), **(meta or {})}))
+    return completed(LAYOUT.parse(Message(arrays(**changes), {"constraints": list(constraints), **(meta or {})})))
+
+
+def completed(query):
+    errors = LAYOUT.complete(query.vector[None], [query.asked])
+    if errors[0]:
+        raise errors[0]
+    return query
 
 
 def fields(query):
@@ -102,3 +109,35 @@ def test_another_hand_is_refused():
         parse(meta={"hand": "paw"})
     with pytest.raises(CongraspError, match="list of names"):
         parse(meta={"constraints": "heading"})
+
+
+def test_a_packed_query_is_the_vector_of_the_named_one():
+    named = LAYOUT.parse(Message(arrays(), {"constraints": ["heading"]}))
+    description = LAYOUT.description()
+    vector = np.zeros(description["size"], np.float32)
+    for name, value in arrays().items():
+        offset, *shape = description["fields"][name]
+        vector[offset : offset + int(np.prod(shape))] = np.ravel(value)
+    meta = {"constraints": ["heading"], "layout": LAYOUT.digest}
+    packed = LAYOUT.parse(Message({"packed": vector}, meta))
+    np.testing.assert_array_equal(packed.vector, named.vector)
+    other = Layout(HAND, TaskConfig(surface_points=8, trajectory_points=4)).digest
+    for wrong in (
+        Message({"packed": vector}, {**meta, "layout": other}),
+        Message({"packed": vector[:-1]}, meta),
+        Message({"packed": vector, "q": np.zeros(20)}, meta),
+        Message({"packed": vector}, {"constraints": ["heading"]}),
+    ):
+        with pytest.raises(CongraspError, match="does not follow this server's layout"):
+            LAYOUT.parse(wrong)
+
+
+def test_a_bad_query_of_a_batch_spoils_no_other():
+    good, bad = parse(), LAYOUT.parse(Message(arrays(u=np.full(6, np.nan)), {}))
+    third = LAYOUT.parse(Message(arrays(base_quaternion=np.zeros(4)), {}))
+    vectors = np.stack([good.vector, bad.vector, good.vector, third.vector])
+    errors = LAYOUT.complete(vectors, [query.asked for query in (good, bad, good, third)])
+    assert [error is not None for error in errors] == [False, True, False, True]
+    assert "'u' is not finite" in str(errors[1]) and "base_quaternion" in str(errors[3])
+    np.testing.assert_allclose(vectors[[0, 2]], good.vector[None].repeat(2, 0), atol=1e-6)
+    assert np.isfinite(vectors).all()
