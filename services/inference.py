@@ -39,7 +39,9 @@ class PolicyFunction:
 
     def __init__(self, hand: Hand, task: TaskConfig):
         self.layout = Layout(hand, task)
-        self._compiled = jax.jit(self._infer)
+        # Waking other threads costs a CPU more than they save here.
+        alone = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
+        self._compiled = jax.jit(self._infer, compiler_options=alone)
 
     def warm_up(self, weights: Acting) -> None:
         """Compiles every batch size."""

@@ -37,14 +37,7 @@ SURFACE_LIMIT = 4096
 PACKED = "packed"
 """The one array of a packed query."""
 _UNIT_TOLERANCE = 0.02
-_UNIT = {
-    **dict.fromkeys(("base_quaternion", "object_quaternion", "object_quaternion_initial"), ""),
-    "heading_direction": "heading",
-    "pose_quaternion": "pose",
-    "trajectory_quaternion": "trajectory",
-}
-"""Fields of unit length, and the constraint that they belong to."""
-_DOWN, _IDENTITY = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0)
+_DOWN, _IDENTITY = np.array((0, 0, -1), np.float32), np.array((1, 0, 0, 0), np.float32)
 _OPTIONAL_STATE = (
     "q_velocity",
     "u_velocity",
@@ -96,6 +89,13 @@ class Layout:
         for name, shape in self.shapes.items():
             self.offsets[name] = self.size
             self.size += math.prod(shape)
+        places = np.arange(self.size)
+        quaternions = [name for name in self.shapes if "quaternion" in name]
+        self._quaternions = np.concatenate([self._field(places, name).reshape(-1, 4) for name in quaternions])
+        # Which constraint a quaternion belongs to: an index into CONSTRAINTS, or the one after for the state's.
+        self._owners = np.concatenate(
+            [[_owner(name)] * (math.prod(self.shapes[name]) // 4) for name in quaternions]
+        ).astype(int)
         self.digest = hashlib.sha256(json.dumps(self.description()).encode()).hexdigest()[:16]
 
     def description(self) -> dict[str, Any]:
@@ -105,10 +105,11 @@ class Layout:
 
     def unpack(self, vectors: Any) -> dict[str, Any]:
         """Fields (B, ...) of flat vectors (B, S); works on NumPy arrays and on traced ones."""
-        return {
-            name: vectors[:, self.offsets[name] : self.offsets[name] + math.prod(shape)].reshape(-1, *shape)
-            for name, shape in self.shapes.items()
-        }
+        return {name: self._field(vectors, name).reshape(-1, *shape) for name, shape in self.shapes.items()}
+
+    def _field(self, vectors: Any, name: str) -> Any:
+        """A field's numbers (..., n) in flat vectors (..., S)."""
+        return vectors[..., self.offsets[name] : self.offsets[name] + math.prod(self.shapes[name])]
 
     def parse(self, message: Message) -> Query:
         """Lays a query out, unless it is packed already; a CongraspError says what is wrong with its form."""
@@ -157,27 +158,28 @@ class Layout:
           What is wrong with each query; the vectors of such are zero afterwards.
         """
         errors: list[CongraspError | None] = [None] * len(vectors)
-        wanted = {name: np.array([name in names for names in asked]) for name in CONSTRAINTS}
-        wanted[""] = np.ones(len(vectors), bool)
-        fields = self.unpack(vectors)
+        wanted = np.array([[*(name in names for name in CONSTRAINTS), True] for names in asked])
         for row in np.flatnonzero(~np.isfinite(vectors).all(1)):
-            bad = next(name for name, value in fields.items() if not np.isfinite(value[row]).all())
+            fields = self.unpack(vectors[row : row + 1])
+            bad = next(name for name, value in fields.items() if not np.isfinite(value).all())
             errors[row] = CongraspError(f"The field '{bad}' is not finite.")
             vectors[row] = 0.0
-        minus = fields["surface_minus"] > 0.5
-        for row in np.flatnonzero(wanted["affordance"] & (minus.all(1) | ~minus.any(1))):
+        minus = self._field(vectors, "surface_minus") > 0.5
+        for row in np.flatnonzero(wanted[:, CONSTRAINTS.index("affordance")] & (minus.all(1) | ~minus.any(1))):
             text = "An affordance needs surface points on both sides."
             errors[row] = errors[row] or CongraspError(text, "Set some of 'surface_minus'.")
-        for name, constraint in _UNIT.items():
-            value, need = fields[name], wanted[constraint].reshape(-1, *([1] * (fields[name].ndim - 1)))
-            norm = np.linalg.norm(value, axis=-1, keepdims=True)
-            wrong = need & (np.abs(norm - 1.0) > _UNIT_TOLERANCE)
-            for row in np.flatnonzero(wrong.reshape(len(vectors), -1).any(1)):
-                length = norm[row].flat[np.abs(norm[row] - 1.0).argmax()]
-                errors[row] = errors[row] or CongraspError(f"The field '{name}' has length {length:.3f}, not 1.")
-            default = _IDENTITY if "quaternion" in name else _DOWN
-            value[...] = np.where(need & ~wrong, value / np.where(wrong | ~need, 1.0, norm), default)
-        fields["heading_cross"][...] = _orthogonal(fields["heading_cross"], fields["heading_direction"])
+        direction = self._field(vectors, "heading_direction")
+        down, lengths = _unit(direction[:, None], wanted[:, :1], _DOWN)
+        turns, more = _unit(vectors[:, self._quaternions], wanted[:, self._owners], _IDENTITY)
+        lengths = np.concatenate([lengths, more], 1)
+        direction[:], vectors[:, self._quaternions] = down[:, 0], turns
+        starts = [self.offsets["heading_direction"], *self._quaternions[:, 0]]
+        for row, column in np.argwhere(np.abs(lengths - 1.0) > _UNIT_TOLERANCE):
+            name = max((n for n in self.offsets if self.offsets[n] <= starts[column]), key=self.offsets.__getitem__)
+            text = f"The field '{name}' has length {lengths[row, column]:.3f}, not 1."
+            errors[row] = errors[row] or CongraspError(text)
+        cross = self._field(vectors, "heading_cross")
+        cross[:] = _orthogonal(cross, direction)
         return errors
 
     def _surface(self, arrays: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -194,6 +196,18 @@ class Layout:
             return points, minus
         index = np.arange(self.task.surface_points) * len(points) // self.task.surface_points
         return points[index], minus[index]
+
+
+def _owner(name: str) -> int:
+    of = [number for number, constraint in enumerate(CONSTRAINTS) if name in GOAL_FIELDS[constraint]]
+    return of[0] if of else len(CONSTRAINTS)
+
+
+def _unit(vectors: np.ndarray, wanted: np.ndarray, default: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Wanted vectors (B, M, n) made unit, the default for the others, and the lengths (B, M) that were, 1 for those."""
+    lengths = np.where(wanted, np.sqrt(np.einsum("bmi,bmi->bm", vectors, vectors)), 1.0)
+    usable = wanted & (lengths > 0.5)
+    return np.where(usable[..., None], vectors / np.where(usable, lengths, 1.0)[..., None], default), lengths
 
 
 def _asked(names: Any) -> tuple[str, ...]:
