@@ -129,7 +129,8 @@ LIMITS: dict[str, tuple[Limit, ...]] = {
         Limit("ticket/*", _SMALL, 0.0),  # the hub counts these by actor
         *(Limit(f"log/{channel}/**", _LOG, 100.0) for channel in ("metrics", "event", "version", "episode", "rollout")),
     ),
-    "server": (Limit("policy/act", 1 << 20, 5000.0), Limit("policy/health", _SMALL, 100.0)),
+    # The policy server's own queue refuses what is too much, in words.
+    "server": (Limit("policy/act", 1 << 20, 0.0), Limit("policy/health", _SMALL, 100.0)),
 }
 """By the role that listens. Rollouts are limited by the longest message and by the learner's hub."""
 
