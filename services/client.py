@@ -37,34 +37,35 @@ class Answer(NamedTuple):
 
 
 class _Packer:
-    """Queries as one vector, in which only what changes from step to step is written anew."""
+    """Queries as one vector, most of which stays the same for an episode."""
 
     def __init__(self, layout: Mapping[str, Any], episode: Mapping[str, np.ndarray], fingers: int):
         self._digest, self._fields, self._fingers = layout["layout"], layout["fields"], fingers
-        self._vector = np.zeros(layout["size"], np.float32)
+        self._episode = np.zeros(layout["size"], np.float32)
         points = self._fields["surface_points"][1]
         for name, value in episode.items():
             if name in ("surface_points", "surface_minus") and len(value) != points:
                 value = np.asarray(value)[np.arange(points) * len(value) // points]
-            self._write(name, value)
+            self._write(self._episode, name, value)
 
     def pack(self, moment: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> Message:
         """The episode's query at a moment."""
+        vector = self._episode.copy()
         for name, value in moment.items():
-            self._write(name, value)
-        return Message({"packed": self._vector}, {**meta, "layout": self._digest})
+            self._write(vector, name, value)
+        return Message({"packed": vector}, {**meta, "layout": self._digest})
 
     def unpack(self, reply: Message) -> list[np.ndarray]:
         """Action, finger targets and wrist targets."""
         return np.split(reply.arrays["packed"], [self._fingers + 6, 2 * self._fingers + 6])
 
-    def _write(self, name: str, value: np.ndarray) -> None:
+    def _write(self, vector: np.ndarray, name: str, value: np.ndarray) -> None:
         if name not in self._fields:
             raise CongraspError(f"The query has an unknown field '{name}'.", f"Known: {', '.join(self._fields)}.")
         offset, *shape = self._fields[name]
         if list(np.shape(value)) != shape:
             raise CongraspError(f"The field '{name}' has shape {np.shape(value)}; it must be {tuple(shape)}.")
-        self._vector[offset : offset + math.prod(shape)] = np.ravel(value)
+        vector[offset : offset + math.prod(shape)] = np.ravel(value)
 
 
 class PolicyClient:

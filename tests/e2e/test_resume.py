@@ -108,7 +108,7 @@ def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
         assert array.dtype == straight_arrays[name].dtype
         assert array.tobytes() == straight_arrays[name].tobytes(), name
     assert (arrays["version"], arrays["transitions"]) == (UPDATES, UPDATES * BATCH * STEPS * WORLDS)
-    books, straight_books = meta["hub"]["ledger"], straight_meta["hub"]["ledger"]
+    books, straight_books = meta["hubs"][0]["ledger"], straight_meta["hubs"][0]["ledger"]
     lost = (KILLED_AFTER - EVERY) * BATCH
     assert (books["undone"], straight_books["undone"]) == (lost, 0)
     assert {**books, "undone": 0} == straight_books  # all else as if nothing had happened
