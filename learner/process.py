@@ -1,10 +1,5 @@
 """The learner process: rollouts in, policy bundles out, and a run directory from which it can be resumed.
 
-A run directory holds `config.json`, `initial.safetensors` where training does not begin with random weights,
-`checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (what became of every rollout),
-`version` (the newest version that was ever published, so that versions rise over a crash, too) and, after an update
-that was not finite, `failure/`.
-
 Several ranks (`learner.ranks`) train one policy, each with actors of its own. The run directory is rank 0's; the others
 take configuration, state and versions from it, and write only journals and what failed. All are at the same update.
 """
@@ -24,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.config import RunConfig, run_config_from_json, to_json
+from common.config import RunConfig, to_json
 from common.errors import CongraspError, PhysicsError, TransportError
 from common.files import write_atomically
 from common.logs.channels import finite
@@ -40,15 +35,11 @@ from learner.checkpoint import Checkpoints, flatten, restore
 from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
 from learner.ranks import Ranks, ended_by
+from learner.run_directory import CONFIG_FILE, INITIAL_FILE, POLICY_FILE, VERSION_FILE, open_run
 from learner.staleness import Ledger, StalenessManager
 from learner.statistics import Pace, overall, summary
 from learner.update import NonFiniteUpdate, TrainState
 
-POLICY_FILE = "policy.safetensors"
-INITIAL_FILE = "initial.safetensors"
-CONFIG_FILE = "config.json"
-LOGS = "logs"
-_VERSION_FILE = "version"
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0
 _FAREWELL_SECONDS = 3.0
@@ -60,40 +51,6 @@ Notify = Callable[[str, str], None]
 
 class ReplicasDiffer(CongraspError):
     """The ranks have not come to the same weights."""
-
-
-def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle | None = None) -> None:
-    """Makes a run directory.
-
-    Args:
-      run_dir: where.
-      config: the run.
-      initial: a policy to begin with instead of random weights: its networks and normalisers.
-
-    Raises:
-      CongraspError: there is a run in it already, or the initial policy does not fit the run.
-    """
-    if (run_dir / CONFIG_FILE).exists():
-        raise CongraspError(
-            f"{run_dir} holds a run already.", "Choose another --run-dir, or continue it with --resume."
-        )
-    if initial is not None:
-        bundles.policy_spec(config.task, config.network).require(initial.spec, "to begin with")
-        run_dir.mkdir(parents=True, exist_ok=True)
-        bundles.save(initial, run_dir / INITIAL_FILE)
-    write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
-    (run_dir / LOGS).mkdir(exist_ok=True)
-
-
-def open_run(run_dir: pathlib.Path) -> RunConfig:
-    """The configuration of a run directory; a CongraspError if it is not one."""
-    try:
-        text = (run_dir / CONFIG_FILE).read_bytes()
-    except OSError:
-        raise CongraspError(
-            f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Name one made by 'congrasp train'."
-        ) from None
-    return run_config_from_json(text)
 
 
 def run_learner(
@@ -114,7 +71,7 @@ def run_learner(
     The run can be resumed in both cases, and after a crash from its last checkpoint.
 
     Args:
-      run_dir: made by `create_run`, if this is rank 0.
+      run_dir: made by `learner.run_directory.create_run`, if this is rank 0.
       config: the run, the same for all ranks; when resuming, it may differ from the one that began it in what changes
         no array.
       transport: the learner's endpoint; it stays the caller's.
@@ -360,15 +317,15 @@ class _Learner:
         # Overwritten in place, which needs no space on a disk that is full, and not flushed: this must survive the
         # process, and a power cut costs no more than a version.
         try:
-            with open(os.open(self._run_dir / _VERSION_FILE, os.O_WRONLY | os.O_CREAT, 0o644), "wb", 0) as file:
+            with open(os.open(self._run_dir / VERSION_FILE, os.O_WRONLY | os.O_CREAT, 0o644), "wb", 0) as file:
                 file.write(f"{self.version:020d}\n".encode())
         except OSError as error:
-            self._event("error", f"{self._run_dir / _VERSION_FILE} could not be written: {error.strerror}.")
+            self._event("error", f"{self._run_dir / VERSION_FILE} could not be written: {error.strerror}.")
 
     def _skip_lost_versions(self, version: int) -> int:
         """Versions that were published after the checkpoint's died with the process; they are not given out again."""
         try:
-            published = int((self._run_dir / _VERSION_FILE).read_text())
+            published = int((self._run_dir / VERSION_FILE).read_text())
         except (OSError, ValueError):
             return 0
         if published <= version:

@@ -12,7 +12,8 @@ from rich.console import Console
 from common.errors import CongraspError
 from common.logs.recorder import Recorder
 from common.transport.zenoh_transport import ZenohTransport
-from learner.process import create_run, run_learner
+from learner.process import run_learner
+from learner.run_directory import create_run
 from services.presets import get_preset
 from services.train import Child, end_all, free_port
 

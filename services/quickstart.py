@@ -21,7 +21,7 @@ from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.shipped import shipped
 from common.transport.zenoh_transport import DEFAULT_ENDPOINT
 from learner import update as updates
-from learner.process import LOGS, POLICY_FILE, create_run, open_run
+from learner.run_directory import LOGS, POLICY_FILE, create_run, open_run
 from services.access import check_training
 from services.client import PolicyClient
 from services.evaluate import Evaluator

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from common.config import RunConfig
 from common.errors import CongraspError, TransportError
-from learner.process import create_run
+from learner.run_directory import create_run
 from services.train import engine_of, leave_gpus_to, train
 
 _WARM_UPDATES = 5

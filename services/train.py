@@ -94,7 +94,7 @@ def train(
     one of several ranks dies, the others end, too, and all are started again.
 
     Args:
-      run_dir: made by `learner.process.create_run`; with checkpoints, the run goes on from the latest.
+      run_dir: made by `learner.run_directory.create_run`; with checkpoints, the run goes on from the latest.
       config: the run's configuration.
       actors: number of actor processes of each rank; with none, an actor lives in each rank's process.
       physics: engine of the actors.
@@ -306,8 +306,9 @@ def train_in_process(
     """
     from actors.process import run_actor
     from common.logs.recorder import Recorder
-    from learner.process import LOGS, run_learner
+    from learner.process import run_learner
     from learner.ranks import ROUND_SECONDS
+    from learner.run_directory import LOGS
     from services.metrics import LearnerMetrics, exposed
     from services.status import ask
 

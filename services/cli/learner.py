@@ -68,8 +68,9 @@ class Learner:
         from common.policy import bundle as bundles
         from common.transport.keys import FLOWS
         from common.transport.zenoh_transport import ZenohTransport, shifted
-        from learner.process import LOGS, create_run, open_run, run_learner
+        from learner.process import run_learner
         from learner.ranks import Ranks
+        from learner.run_directory import LOGS, create_run, open_run
         from services.access import listening
         from services.logs import say
         from services.metrics import LearnerMetrics

@@ -12,7 +12,6 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from services.cli.learner import Learner
 from services.cli.main import load
 from tests.conftest import ROOT
 
@@ -172,7 +171,6 @@ def test_scripts_pass_shellcheck(script):
         assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.skipif(not hasattr(Learner, "rank"), reason="this version has no learner ranks")
 def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
     """With stand-ins for Slurm's commands, the script starts the learner's ranks with arguments that it understands."""
     stubs = {

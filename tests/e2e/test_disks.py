@@ -17,7 +17,8 @@ from common.logs.recorder import Recorder
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
-from learner.process import LOGS, create_run, run_learner
+from learner.process import run_learner
+from learner.run_directory import LOGS, create_run
 from services.audit import audit
 from tests.learner.test_process import CONFIG, MadeUpActor
 

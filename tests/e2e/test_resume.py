@@ -18,7 +18,8 @@ from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message, decode
 from learner.audit import journal_path, replay
-from learner.process import create_run, open_run, run_learner
+from learner.process import run_learner
+from learner.run_directory import create_run, open_run
 from tests.learner.test_process import CONFIG
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

@@ -22,7 +22,8 @@ from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.zenoh_transport import ZenohTransport
 from learner import update as updates
-from learner.process import create_run, open_run, run_learner
+from learner.process import run_learner
+from learner.run_directory import create_run, open_run
 from tests.learner.made_up_actor import MadeUpActor
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -106,7 +107,8 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
 LEARNER = """
 import dataclasses, pathlib, sys, threading
 from common.transport.zenoh_transport import ZenohTransport
-from learner.process import open_run, run_learner
+from learner.process import run_learner
+from learner.run_directory import open_run
 
 run_dir, endpoint, goal, resume = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), sys.argv[4] == "resume"
 with ZenohTransport(listen=[endpoint]) as transport:

@@ -16,8 +16,8 @@ import pytest
 
 from common.errors import CongraspError, TransportError
 from learner import ranks as ranks_module
-from learner.process import create_run
 from learner.ranks import Ranks, ended_by
+from learner.run_directory import create_run
 from tests.learner.rank_process import CONFIG
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

@@ -1,0 +1,55 @@
+"""The directory of a run.
+
+It holds `config.json`, `initial.safetensors` where training does not begin with random weights, `checkpoints/`,
+`policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (what became of every rollout), `version` (the
+newest version that was ever published, so that versions rise over a crash, too) and, after an update that was not
+finite, `failure/`.
+"""
+
+import pathlib
+
+from common.config import RunConfig, run_config_from_json, to_json
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle
+
+POLICY_FILE = "policy.safetensors"
+INITIAL_FILE = "initial.safetensors"
+CONFIG_FILE = "config.json"
+VERSION_FILE = "version"
+LOGS = "logs"
+
+
+def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle | None = None) -> None:
+    """Makes a run directory.
+
+    Args:
+      run_dir: where.
+      config: the run.
+      initial: a policy to begin with instead of random weights: its networks and normalisers.
+
+    Raises:
+      CongraspError: there is a run in it already, or the initial policy does not fit the run.
+    """
+    if (run_dir / CONFIG_FILE).exists():
+        raise CongraspError(
+            f"{run_dir} holds a run already.", "Choose another --run-dir, or continue it with --resume."
+        )
+    if initial is not None:
+        bundles.policy_spec(config.task, config.network).require(initial.spec, "to begin with")
+        run_dir.mkdir(parents=True, exist_ok=True)
+        bundles.save(initial, run_dir / INITIAL_FILE)
+    write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
+    (run_dir / LOGS).mkdir(exist_ok=True)
+
+
+def open_run(run_dir: pathlib.Path) -> RunConfig:
+    """The configuration of a run directory; a CongraspError if it is not one."""
+    try:
+        text = (run_dir / CONFIG_FILE).read_bytes()
+    except OSError:
+        raise CongraspError(
+            f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Name one made by 'congrasp train'."
+        ) from None
+    return run_config_from_json(text)
