@@ -225,6 +225,7 @@ class Admission(RuleBasedStateMachine):
     def restart(self):
         durable, version = self.staleness.durable(), self.staleness.version
         self.staleness.restore(durable, version)
+        self.staleness.publish(version)  # as a learner does before anything else
         self.fates["accepted"] -= len(self.queue)
         self.tickets, self.queue, self.in_update = {}, [], 0
 
