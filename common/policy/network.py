@@ -30,7 +30,8 @@ Layout = tuple[tuple[str, int], ...]
 Params = dict[str, Any]
 """Flax parameters: nested dicts of arrays."""
 
-_TRUNK = ("state", "heading", "mask")
+TRUNK = ("state", "heading", "mask")
+"""Blocks that go into the trunk as they are, in this order; the codes of `MASKS` follow."""
 _HIDDEN_GAIN = math.sqrt(2.0)
 _ACTION_GAIN = 0.01  # first actions are noise around zero, whatever the observation
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -39,7 +40,7 @@ _LOG_2PI = math.log(2.0 * math.pi)
 def check_layout(layout: Layout) -> None:
     """Raises `CongraspError` unless the layout has exactly the blocks that the networks are made for."""
     names = [name for name, _ in layout]
-    if sorted(names) != sorted((*_TRUNK, *MASKS)) or dict(layout)["mask"] != len(MASKS):
+    if sorted(names) != sorted((*TRUNK, *MASKS)) or dict(layout)["mask"] != len(MASKS):
         raise CongraspError(f"The observation layout {names} does not fit the network.", "Use this version's layout.")
 
 
@@ -70,7 +71,7 @@ class GatedNetwork(nn.Module):
     def __call__(self, observation: Array) -> Array:
         """Maps normalised observations (..., D) to (..., outputs)."""
         blocks = split(self.layout, observation)
-        inputs = [blocks[name] for name in _TRUNK]
+        inputs = [blocks[name] for name in TRUNK]
         for bit, name in enumerate(MASKS):
             code = nn.elu(self._dense(self.encoder, name)(blocks[name]))
             inputs.append(code * blocks["mask"][..., bit : bit + 1])

@@ -11,7 +11,8 @@ from common.task.types import MASKS, Array, Goal, SceneState
 
 OPTIONAL = MASKS
 """Names of the optional blocks; each is gated by the mask bit of its name."""
-_FORCE_SCALE = 5.0  # N at which the squashed force is one half
+FORCE_SCALE = 5.0
+"""N at which the squashed force is one half."""
 
 
 def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
@@ -30,7 +31,7 @@ def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
 
 def squash(force: Array) -> Array:
     """Forces (..., 3) in newtons to vectors shorter than one: f / (|f| + 5 N)."""
-    return force / (jnp.linalg.norm(force, axis=-1, keepdims=True) + _FORCE_SCALE)
+    return force / (jnp.linalg.norm(force, axis=-1, keepdims=True) + FORCE_SCALE)
 
 
 def _flat(x: Array) -> Array:

@@ -29,6 +29,7 @@ COMMANDS = {
     "constraints": "make the constraint sets of objects, and look at them",
     "record": "record a run to MCAP, from this machine or another",
     "plot": "draw a run's learning curves and reward terms",
+    "export": "a policy as ONNX or StableHLO, a motion as GLB, USD, BVH, ROS 2 or LeRobot",
     "render": "draw the hand, or an episode of a run",
     "status": "who works on a run, and how it goes",
     "audit": "what became of every rollout of a run",
@@ -41,7 +42,11 @@ COMMANDS = {
 USAGE_ERROR = 2
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-EXTRAS = {"foxglove": "viz", "imageio_ffmpeg": "viz", "matplotlib": "viz", "warp": "cuda"}
+EXTRAS = {
+    **dict.fromkeys(("foxglove", "imageio_ffmpeg", "matplotlib"), "viz"),
+    **dict.fromkeys(("bvhio", "mcap_ros2", "onnx", "onnxruntime", "pxr", "pyarrow", "pygltflib"), "export"),
+    "warp": "cuda",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

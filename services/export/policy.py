@@ -1,0 +1,219 @@
+"""A policy as ONNX or StableHLO, with normalisation inside, compared with the Flax policy before the file is kept."""
+
+import dataclasses
+import io
+import json
+import pathlib
+import zipfile
+from typing import Any
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+
+from actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, TABLE_AWAY, scene_spec
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.hands import get_hand
+from common.hands.kinematics import grasp_frame
+from common.hands.mjcf import WRIST_JOINTS
+from common.hands.spec import link_origin
+from common.objects.mjcf import CONTACT
+from common.policy.bundle import PolicyBundle, content_hash, mean_action
+from common.task.observation import FORCE_SCALE
+from common.task.types import MASKS
+from common.wire.codec import encode
+
+TOLERANCE = 1e-5
+"""Largest absolute difference between an exported policy and the Flax policy that is let through, in action units."""
+SUFFIXES = {"onnx": ".onnx", "stablehlo": ".stablehlo.zip"}
+_SAMPLES = 512
+_PLATFORMS = ("cpu", "cuda", "tpu")
+
+
+def describe(bundle: PolicyBundle) -> dict[str, Any]:
+    """What a user of the exported policy must know, as JSON: every number that goes in and comes out, in order."""
+    hand, task = get_hand(bundle.spec.hand), bundle.task
+    joints = [joint.name for joint in hand.joints]
+    frame = grasp_frame(hand)
+    return {
+        "format": 1,
+        "hand": hand.name,
+        "version": bundle.version,
+        "bundle": content_hash(encode(bundle.to_message())),
+        "units": "m, rad, s, N; quaternions (w, x, y, z); the world's z axis points up, the table's top is at z = 0",
+        "control_dt": task.control_dt,
+        "layout": [[name, size] for name, size in bundle.spec.layout],
+        "observation": observation_fields(bundle),
+        "masks": list(MASKS),
+        "action": action_meaning(bundle),
+        "action_std": np.exp(np.asarray(bundle.params["actor"]["log_std"])).tolist(),
+        "joints": joints,
+        "joint_limits": [[joint.lower, joint.upper] for joint in hand.joints],
+        "open_pose": hand.q_open.tolist(),
+        "wrist_joints": list(WRIST_JOINTS),
+        "links": [link.name for link in hand.links],
+        "link_origins": [list(link_origin(link)) for link in hand.links],
+        "keypoint_links": hand.keypoint_links.tolist(),
+        "keypoints": hand.keypoints.tolist(),
+        "grasp_frame": {"heading": frame.heading.tolist(), "cross": frame.cross.tolist()},
+        "force_scale": FORCE_SCALE,
+        "task": dataclasses.asdict(task),
+        "scene": {
+            "mjcf": scene_spec(hand, task).to_xml(),
+            "hand_contype": HAND_CONTYPE,
+            "object_contype": OBJECT_CONTYPE,
+            "object_contact": dataclasses.asdict(CONTACT),
+            "table_away": list(TABLE_AWAY),
+        },
+    }
+
+
+def observation_fields(bundle: PolicyBundle) -> list[dict[str, Any]]:
+    """The observation's numbers in order: block, field, how many, and what they are.
+
+    "wrist" is the wrist frame, in which all vectors are unless something else is said.
+    """
+    hand, task = get_hand(bundle.spec.hand), bundle.task
+    f, n, p = len(hand.joints), len(hand.links), len(hand.keypoints)
+    table = {
+        "state": [
+            ("q", f, "rad, finger joints in the order of 'joints'"),
+            ("u", 6, "m and rad, wrist joints in the order of 'wrist_joints', from the wrist's pose at the start"),
+            ("q_target - q", f, "rad, by what the last action's finger targets are ahead"),
+            ("u_target - u", 6, "m and rad, the same for the wrist"),
+            ("q_velocity", f, "rad/s"),
+            ("u_velocity", 6, "m/s and rad/s"),
+            ("touching", n, "1 where a link, in the order of 'links', touches the object, else 0"),
+            ("force", 3 * n, "f / (|f| + force_scale) of the object's net force f on each link, N, wrist frame"),
+            ("nearest", 3 * p, "m, from each keypoint to the nearest surface point, wrist frame"),
+            ("object_velocity", 3, "m/s of the centre of mass, wrist frame"),
+            ("object_angular_velocity", 3, "rad/s, wrist frame"),
+            ("object_displacement", 3, "m since the start, wrist frame"),
+            ("object_rotation", 3, "twice the vector part of the rotation since the start (w >= 0), wrist frame"),
+            ("time", 1, "control steps over (approach_steps + hold_steps), at most 1"),
+            ("table", 1, "1 while the table is there"),
+        ],
+        "heading": [
+            ("center", 3, "m, middle between thumb's tip and the other tips' mean, wrist frame"),
+            ("heading_position", 3, "m, where the centre should be, wrist frame"),
+            ("heading_position - center", 3, "m, wrist frame"),
+            ("heading_direction", 3, "unit, the way the hand should come, wrist frame"),
+            ("object_matrix", 9, "rotation matrix from object to wrist frame, row by row"),
+        ],
+        "affordance": [
+            ("nearest_minus", 3 * p, "m, from each keypoint to the nearest point that must not be touched"),
+            ("force_minus", 3 * n, "as force, of contacts that must not be"),
+        ],
+        "pose_finger": [
+            ("pose_q - q", f, "rad, to the reference pose"),
+            ("pose_keypoints - keypoints", 3 * p, "m, wrist frame"),
+        ],
+        "pose_wrist": [("pose_u - u", 6, "m and rad, wrist joints of the reference pose, less the present ones")],
+        "trajectory": [("waypoint_u - u", 6 * task.trajectory_points, "m and rad, the same for every waypoint")],
+        "mask": [("mask", len(MASKS), "1 for each active constraint in the order of 'masks'; else its block is zero")],
+    }
+    return [
+        {"block": block, "field": field, "size": size, "meaning": meaning}
+        for block, _ in bundle.spec.layout
+        for field, size, meaning in table[block]
+    ]
+
+
+def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
+    """The action's numbers in order: which joint they move, the scale, and how a target comes of them."""
+    control = bundle.task.control
+    fingers = [
+        {"joint": joint.name, "scale": control.finger_scale, "target": "clip(previous target + scale * action, limits)"}
+        for joint in get_hand(bundle.spec.hand).joints
+    ]
+    wrist = [
+        {
+            "joint": name,
+            "scale": control.wrist_position_scale if i < 3 else control.wrist_rotation_scale,
+            "target": "present joint + limited way to the guidance's joint + scale * action",
+        }
+        for i, name in enumerate(WRIST_JOINTS)
+    ]
+    return fingers + wrist
+
+
+def sample_observations(bundle: PolicyBundle, count: int, seed: int = 0) -> np.ndarray:
+    """(count, D) observations as the policy knows them and beyond: three times as spread, masks drawn at random."""
+    rng = np.random.default_rng(seed)
+    seen = bundle.observation
+    spread = np.sqrt(np.asarray(seen.m2) / max(float(seen.count), 1.0)) + 1e-3
+    drawn = np.asarray(seen.mean) + 3.0 * spread * rng.normal(size=(count, len(spread)))
+    start, mask = 0, rng.integers(0, 2, (count, len(MASKS)))
+    for name, size in bundle.spec.layout:
+        block = slice(start, start + size)
+        start += size
+        if name in MASKS:
+            drawn[:, block] *= mask[:, MASKS.index(name), None]
+        elif name == "mask":
+            drawn[:, block] = mask
+    return drawn.astype(np.float32)
+
+
+def export_policy(bundle: PolicyBundle, kind: str, path: pathlib.Path) -> float:
+    """Writes a policy and compares what the file says with the Flax policy, on observations drawn at random.
+
+    Args:
+      bundle: the policy.
+      kind: onnx or stablehlo.
+      path: the file.
+
+    Returns:
+      The largest absolute difference of an action, in action units.
+
+    Raises:
+      CongraspError: it is above `TOLERANCE`, and no file was written; or the file cannot be written.
+    """
+    encoded = _onnx(bundle) if kind == "onnx" else _stablehlo(bundle)
+    observations = sample_observations(bundle, _SAMPLES)
+    expected = np.asarray(mean_action(bundle.spec.layout, bundle.acting, jnp.asarray(observations)))
+    answers = _run_onnx(encoded, observations) if kind == "onnx" else _run_stablehlo(encoded, observations)
+    difference = float(np.abs(answers - expected).max())
+    if not difference <= TOLERANCE:
+        raise CongraspError(
+            f"The {kind} policy differs from the Flax policy by {difference:.2e}; {TOLERANCE:g} is let through.",
+            "Nothing was written; please report this with the versions that 'congrasp doctor' prints.",
+        )
+    write_atomically(path, encoded)
+    return difference
+
+
+def _onnx(bundle: PolicyBundle) -> bytes:
+    from services.export.onnx_graph import policy_model
+
+    return policy_model(bundle, describe(bundle)).SerializeToString()
+
+
+def _run_onnx(encoded: bytes, observations: np.ndarray) -> np.ndarray:
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(encoded, providers=["CPUExecutionProvider"])
+    return session.run(["action"], {"observation": observations})[0]
+
+
+def _stablehlo(bundle: PolicyBundle) -> bytes:
+    """A ZIP with `policy.jax` (for `jax.export.deserialize`), `policy.mlirbc` (portable StableHLO) and `meta.json`."""
+    layout, acting = bundle.spec.layout, jax.device_get(bundle.acting)
+    size = sum(width for _, width in layout)
+    function = jax.jit(lambda observation: mean_action(layout, acting, observation))
+    batch = jax.export.symbolic_shape("batch")[0]
+    argument = jax.ShapeDtypeStruct((batch, size), jnp.float32)
+    exported = jax.export.export(function, platforms=_PLATFORMS)(argument)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("policy.jax", exported.serialize())
+        archive.writestr("policy.mlirbc", exported.mlir_module_serialized)
+        archive.writestr("meta.json", json.dumps(describe(bundle), indent=1))
+    return buffer.getvalue()
+
+
+def _run_stablehlo(encoded: bytes, observations: np.ndarray) -> np.ndarray:
+    with zipfile.ZipFile(io.BytesIO(encoded)) as archive:
+        exported = jax.export.deserialize(bytearray(archive.read("policy.jax")))
+    return np.asarray(exported.call(observations))
