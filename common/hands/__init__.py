@@ -1,14 +1,20 @@
-"""Hands by name."""
+"""Hands by name: the one place that knows them all."""
+
+import functools
+from collections.abc import Callable
 
 from common.errors import CongraspError
 from common.hands.human import HUMAN
+from common.hands.mano import own_mano_hand
 from common.hands.spec import Hand
 
-HANDS: dict[str, Hand] = {hand.name: hand for hand in (HUMAN,)}
+HANDS: dict[str, Callable[[], Hand]] = {"human": lambda: HUMAN, "mano": own_mano_hand}
+"""Makers of the hands; `mano` needs the user's own file."""
 
 
+@functools.cache
 def get_hand(name: str) -> Hand:
-    """The hand of this name; a CongraspError lists those that exist."""
+    """The hand of this name, the same object every time; a CongraspError lists those that exist."""
     if name not in HANDS:
         raise CongraspError(f"There is no hand '{name}'.", f"Choose one of: {', '.join(sorted(HANDS))}.")
-    return HANDS[name]
+    return HANDS[name]()

@@ -5,9 +5,19 @@ lunate, fingers towards -y, thumb side +x, back of the hand +z. Fingers flex wit
 `ip` with negative ones. Limits are MyoHand's, widened where anatomy allows; phalanx masses are of a mean adult hand.
 """
 
-from common.hands.spec import Capsule, Hand, Joint, Link, Vector, WristGains
+from common.hands.spec import Capsule, Hand, Joint, Link, Vector, WristGains, chain
 
-_FINGER_GAINS = {"kp": 4.0, "kv": 0.15, "torque_limit": 1.5}
+FINGER_GAINS = {"kp": 4.0, "kv": 0.15, "torque_limit": 1.5}
+WRIST = WristGains(
+    slide_kp=1000.0,
+    slide_kv=50.0,
+    slide_limit=150.0,
+    slide_armature=0.2,
+    hinge_kp=50.0,
+    hinge_kv=3.0,
+    hinge_limit=20.0,
+    hinge_armature=0.01,
+)
 _MCP_FLEXION = (-0.35, 1.571)
 _MCP_ABDUCTION = (-0.30, 0.30)
 _PIP = (0.0, 1.75)
@@ -17,7 +27,7 @@ _DIP = (-0.09, 1.571)
 def _joint(name: str, anchor: Vector, axis: Vector, limits: tuple[float, float]) -> Joint:
     norm = sum(x * x for x in axis) ** 0.5
     unit = (axis[0] / norm, axis[1] / norm, axis[2] / norm)
-    return Joint(name, unit, anchor, *limits, **_FINGER_GAINS)
+    return Joint(name, unit, anchor, *limits, **FINGER_GAINS)
 
 
 def _finger(
@@ -27,38 +37,23 @@ def _finger(
     tip: Vector,
     radii: tuple[float, float, float],
     masses: tuple[float, float, float],
-) -> tuple[Link, Link, Link]:
+) -> tuple[Link, ...]:
     """Three phalanges; `axes` are MCP flexion, MCP abduction, PIP and DIP."""
     mcp, pip, dip = anchors
-    return (
-        Link(
-            f"{name}_proximal",
-            "palm",
+    return chain(
+        [f"{name}_proximal", f"{name}_middle", f"{name}_distal"],
+        [
             (
                 _joint(f"{name}_mcp_flexion", mcp, axes[0], _MCP_FLEXION),
                 _joint(f"{name}_mcp_abduction", mcp, axes[1], _MCP_ABDUCTION),
             ),
-            (Capsule(mcp, pip, radii[0]),),
-            masses[0],
-            1.0,
-        ),
-        Link(
-            f"{name}_middle",
-            f"{name}_proximal",
             (_joint(f"{name}_pip", pip, axes[2], _PIP),),
-            (Capsule(pip, dip, radii[1]),),
-            masses[1],
-            1.0,
-        ),
-        Link(
-            f"{name}_distal",
-            f"{name}_middle",
             (_joint(f"{name}_dip", dip, axes[3], _DIP),),
-            (Capsule(dip, tip, radii[2]),),
-            masses[2],
-            3.0,
-            tip,
-        ),
+        ],
+        (*anchors, tip),
+        radii,
+        masses,
+        (1.0, 1.0, 3.0),
     )
 
 
@@ -81,35 +76,20 @@ _THUMB_MP: Vector = (0.0430, -0.0542, -0.0232)
 _THUMB_IP: Vector = (0.0570, -0.0801, -0.0333)
 _THUMB_TIP: Vector = (0.0670, -0.0981, -0.0403)
 
-_THUMB = (
-    Link(
-        "thumb_metacarpal",
-        "palm",
+_THUMB = chain(
+    ["thumb_metacarpal", "thumb_proximal", "thumb_distal"],
+    [
         (
             _joint("thumb_cmc_abduction", _THUMB_CMC, (-0.042, -0.665, 0.745), (-0.55, 0.80)),
             _joint("thumb_cmc_flexion", _THUMB_CMC, (0.496, 0.732, 0.468), (-0.80, 0.90)),
         ),
-        (Capsule(_THUMB_CMC, _THUMB_MP, 0.0095),),
-        0.0139,
-        2.0,
-    ),
-    Link(
-        "thumb_proximal",
-        "thumb_metacarpal",
         (_joint("thumb_mp_flexion", _THUMB_MP, (-0.084, -0.203, 0.975), (-1.00, 0.70)),),
-        (Capsule(_THUMB_MP, _THUMB_IP, 0.0085),),
-        0.0082,
-        2.0,
-    ),
-    Link(
-        "thumb_distal",
-        "thumb_proximal",
         (_joint("thumb_ip_flexion", _THUMB_IP, (-0.050, -0.480, 0.876), (-1.40, 0.44)),),
-        (Capsule(_THUMB_IP, _THUMB_TIP, 0.0065),),
-        0.0075,
-        6.0,
-        _THUMB_TIP,
-    ),
+    ],
+    (_THUMB_CMC, _THUMB_MP, _THUMB_IP, _THUMB_TIP),
+    (0.0095, 0.0085, 0.0065),
+    (0.0139, 0.0082, 0.0075),
+    (2.0, 2.0, 6.0),
 )
 
 _FINGERS = (
@@ -169,14 +149,5 @@ HUMAN = Hand(
         **{f"{finger}_mcp_flexion": 1.35 for finger in ("index", "middle", "ring", "little")},
         **dict.fromkeys(sorted(_FLEXED), 1.20),
     },
-    wrist=WristGains(
-        slide_kp=1000.0,
-        slide_kv=50.0,
-        slide_limit=150.0,
-        slide_armature=0.2,
-        hinge_kp=50.0,
-        hinge_kv=3.0,
-        hinge_limit=20.0,
-        hinge_armature=0.01,
-    ),
+    wrist=WRIST,
 )

@@ -6,6 +6,8 @@ exponentials (`common.hands.kinematics`) and the MJCF (`common.hands.mjcf`) foll
 
 import dataclasses
 import functools
+import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -151,3 +153,30 @@ class Hand:
 def link_origin(link: Link) -> Vector:
     """Origin of a link's frame in the wrist frame at zero: the anchor of its first joint, or the wrist."""
     return link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0)
+
+
+def chain(
+    names: Sequence[str],
+    joints: Sequence[tuple[Joint, ...]],
+    points: Sequence[Vector],
+    radii: Sequence[float],
+    masses: Sequence[float],
+    weights: Sequence[float],
+    parent: str = "palm",
+) -> tuple[Link, ...]:
+    """A finger: links one after the other, each a capsule between two of its points, with the tip on the last.
+
+    Args:
+      names: n names, the first next to the palm.
+      joints: n tuples, the joints that move each link against the one before it.
+      points: n + 1 points in the wrist frame at zero; the last is the fingertip.
+      radii: n capsule radii.
+      masses: n masses.
+      weights: n contact weights.
+      parent: the link that carries the first.
+    """
+    rows = zip(names, (parent, *names), joints, itertools.pairwise(points), radii, masses, weights, strict=False)
+    return tuple(
+        Link(name, above, moved, (Capsule(start, end, radius),), mass, weight, end if name == names[-1] else None)
+        for name, above, moved, (start, end), radius, mass, weight in rows
+    )

@@ -1,0 +1,186 @@
+"""The MANO right hand: 20 anatomical joints on the skeleton of the user's own `MANO_RIGHT.pkl`.
+
+MANO may not be passed on, so that nothing of it is part of this package, and this hand always needs the file (from
+mano.is.tue.mpg.de, after registration). Wrist frame: MANO's own, with the wrist joint as origin; fingers towards -x,
+back of the hand +y, thumb side +z.
+"""
+
+import dataclasses
+import os
+import pathlib
+
+import numpy as np
+
+from common.errors import CongraspError
+from common.hands.human import FINGER_GAINS, WRIST
+from common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain
+from common.pickles import read_pickle
+
+VARIABLE = "CONGRASP_MANO"
+"""Environment variable with the path of the user's file."""
+MANO_FINGERS = ("index", "middle", "little", "ring", "thumb")
+"""Order of the fingers in MANO's arrays; each has three joints, from the palm to the tip."""
+TIP_VERTICES = {"thumb": 745, "index": 317, "middle": 444, "ring": 556, "little": 673}
+"""Vertices of the right hand at the fingertips."""
+_SHAPES = {
+    "v_template": (778, 3),
+    "shapedirs": (778, 3, 10),
+    "J_regressor": (16, 778),
+    "hands_mean": (45,),
+    "hands_components": (45, 45),
+}
+_REMEDY = "Use MANO_RIGHT.pkl of mano_v1_2 (mano.is.tue.mpg.de)."
+
+_RADII = {
+    "thumb": (0.0100, 0.0095, 0.0085),
+    "index": (0.0090, 0.0080, 0.0070),
+    "middle": (0.0090, 0.0080, 0.0070),
+    "ring": (0.0085, 0.0075, 0.0068),
+    "little": (0.0080, 0.0070, 0.0060),
+}
+_MASSES = {
+    "thumb": (0.0139, 0.0082, 0.0075),
+    "index": (0.0089, 0.0043, 0.0031),
+    "middle": (0.0104, 0.0041, 0.0030),
+    "ring": (0.0076, 0.0050, 0.0029),
+    "little": (0.0043, 0.0028, 0.0016),
+}
+_LIMITS = {"mcp_abduction": (-20, 20), "mcp_flexion": (-20, 90), "pip": (0, 105), "dip": (-5, 85)}
+_THUMB_LIMITS = {"cmc_abduction": (-15, 50), "cmc_flexion": (-20, 50), "mp_flexion": (-10, 75), "ip_flexion": (-15, 85)}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ManoModel:
+    """What of a MANO file is used; lengths in m, in MANO's frame."""
+
+    vertices: np.ndarray
+    """(778, 3) of the mean shape."""
+    shape_directions: np.ndarray
+    """(778, 3, 10) change of the vertices with each shape parameter."""
+    regressor: np.ndarray
+    """(16, 778) from vertices to joints."""
+    hand_mean: np.ndarray
+    """(45,) mean axis-angles of the finger joints, in the order of `MANO_FINGERS`."""
+    components: np.ndarray
+    """(45, 45) principal components of the finger joints' axis-angles, one a row."""
+
+    def skeleton(self, betas: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Joints (16, 3), the wrist and then three for each of `MANO_FINGERS`, and the five fingertips (5, 3).
+
+        Args:
+          betas: (up to 10,) shape parameters; the mean shape without.
+        """
+        vertices = self.vertices
+        if betas is not None:
+            vertices = vertices + self.shape_directions[..., : len(betas)] @ np.asarray(betas, float)
+        return self.regressor @ vertices, vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]]
+
+
+def read_mano(path: pathlib.Path) -> ManoModel:
+    """A MANO file, without unpickling it.
+
+    Raises:
+      CongraspError: it is not there, no MANO file, or that of a left hand.
+    """
+    content = read_pickle(path)
+    if not isinstance(content, dict):
+        raise CongraspError(f"{path} is no MANO file.", _REMEDY)
+    arrays = []
+    for name, shape in _SHAPES.items():
+        array = content.get(name)
+        if not isinstance(array, np.ndarray) or array.shape != shape or not np.isfinite(array).all():
+            raise CongraspError(f"{path} has no array '{name}' {shape} of finite numbers.", _REMEDY)
+        arrays.append(array.astype(float))
+    model = ManoModel(*arrays)
+    joints, _ = model.skeleton()
+    if (joints[1:, 0] - joints[0, 0]).mean() > 0:
+        raise CongraspError(f"{path} is a left hand.", _REMEDY)
+    return model
+
+
+def mano_axes(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
+    """(15, 3, 3) anatomical axes of the finger joints at zero: rows are twist, spread and bend, unit and orthogonal.
+
+    The twist points from the child to the joint, along the bone that the joint moves; the bend is orthogonal to it and
+    to the back of the hand, and flexes with positive angles; positive spread is towards the thumb.
+
+    Args:
+      joints: (16, 3) from `ManoModel.skeleton`.
+      tips: (5, 3) from there, too.
+    """
+    fingers = joints[1:].reshape(5, 3, 3)
+    child = np.concatenate([fingers[:, 1:], tips[:, None]], 1)
+    up = np.array([[0.0, 1.0, 0.0]] * 4 + [[1.0, 1.0, 1.0]])[:, None]
+    twist = _unit(fingers - child)
+    bend = _unit(np.cross(twist, np.broadcast_to(up, twist.shape)))
+    return np.stack([twist, np.cross(bend, twist), bend], -2).reshape(15, 3, 3)
+
+
+def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
+    """The hand of a MANO model, of its mean shape or of one with shape parameters (up to 10,)."""
+    joints, tips = model.skeleton(betas)
+    axes = mano_axes(joints, tips).reshape(5, 3, 3, 3)
+    anchors, ends = (joints[1:] - joints[0]).reshape(5, 3, 3), tips - joints[0]
+    links: list[Link] = []
+    palm: list[Capsule] = []
+    for finger in ("thumb", "index", "middle", "ring", "little"):
+        i = MANO_FINGERS.index(finger)
+        radii = _RADII[finger]
+        # Skin ends at the fingertip, a capsule's axis one radius before it.
+        end = ends[i] - radii[2] * _unit(ends[i] - anchors[i, 2])
+        points = [_vector(point) for point in (*anchors[i], end)]
+        limits = _THUMB_LIMITS if finger == "thumb" else _LIMITS
+        moved = [
+            Joint(f"{finger}_{name}", _vector(axis), points[bone], *np.radians(limits[name]).tolist(), **FINGER_GAINS)
+            for name, bone, axis in zip(limits, (0, 0, 1, 2), (*axes[i, 0, 1:], *axes[i, 1:, 2]), strict=True)
+        ]
+        names = ("metacarpal", "proximal", "distal") if finger == "thumb" else ("proximal", "middle", "distal")
+        weights = (2.0, 2.0, 6.0) if finger == "thumb" else (1.0, 1.0, 3.0)
+        groups = [(moved[0], moved[1]), (moved[2],), (moved[3],)]
+        links += chain([f"{finger}_{name}" for name in names], groups, points, radii, _MASSES[finger], weights)
+        if finger != "thumb":
+            palm.append(Capsule(_vector(0.2 * anchors[i, 0]), points[0], 0.0100))
+    return Hand(
+        name="mano",
+        links=(Link("palm", "", (), tuple(palm), 0.250, 1.0), *links),
+        thumb="thumb_distal",
+        open_pose={
+            "thumb_cmc_abduction": 0.55,
+            "thumb_cmc_flexion": 0.35,
+            "thumb_ip_flexion": 0.20,
+            **_each(mcp_flexion=0.25, pip=0.25, dip=0.15),
+        },
+        closed_pose={
+            "thumb_cmc_abduction": 0.75,
+            "thumb_cmc_flexion": 0.75,
+            "thumb_mp_flexion": 0.60,
+            "thumb_ip_flexion": 0.90,
+            **_each(mcp_flexion=1.35, pip=1.2, dip=1.2),
+        },
+        wrist=WRIST,
+    )
+
+
+def own_mano_hand() -> Hand:
+    """The hand of the user's file, which the environment variable `CONGRASP_MANO` names."""
+    path = os.environ.get(VARIABLE)
+    if not path:
+        raise CongraspError(
+            "The hand 'mano' needs your own MANO_RIGHT.pkl, which may not come with this package.",
+            f"Get it from mano.is.tue.mpg.de and set {VARIABLE}=/path/to/MANO_RIGHT.pkl.",
+        )
+    return mano_hand(read_mano(pathlib.Path(path)))
+
+
+def _each(**angles: float) -> dict[str, float]:
+    """Angles of the same joints of the four fingers."""
+    return {f"{finger}_{name}": x for finger in ("index", "middle", "ring", "little") for name, x in angles.items()}
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def _vector(array: np.ndarray) -> Vector:
+    x, y, z = array.tolist()
+    return x, y, z

@@ -1,0 +1,264 @@
+"""Arrays out of a pickle without unpickling it: opcodes are read as data, and nothing that they name is ever called.
+
+Python's own `pickle.load` runs whatever a file tells it to run. Here a global is only its name, an object only a name
+with arguments and state, and the few names that stand for arrays are turned into arrays by this module. Any other name
+refuses the file.
+"""
+
+import codecs
+import io
+import pathlib
+import pickletools
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from common.errors import CongraspError
+
+_LARGEST = 256 * 2**20
+_ARRAY = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
+_BUFFER = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
+_SCALAR = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
+_DTYPE, _OBJECT = "numpy.dtype", ("copy_reg._reconstructor", "copyreg._reconstructor")
+_SPARSE = ("scipy.sparse.csc.csc_matrix", "scipy.sparse._csc.csc_matrix")
+_VARIABLE, _SELECTION = "chumpy.ch.Ch", "chumpy.reordering.Select"
+_ENCODE = "_codecs.encode"
+_SETS = ("__builtin__.set", "builtins.set")
+_PASSIVE = ("numpy.ndarray", "__builtin__.object", "builtins.object")
+KNOWN = {*_ARRAY, *_BUFFER, *_SCALAR, _DTYPE, *_OBJECT, *_SPARSE, _VARIABLE, _SELECTION, _ENCODE, *_SETS, *_PASSIVE}
+"""Names that a file may use."""
+_OPCODES: dict[str, Any] = {opcode.code: opcode for opcode in pickletools.opcodes}
+_ENDED, _MARK = object(), object()
+
+
+class _Name(NamedTuple):
+    """A global: its module and name."""
+
+    text: str
+
+
+class _Made:
+    """What a file says is made of a name: the arguments, and a state that came later."""
+
+    def __init__(self, name: str, arguments: tuple[Any, ...]):
+        self.name = name
+        self.arguments = arguments
+        self.state: Any = None
+
+
+class _Refused(Exception):
+    """Why a file is not read, in words."""
+
+
+def read_pickle(path: pathlib.Path) -> Any:
+    """The file's value: plain Python values and NumPy arrays, which sparse matrices and chumpy's variables become, too.
+
+    Strings of Python 2 are read as Latin-1.
+
+    Raises:
+      CongraspError: there is no such file, or it is no pickle of arrays; the line says which name or opcode it is.
+    """
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise _Refused(f"has more than {_LARGEST >> 20} MB")
+        return _Plain()(_run(io.BytesIO(path.read_bytes())))
+    except OSError as error:
+        raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
+    except _Refused as error:
+        what = str(error)
+    except RecursionError:
+        what = "is nested too deeply"
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, LookupError, MemoryError, OverflowError):
+        what = "is damaged"
+    raise CongraspError(f"{path} {what}.", "Only pickles of plain values and arrays are read; get the file again.")
+
+
+def _run(stream: io.BytesIO) -> Any:
+    """What the opcodes leave on the stack at their end."""
+    stack: list[Any] = []
+    memo: dict[int, Any] = {}
+    while True:
+        code = stream.read(1)
+        opcode = _OPCODES.get(code.decode("latin-1"))
+        if opcode is None:
+            raise _Refused("is no pickle, or is cut off" if code == b"" else "is no pickle")
+        if opcode.name == "STRING":  # pickletools decodes it as ASCII, which an array's bytes are not
+            quoted = pickletools.read_stringnl(stream, decode=False, stripquotes=True)
+            text: Any = codecs.escape_decode(quoted)[0]
+            argument: Any = text.decode("latin-1")
+        else:
+            argument = opcode.arg.reader(stream) if opcode.arg else None
+        if opcode.name == "STOP":
+            return stack.pop()
+        _step(opcode.name, argument, stack, memo)
+
+
+_CONSTANTS: dict[str, Any] = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
+_LITERALS = {
+    *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
+    *("STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"),
+    *("BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"),
+}
+
+
+def _step(name: str, argument: Any, stack: list[Any], memo: dict[int, Any]) -> None:
+    """Carries out one opcode."""
+    match name:
+        case "PROTO" | "FRAME":
+            pass
+        case "MARK":
+            stack.append(_MARK)
+        case "NONE" | "NEWTRUE" | "NEWFALSE":
+            stack.append(_CONSTANTS[name])
+        case "EMPTY_DICT":
+            stack.append({})
+        case "EMPTY_LIST":
+            stack.append([])
+        case "EMPTY_TUPLE":
+            stack.append(())
+        case "EMPTY_SET":
+            stack.append(set())
+        case "DICT":
+            items = _since_mark(stack)
+            stack.append(dict(zip(items[::2], items[1::2], strict=True)))
+        case "LIST":
+            stack.append(_since_mark(stack))
+        case "TUPLE":
+            stack.append(tuple(_since_mark(stack)))
+        case "TUPLE1" | "TUPLE2" | "TUPLE3":
+            count = int(name[-1])
+            stack[-count:] = [tuple(stack[-count:])]
+        case "APPEND" | "APPENDS":
+            items = _since_mark(stack) if name == "APPENDS" else [stack.pop()]
+            _of(list, stack).extend(items)
+        case "SETITEM" | "SETITEMS":
+            items = _since_mark(stack) if name == "SETITEMS" else [stack.pop(-2), stack.pop()]
+            _of(dict, stack).update(zip(items[::2], items[1::2], strict=True))
+        case "ADDITEMS":
+            items = _since_mark(stack)
+            _of(set, stack).update(items)
+        case "PUT" | "BINPUT" | "LONG_BINPUT":
+            memo[argument] = stack[-1]
+        case "MEMOIZE":
+            memo[len(memo)] = stack[-1]
+        case "GET" | "BINGET" | "LONG_BINGET":
+            stack.append(memo[argument])
+        case "POP":
+            stack.pop()
+        case "POP_MARK":
+            _since_mark(stack)
+        case "GLOBAL":
+            stack.append(_known(argument.replace(" ", ".")))
+        case "STACK_GLOBAL":
+            module, attribute = stack.pop(-2), stack.pop()
+            stack.append(_known(f"{module}.{attribute}"))
+        case "REDUCE" | "NEWOBJ":
+            made_of, arguments = stack.pop(-2), stack.pop()
+            if not (isinstance(made_of, _Name) and isinstance(arguments, tuple)):
+                raise _Refused("makes an object of something that is no name")
+            stack.append(_Made(made_of.text, arguments))
+        case "BUILD":
+            state = stack.pop()
+            _of(_Made, stack).state = state
+        case _ if name in _LITERALS:
+            stack.append(argument)
+        case _:
+            raise _Refused(f"uses the opcode {name}, which pickles of arrays do not need")
+
+
+def _since_mark(stack: list[Any]) -> list[Any]:
+    """Takes what lies above the last mark, and the mark, off the stack."""
+    for i in range(len(stack) - 1, -1, -1):
+        if stack[i] is _MARK:
+            items = stack[i + 1 :]
+            del stack[i:]
+            return items
+    raise _Refused("is damaged")
+
+
+def _of(kind: type, stack: list[Any]) -> Any:
+    if not isinstance(stack[-1], kind):
+        raise _Refused("is damaged")
+    return stack[-1]
+
+
+def _known(name: str) -> _Name:
+    if name not in KNOWN:
+        raise _Refused(f"names {name[:80]!r}, which stands for no array")
+    return _Name(name)
+
+
+class _Plain:
+    """From what was read to plain values and arrays; what the file shares is turned once."""
+
+    def __init__(self) -> None:
+        self._done: dict[int, Any] = {}
+
+    def __call__(self, value: Any) -> Any:
+        if not isinstance(value, (list, tuple, dict, _Made)):
+            return None if isinstance(value, _Name) else value
+        key = id(value)
+        if key not in self._done:
+            self._done[key] = _ENDED
+            self._done[key] = self._turned(value)
+        if self._done[key] is _ENDED:
+            raise _Refused("contains itself")
+        return self._done[key]
+
+    def _turned(self, value: Any) -> Any:
+        if isinstance(value, (list, tuple)):
+            return type(value)(self(item) for item in value)
+        if isinstance(value, dict):
+            return {self(name): self(item) for name, item in value.items()}
+        name, arguments, state = value.name, value.arguments, value.state
+        if name in _OBJECT:
+            name = arguments[0].text
+        if name in _ARRAY:
+            _, shape, kind, fortran, data = state
+            dtype = _dtype(kind)
+            return np.frombuffer(_bytes(self(data)), dtype).copy().reshape(tuple(shape), order="F" if fortran else "C")
+        if name in _BUFFER:
+            data, kind, shape, order = arguments
+            return np.frombuffer(_bytes(self(data)), _dtype(kind)).copy().reshape(tuple(shape), order=order)
+        if name in _SCALAR:
+            return np.frombuffer(_bytes(self(arguments[1])), _dtype(arguments[0]), count=1)[0]
+        if name in _SPARSE:
+            return _dense(self(state))
+        if name == _VARIABLE:
+            return self(state["x"])
+        if name == _SELECTION:
+            return self(state["a"]).ravel()[self(state["idxs"])].reshape(self(state["preferred_shape"]))
+        if name == _ENCODE:
+            text, encoding = arguments
+            if encoding != "latin1":
+                raise _Refused(f"encodes bytes as {encoding!r:.40}")
+            return text.encode("latin-1")
+        if name in _SETS:
+            return set(self(arguments[0]))
+        return None
+
+
+def _bytes(data: Any) -> bytes:
+    return data.encode("latin-1") if isinstance(data, str) else bytes(data)
+
+
+def _dtype(made: Any) -> np.dtype[Any]:
+    """A number's type: booleans, integers and floats alone."""
+    if not (isinstance(made, _Made) and made.name == _DTYPE):
+        raise _Refused("has an array of an unknown type")
+    kind = str(made.arguments[0])
+    dtype = np.dtype(kind).newbyteorder(">" if made.state and made.state[1] == ">" else "<")
+    if dtype.kind not in "biuf":
+        raise _Refused(f"has an array of {kind[:20]!r}, not of numbers")
+    return dtype
+
+
+def _dense(state: dict[str, Any]) -> np.ndarray:
+    """A matrix of compressed columns as an array."""
+    rows, columns = state["_shape"]
+    data, indices, starts = state["data"], state["indices"], state["indptr"]
+    if not (0 < rows * columns <= 1e7 and len(starts) == columns + 1 and len(data) == len(indices)):
+        raise _Refused("has a sparse matrix that is damaged or very large")
+    dense = np.zeros((rows, columns), data.dtype)
+    dense[indices, np.repeat(np.arange(columns), np.diff(starts))] = data
+    return dense
