@@ -68,14 +68,28 @@ class TaskSet(NamedTuple):
     """(N, R) bool: the object has an O-, and its O+ can be approached in the resting pose."""
 
 
-def build_taskset(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> TaskSet:
+def build_taskset(
+    hand: Hand,
+    task: TaskConfig,
+    objects: Sequence[GraspObject],
+    seed: int,
+    given: Sequence[Headings | None] | None = None,
+) -> TaskSet:
     """Heading sets by the paper's rules, and procedural reference poses and trajectories, for a pool of objects.
+
+    Args:
+      hand: the hand.
+      task: geometry of the approach.
+      objects: N objects.
+      seed: of everything random.
+      given: of each object the headings to take instead of sampled ones, if there are any.
 
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
+    seeds = [(seed, n) for n in range(len(objects))]
     rows = parallel_map(
-        _headings_of, itertools.repeat(task, len(objects)), objects, [(seed, n) for n in range(len(objects))]
+        headings_of, itertools.repeat(task, len(objects)), objects, seeds, given or [None] * len(objects)
     )
     rests = max(len(row["rest"]) for row in rows)
     for row in rows:
@@ -116,13 +130,25 @@ def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints
       Trajectories (M, K, 3) and (M, K, 4), and (M, R) bool.
     """
     path, turns = make_trajectories(hand, poses.position, poses.quaternion, key, waypoints=waypoints)
+    return path, turns, clear_of_table(hand, poses.quaternion, path, rest)
+
+
+def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> Array:
+    """(M, R) bool: a reference pose's approach comes from above or level, and its whole trajectory stays in the air.
+
+    Args:
+      hand: its heading axis is used.
+      quaternion: (M, 4) wrist orientations of the poses, in the object frame.
+      path: (M, K, 3) wrist waypoints.
+      rest: (M, R, 7) resting poses of the objects.
+    """
     heading = rotations.rotate(
-        poses.quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), poses.position.shape)
+        quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), (*quaternion.shape[:-1], 3))
     )
     up = rotations.to_matrix(rest[..., 3:])[..., 2, :]
     lowest = jnp.min(jnp.einsum("mri,mki->mrk", up, path), -1) + rest[..., 2]
     rising = jnp.einsum("mri,mi->mr", up, heading)
-    return path, turns, (lowest > _CLEARANCE) & (rising < _STEEPEST_UP)
+    return (lowest > _CLEARANCE) & (rising < _STEEPEST_UP)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -137,10 +163,22 @@ def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Pose
     return jax.lax.map(of_object, (points, normals, *headings))
 
 
-def _headings_of(task: TaskConfig, obj: GraspObject, seed: tuple[int, int]) -> dict[str, np.ndarray]:
-    """What NumPy finds out about one object; resting poses without a reachable heading are left out."""
+def headings_of(
+    task: TaskConfig, obj: GraspObject, seed: tuple[int, int], given: Headings | None = None
+) -> dict[str, np.ndarray]:
+    """What NumPy finds out about one object; resting poses without a reachable heading are left out.
+
+    Args:
+      task: geometry of the approach.
+      obj: the object.
+      seed: of its headings.
+      given: `HEADINGS` headings to take instead of sampled ones.
+
+    Raises:
+      CongraspError: it has no heading that the hand can reach in any resting pose.
+    """
     rng = np.random.default_rng(seed)
-    whole, plus = (sample_headings(obj, rng, count=HEADINGS, use_affordance=use) for use in (False, True))
+    whole, plus = (given or sample_headings(obj, rng, count=HEADINGS, use_affordance=use) for use in (False, True))
     assert whole is not None, "only O+ may be out of reach"
     sets = [whole, plus or whole]
     reachable = np.array([[_reachable(task, headings, rest) for rest in obj.rest_poses] for headings in sets])

@@ -2,7 +2,7 @@
 
 import pathlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from common.wire.codec import Message, decode, encode
 SUFFIX = ".constraints.safetensors"
 VARIANTS = ("whole surface", "O+")
 """The axis V: constraints for the whole surface, and for the graspable region alone."""
-_FORMAT = 1
+Split = Literal["all", "training", "held-out"]
+_FORMAT = 2
+_TRAINING = 0.8
 _MEANING = {
     "surface/points": "(P, 3) m, object frame",
     "surface/minus": "(P,) bool, the point belongs to the non-graspable region O-",
@@ -34,6 +36,8 @@ _MEANING = {
     "trajectory/position": "(V, M, K, 3) m, wrist waypoints in the object frame; trajectory m ends at pose m",
     "trajectory/quaternion": "(V, M, K, 4) wrist frame to object frame",
     "pose/allowed": "(V, R, M) bool, the table leaves room for the pose and its trajectory",
+    "heading/training": "(V, H) bool, the heading is among the 80 % for training; the others are held out",
+    "pose/training": "(V, M) bool, the same for pose m and trajectory m",
     "visual/vertices": "(n, 3) m, object frame",
     "visual/faces": "(m, 3) indices of vertices",
 }
@@ -46,11 +50,19 @@ def make_sets(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
     taskset = TaskSet(*(np.asarray(field) for field in build_taskset(hand, task, objects, seed)))
-    return [_of_object(hand, taskset, n, obj, seed) for n, obj in enumerate(objects)]
+    return [set_of(hand, TaskSet(*(field[n] for field in taskset)), obj, seed) for n, obj in enumerate(objects)]
 
 
-def _of_object(hand: Hand, taskset: TaskSet, n: int, obj: GraspObject, seed: int) -> Message:
-    row = TaskSet(*(field[n] for field in taskset))
+def set_of(hand: Hand, row: TaskSet, obj: GraspObject, seed: int, about: dict[str, Any] | None = None) -> Message:
+    """The constraint set of one object.
+
+    Args:
+      hand: the hand.
+      row: of the task set, without the axis of the objects.
+      obj: the object.
+      seed: of the constraints; the split into training and held-out is drawn from it.
+      about: further facts for the file.
+    """
     # The task set fills an object's resting poses up to the most of any object by repeating them.
     again = np.flatnonzero((row.rest[1:] == row.rest[0]).all(-1))
     rests = int(again[0]) + 1 if len(again) else len(row.rest)
@@ -75,6 +87,8 @@ def _of_object(hand: Hand, taskset: TaskSet, n: int, obj: GraspObject, seed: int
         "trajectory/position": row.trajectory_position,
         "trajectory/quaternion": row.trajectory_quaternion,
         "pose/allowed": row.pose_valid[:, :rests],
+        "heading/training": _split(row.heading_position.shape[:2], seed),
+        "pose/training": _split(row.pose_q.shape[:2], seed),
         "visual/vertices": np.asarray(obj.visual_vertices, np.float32),
         "visual/faces": np.asarray(obj.visual_faces, np.int32),
     }
@@ -90,8 +104,101 @@ def _of_object(hand: Hand, taskset: TaskSet, n: int, obj: GraspObject, seed: int
         "quaternions": "(w, x, y, z)",
         "object_frame": "origin at the centre of mass, orientation of the object file",
         "arrays": _MEANING,
+        **(about or {}),
     }
     return Message(arrays, meta)
+
+
+def _split(shape: tuple[int, ...], seed: int) -> np.ndarray:
+    """(V, M) bool, true for 80 % of M (rounded up), the same in both variants."""
+    order = np.random.default_rng(seed).permutation(shape[1])
+    return np.broadcast_to(order < np.ceil(_TRAINING * shape[1]), shape).copy()
+
+
+def taskset_of(sets: Sequence[Message], split: Split = "all") -> TaskSet:
+    """The task set that episodes are drawn from, of constraint sets of one hand.
+
+    Sets may differ in their numbers of resting poses, headings and references: they are repeated to the largest.
+
+    Args:
+      sets: N constraint sets.
+      split: takes all constraints, those for training, or those that are held out.
+
+    Raises:
+      CongraspError: the sets are of different hands or sizes, or one of them has no heading left.
+    """
+    first = sets[0]
+    for made in sets:
+        for key in ("hand", "finger_joints"):
+            if made.meta[key] != first.meta[key]:
+                raise CongraspError(
+                    f"The set of '{made.meta['object']}' is for the hand '{made.meta['hand']}', that of "
+                    f"'{first.meta['object']}' for '{first.meta['hand']}'.",
+                    "Use sets of one hand together.",
+                )
+        for name in ("surface/points", "trajectory/position"):
+            size, wanted = (m.arrays[name].shape[-2] for m in (made, first))
+            if size != wanted:
+                raise CongraspError(
+                    f"The sets of '{made.meta['object']}' and '{first.meta['object']}' differ in {name}: {size} and "
+                    f"{wanted}.",
+                    "Make them with the same settings.",
+                )
+    rows = [_row(made, split) for made in sets]
+    most = {axis: max(row.pose_valid.shape[axis] for row in rows) for axis in (1, 2)}
+    return TaskSet(*(np.stack(column) for column in zip(*(_filled(row, *most.values()) for row in rows), strict=True)))
+
+
+def _row(made: Message, split: Split) -> TaskSet:
+    """One set as a row of a task set, with what belongs to the split alone, and resting poses that allow a heading."""
+    arrays = made.arrays
+    kinds = ("heading", "pose")
+    chosen = {
+        kind: {"all": True, "training": arrays[f"{kind}/training"], "held-out": ~arrays[f"{kind}/training"]}[split]
+        for kind in kinds
+    }
+    heading, pose = (arrays[f"{kind}/allowed"] & np.expand_dims(chosen[kind], 1) for kind in kinds)
+    usable = np.flatnonzero(heading[0].any(-1))
+    if len(usable) == 0:
+        raise CongraspError(
+            f"The constraint set of '{made.meta['object']}' has no heading ({split}) in any resting pose.",
+            "Leave it out, or take another split.",
+        )
+    heading, back = heading[:, usable], arrays["heading/back"][:, usable]
+    count = heading.shape[-1]
+    index = np.array([[np.resize(np.flatnonzero(row) if row.any() else [0], count) for row in v] for v in heading])
+    return TaskSet(
+        points=arrays["surface/points"],
+        minus=arrays["surface/minus"],
+        rest=arrays["rest"][usable],
+        heading_position=arrays["heading/position"],
+        heading_direction=arrays["heading/direction"],
+        heading_cross=arrays["heading/cross"],
+        heading_index=index.astype(np.int32),
+        heading_back=np.take_along_axis(back, index, -1),
+        pose_q=arrays["pose/q"],
+        pose_position=arrays["pose/position"],
+        pose_quaternion=arrays["pose/quaternion"],
+        trajectory_position=arrays["trajectory/position"],
+        trajectory_quaternion=arrays["trajectory/quaternion"],
+        pose_valid=pose[:, usable],
+        has_affordance=arrays["surface/minus"].any() & heading[1].any(-1),
+    )
+
+
+def _filled(row: TaskSet, rests: int, poses: int) -> TaskSet:
+    """The row with its resting poses and references repeated to these numbers."""
+    r = np.resize(np.arange(len(row.rest)), rests)
+    m = np.resize(np.arange(row.pose_q.shape[1]), poses)
+    per_pose = [name for name in TaskSet._fields if name.startswith(("pose_", "trajectory_")) and name != "pose_valid"]
+    return row._replace(
+        rest=row.rest[r],
+        has_affordance=row.has_affordance[r],
+        heading_index=row.heading_index[:, r],
+        heading_back=row.heading_back[:, r],
+        pose_valid=row.pose_valid[:, r][:, :, m],
+        **{name: getattr(row, name)[:, m] for name in per_pose},
+    )
 
 
 def save(constraints: Message, folder: pathlib.Path) -> pathlib.Path:
@@ -136,6 +243,8 @@ def describe(constraints: Message) -> dict[str, str]:
         "wrist trajectories": f"as many, {waypoints.shape[2]} waypoints, "
         f"{100 * length.min():.0f} to {100 * length.max():.0f} cm long; each ends at its pose",
     }
+    if "source" in meta:
+        rows["captured"] = f"{meta['source']}: {', '.join(meta['demonstrations'])}"
     for r, rest in enumerate(arrays["rest"]):
         counts = [
             f"{variant}: {int(allowed[v, r].sum())} headings, {int(poses[v, r].sum())} poses"

@@ -23,9 +23,11 @@ from common.objects.surface import halves, mass_properties, sample_mesh
 Unit = Literal["auto", "m", "cm", "mm", "in"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
+UNLABELLED = ("near half", "far half")
+"""Parts of an object whose files name none."""
 _PLAUSIBLE = (0.01, 0.6)
 _POSSIBLE = (0.005, 1.0)
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 _MAX_FACES = 20_000
 _THINNEST = 2e-4
 _log = logging.getLogger(__name__)
@@ -157,6 +159,7 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
         rest_poses=np.zeros((0, 7)),
         visual_vertices=np.asarray(picture.vertices, np.float32),
         visual_faces=np.asarray(picture.faces, np.int32),
+        origin=tuple((-center).tolist()),
     )
     return dataclasses.replace(obj, rest_poses=rest_poses(obj))
 
@@ -321,7 +324,7 @@ def _labels(
         labels = halves(points, 0.5)
         middle = [points[labels == k] - points[labels == k].mean(0) for k in (0, 1)]
         slim = int(np.argmin([np.linalg.svd(half, compute_uv=False)[2] / np.sqrt(len(half)) for half in middle]))
-        return ("near half", "far half"), np.arange(2) == slim, labels
+        return UNLABELLED, np.arange(2) == slim, labels
     files = source.parts
     graspable = np.array([bool(file.graspable) for file in files])
     if graspable.all() or not graspable.any():

@@ -42,7 +42,8 @@ class GraspObject:
     Shapes: `points`, `normals` (512, 3), outward unit normals; `labels` (512,) part index of each surface point;
     `graspable` (parts,) bool, the default partition into O+ and O-; `inertia` (3, 3) about the centre of mass,
     kg.m^2; `rest_poses` (R, 7) position and quaternion in the world with the table's top at z = 0;
-    `visual_vertices` (V, 3), `visual_faces` (F, 3) for pictures, in the object frame.
+    `visual_vertices` (V, 3), `visual_faces` (F, 3) for pictures, in the object frame; `origin` (3,) where the origin of
+    the file that it was imported from lies in the object frame.
     """
 
     name: str
@@ -58,6 +59,7 @@ class GraspObject:
     rest_poses: np.ndarray
     visual_vertices: np.ndarray
     visual_faces: np.ndarray
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def primitive(self) -> bool:

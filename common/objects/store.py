@@ -120,6 +120,8 @@ def _to_message(obj: GraspObject) -> Message:
         "mass": float(obj.mass),
         "units": "m, kg, kg.m^2; quaternions (w, x, y, z); object frame with its origin at the centre of mass",
     }
+    if any(obj.origin):
+        meta["origin"] = list(obj.origin)
     return Message(arrays, meta)
 
 
@@ -144,5 +146,6 @@ def _from_message(message: Message) -> GraspObject:
         pieces=pieces,
         part_names=tuple(meta["part_names"]),
         mass=meta["mass"],
+        origin=tuple(meta.get("origin", (0.0, 0.0, 0.0))),
         **{name: arrays[name] for name in _ARRAYS},
     )

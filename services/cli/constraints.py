@@ -1,4 +1,4 @@
-"""Constraint sets of objects: headings, reference poses and wrist trajectories as training draws them."""
+"""Constraint sets of objects: headings, reference poses and wrist trajectories as training draws them, or captured."""
 
 import dataclasses
 import pathlib
@@ -12,6 +12,7 @@ from rich.table import Table
 
 from common.errors import CongraspError
 from common.objects.spec import GraspObject
+from services.cli.constraints_import import ConstraintsImport
 
 _console = Console(highlight=False)
 
@@ -69,8 +70,8 @@ class ConstraintsShow:
     """A file of 'congrasp constraints generate'."""
     png: pathlib.Path | None = None
     """Picture to write: headings, affordance, trajectories and reference poses."""
-    rest: int = 1
-    """Resting pose of the picture, from 1."""
+    rest: int = 0
+    """Resting pose of the picture, from 1; 0 takes the one that leaves room for most poses."""
     seed: int = 0
     """Draws which constraints the picture shows."""
 
@@ -80,8 +81,9 @@ class ConstraintsShow:
 
         constraints = load(self.file)
         rests = len(constraints.arrays["rest"])
-        if not 1 <= self.rest <= rests:
+        if not 0 <= self.rest <= rests:
             raise CongraspError(f"--rest is {self.rest}.", f"The object has the resting poses 1 to {rests}.")
+        rest = self.rest or 1 + int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
         table = Table(show_header=False, box=None)
         for key, value in describe(constraints).items():
             table.add_row(key, escape(value))
@@ -90,7 +92,7 @@ class ConstraintsShow:
             from services.constraint_sheet import constraint_sheet
             from services.sheets import save_png
 
-            save_png(self.png, constraint_sheet(constraints, self.rest - 1, self.seed))
+            save_png(self.png, constraint_sheet(constraints, rest - 1, self.seed))
             _console.print(f"The picture is {escape(str(self.png))}.")
         return 0
 
@@ -103,7 +105,11 @@ def _find(text: str, folder: str) -> list[GraspObject]:
     return objects_of(path) if path.exists() else [find_object(text, folder)]
 
 
-SUBCOMMANDS: dict[str, Callable[..., Any]] = {"generate": ConstraintsGenerate, "show": ConstraintsShow}
+SUBCOMMANDS: dict[str, Callable[..., Any]] = {
+    "generate": ConstraintsGenerate,
+    "import": ConstraintsImport,
+    "show": ConstraintsShow,
+}
 
 
 def parse(arguments: Sequence[str]) -> Callable[[], int]:

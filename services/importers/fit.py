@@ -1,0 +1,123 @@
+"""Finger angles from joint positions: a captured hand's pose projected onto the joints of one of ours.
+
+The two hands have bones of different lengths, so that what is fitted is the direction of every bone, in the wrist
+frame. Four joints of a finger cannot follow three bones exactly; what is left over is reported.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands.spec import Hand, Link, link_origin
+from services.importers.sequence import FINGERS
+
+_SYNONYMS = {"little": ("little", "pinky")}
+
+
+class Fit(NamedTuple):
+    """Finger angles and what they leave over."""
+
+    q: np.ndarray
+    """(F,) rad; may lie outside the hand's limits."""
+    angle: float
+    """Root mean square angle between the fifteen bones and those of the capture, rad."""
+    tip: float
+    """Mean distance of the fingertips from those of the capture, m; mostly the hands' different sizes."""
+
+
+class _Finger(NamedTuple):
+    axes: np.ndarray  # (n, 3) joint axes, from the palm outwards
+    anchors: np.ndarray  # (n, 3)
+    first: int  # index of its first joint in q
+    carriers: tuple[int, ...]  # how many of the joints move each of the four points
+    points: np.ndarray  # (4, 3) three link origins and the tip, at zero
+
+
+@functools.cache
+def _fingers(hand: Hand) -> tuple[_Finger, ...]:
+    links = {link.name: link for link in hand.links}
+    first = {}
+    for link in hand.links:
+        first[link.name] = sum(len(other.joints) for other in hand.links[: hand.links.index(link)])
+    found = []
+    for finger in FINGERS:
+        names = _SYNONYMS.get(finger, (finger,))
+        last = next((link for link in hand.links if link.tip and link.name.startswith(names)), None)
+        chain: list[Link] = []
+        while last is not None and last.parent:
+            chain.insert(0, last)
+            last = links[last.parent]
+        if len(chain) != 3:
+            raise CongraspError(
+                f"The hand '{hand.name}' has no {finger} of three bones, so that no human pose fits it.",
+                "Import for the hand 'human', or give this hand headings and affordance alone.",
+            )
+        joints = [joint for link in chain for joint in link.joints]
+        moved = np.cumsum([len(link.joints) for link in chain])
+        tip = chain[-1].tip
+        assert tip is not None
+        found.append(
+            _Finger(
+                np.array([joint.axis for joint in joints]),
+                np.array([joint.anchor for joint in joints]),
+                first[chain[0].name],
+                (*(int(count) for count in moved), int(moved[-1])),
+                np.array([*(link_origin(link) for link in chain), tip]),
+            )
+        )
+    return tuple(found)
+
+
+def joint_positions(hand: Hand, q: np.ndarray) -> np.ndarray:
+    """(5, 4, 3) joints and tips of `FINGERS` in the hand's wrist frame, at finger angles q (F,)."""
+    return np.stack([_points(finger, q[finger.first :][: len(finger.axes)]) for finger in _fingers(hand)])
+
+
+def fit(hand: Hand, joints: np.ndarray) -> Fit:
+    """The finger angles whose bones point as those of a capture.
+
+    Args:
+      hand: one with five fingers of three bones.
+      joints: (5, 4, 3) joints and tips of the captured hand, in the hand's wrist frame.
+
+    Raises:
+      CongraspError: the hand has other fingers.
+    """
+    q = np.zeros(len(hand.joints))
+    for finger, wanted in zip(_fingers(hand), _directions(joints), strict=True):
+
+        def residual(angles: np.ndarray, finger: _Finger = finger, wanted: np.ndarray = wanted) -> np.ndarray:
+            return (_directions(_points(finger, angles)) - wanted).ravel()
+
+        q[finger.first :][: len(finger.axes)] = least_squares(residual, np.zeros(len(finger.axes)), method="lm").x
+    q = (q + np.pi) % (2 * np.pi) - np.pi
+    reached = joint_positions(hand, q)
+    cosine = (_directions(reached) * _directions(joints)).sum(-1).clip(-1, 1)
+    tips = np.linalg.norm(reached[:, 3] - joints[:, 3], axis=-1)
+    return Fit(q, float(np.sqrt((np.arccos(cosine) ** 2).mean())), float(tips.mean()))
+
+
+def _directions(points: np.ndarray) -> np.ndarray:
+    """Unit vectors (..., 3, 3) along the bones between points (..., 4, 3)."""
+    bones = np.diff(points, axis=-2)
+    return bones / np.linalg.norm(bones, axis=-1, keepdims=True).clip(1e-9)
+
+
+def _points(finger: _Finger, angles: np.ndarray) -> np.ndarray:
+    """(4, 3) a finger's joints and tip, by the product of exponentials."""
+    turn, shift, moved = np.eye(3), np.zeros(3), 0
+    placed = []
+    for carrier, point in zip(finger.carriers, finger.points, strict=True):
+        for axis, anchor, angle in zip(
+            finger.axes[moved:carrier], finger.anchors[moved:carrier], angles[moved:carrier], strict=True
+        ):
+            own = Rotation.from_rotvec(angle * axis).as_matrix()
+            shift = shift + turn @ (anchor - own @ anchor)
+            turn = turn @ own
+        moved = carrier
+        placed.append(turn @ point + shift)
+    return np.array(placed)

@@ -1,0 +1,77 @@
+"""Meshes of a data set's objects: where they are, and the objects that congrasp makes of them."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+
+from common.errors import CongraspError
+from common.objects.meshes import ImportOptions, import_source
+from common.objects.sources import SUFFIXES, find_sources
+from common.objects.spec import GraspObject
+from services.importers.sequence import Dropped
+
+
+@dataclasses.dataclass(frozen=True)
+class Meshes:
+    """Folders in which the meshes of objects are looked for, in this order."""
+
+    folders: tuple[pathlib.Path, ...]
+
+    def find(self, sequence: str, name: str) -> pathlib.Path:
+        """The mesh file `<name>.*`, or the folder `<name>` with one.
+
+        Raises:
+          Dropped: there is none.
+        """
+        for folder in self.folders:
+            for suffix in SUFFIXES:
+                if (file := folder / f"{name}{suffix}").is_file():
+                    return file
+            if (folder / name).is_dir():
+                return folder / name
+        where = ", ".join(map(str, self.folders)) or "no folder"
+        raise Dropped(sequence, "no mesh", f"there is no mesh of '{name}' in {where} (--meshes)")
+
+
+def load_object(mesh: pathlib.Path, name: str) -> GraspObject:
+    """The object of a mesh in metres, under a data set's name; imports are remembered.
+
+    Raises:
+      CongraspError: the mesh cannot be used, or is a folder of several objects.
+    """
+    sources = find_sources(mesh)
+    if len(sources) > 1:
+        raise CongraspError(f"{mesh} holds {len(sources)} objects.", "Name the folder of one, or its file.")
+    obj, _ = import_source(dataclasses.replace(sources[0], name=name), ImportOptions(unit="m"))
+    return obj
+
+
+def scaled(obj: GraspObject, factor: float) -> GraspObject:
+    """The object `factor` times as large about its centre of mass, with the same mass."""
+    if factor == 1.0:
+        return obj
+
+    def larger(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+        return vector[0] * factor, vector[1] * factor, vector[2] * factor
+
+    pieces = tuple(
+        dataclasses.replace(
+            piece,
+            size=larger(piece.size),
+            pos=larger(piece.pos),
+            vertices=None if piece.vertices is None else piece.vertices * factor,
+        )
+        for piece in obj.pieces
+    )
+    rest = obj.rest_poses.copy()
+    rest[:, :3] *= factor
+    return dataclasses.replace(
+        obj,
+        pieces=pieces,
+        inertia=obj.inertia * factor**2,
+        points=obj.points * np.float32(factor),
+        rest_poses=rest,
+        visual_vertices=obj.visual_vertices * np.float32(factor),
+        origin=larger(obj.origin),
+    )
