@@ -1,4 +1,4 @@
-"""Queries that arrive together are answered together: a bounded queue and one worker thread."""
+"""Queries that arrive together are answered together: a bounded queue, a worker thread, and none for a lone query."""
 
 import collections
 import threading
@@ -29,10 +29,12 @@ class _Waiting(NamedTuple):
 
 
 class Batcher(Generic[T, R]):
-    """Runs a function on batches of what callers submit.
+    """Runs a function on batches of what callers submit, one batch at a time.
 
-    The worker takes what has arrived. It waits for more, `window` seconds at most, only until as many are there as
-    were in the last batch: one lonely caller never waits, and many callers in step are answered in step.
+    An item that finds nothing running and nobody waiting is run in the thread that submits it, since waking another
+    costs a lone caller more than the work. Everything else waits for the worker, which takes what has arrived. It
+    waits for more, `window` seconds at most, only until as many are there as were in the last batch: many callers in
+    step are answered in step.
 
     Args:
       run: the function of a batch and its queueing times in seconds; it returns one result or exception for each item.
@@ -55,6 +57,8 @@ class Batcher(Generic[T, R]):
         self._depth = depth
         self._queue: collections.deque[_Waiting] = collections.deque()
         self._changed = threading.Condition()
+        self._running = False
+        self._expected = 1
         self._closed = False
         self._thread = threading.Thread(target=self._work, daemon=True, name="batcher")
         self._thread.start()
@@ -70,15 +74,21 @@ class Batcher(Generic[T, R]):
           Overloaded: `depth` items wait already.
         """
         now = time.monotonic()
-        future: Future[R] = Future()
+        waiting = _Waiting(item, Future(), now, now + timeout)
         with self._changed:
             if self._closed:
                 raise CongraspError("The server is shutting down.")
-            if len(self._queue) >= self._depth:
+            alone = not self._running and not self._queue and self._expected == 1
+            if alone:
+                self._running = True
+            elif len(self._queue) >= self._depth:
                 raise Overloaded(f"Overloaded: {self._depth} queries wait already.", "Ask again later.")
-            self._queue.append(_Waiting(item, future, now, now + timeout))
-            self._changed.notify()
-        return future
+            else:
+                self._queue.append(waiting)
+                self._changed.notify()
+        if alone:
+            self._answer([waiting])
+        return waiting.future
 
     def close(self, timeout: float = 2.0) -> None:
         """Refuses what waits and ends the worker."""
@@ -88,41 +98,43 @@ class Batcher(Generic[T, R]):
         self._thread.join(timeout)
 
     def _work(self) -> None:
-        expected = 1
-        while batch := self._collect(expected):
-            expected = len(batch)
-            now = time.monotonic()
-            for waiting in batch:
-                if waiting.deadline < now:
-                    late = f"Too late: the query waited {1e3 * (now - waiting.arrival):.0f} ms, beyond its deadline."
-                    waiting.future.set_exception(Late(late))
-            batch = [waiting for waiting in batch if waiting.deadline >= now]
-            if batch:
-                self._answer(batch, now)
+        while batch := self._collect():
+            self._answer(batch)
         for waiting in self._queue:
             waiting.future.set_exception(CongraspError("The server is shutting down."))
 
-    def _answer(self, batch: list[_Waiting], now: float) -> None:
+    def _answer(self, batch: list[_Waiting]) -> None:
+        now = time.monotonic()
+        for waiting in batch:
+            if waiting.deadline < now:
+                late = f"Too late: the query waited {1e3 * (now - waiting.arrival):.0f} ms, beyond its deadline."
+                waiting.future.set_exception(Late(late))
+        batch = [waiting for waiting in batch if waiting.deadline >= now]
         try:
-            results = self._run(
-                [cast(T, waiting.item) for waiting in batch], [now - waiting.arrival for waiting in batch]
-            )
+            items = [cast(T, waiting.item) for waiting in batch]
+            results = self._run(items, [now - waiting.arrival for waiting in batch]) if batch else []
         except Exception as error:
             results = [error] * len(batch)
+        with self._changed:
+            self._running = False
+            self._changed.notify()
         for waiting, result in zip(batch, results, strict=True):
             if isinstance(result, Exception):
                 waiting.future.set_exception(result)
             else:
                 waiting.future.set_result(result)
 
-    def _collect(self, expected: int) -> list[_Waiting]:
+    def _collect(self) -> list[_Waiting]:
         """The next batch; empty once closed."""
         with self._changed:
-            while not self._queue and not self._closed:
-                self._changed.wait()
+            while (self._running or not self._queue) and not self._closed:
+                if not self._changed.wait(self._window if self._expected > 1 else None):
+                    self._expected = 1
             if self._closed:
                 return []
             until = self._queue[0].arrival + self._window
-            while len(self._queue) < expected and (rest := until - time.monotonic()) > 0 and not self._closed:
+            while len(self._queue) < self._expected and (rest := until - time.monotonic()) > 0 and not self._closed:
                 self._changed.wait(rest)
-            return [self._queue.popleft() for _ in range(min(self._size, len(self._queue)))]
+            batch = [self._queue.popleft() for _ in range(min(self._size, len(self._queue)))]
+            self._running, self._expected = True, len(batch)
+            return batch

@@ -53,30 +53,31 @@ class PolicyFunction:
         count = len(queries)
         batch = np.zeros((next(size for size in BATCH_SIZES if size >= count), self.layout.size), np.float32)
         batch[:count] = [query.vector for query in queries]
-        errors = self.layout.complete(batch[:count], [query.asked for query in queries])
-        rows = np.asarray(self._compiled(weights, batch))[:count]
-        return [error or self._answer(query, row) for query, row, error in zip(queries, rows, errors, strict=True)]
+        vectors, notes, checks = (np.asarray(part)[:count] for part in self._compiled(weights, batch))
+        return [self._answer(*each) for each in zip(queries, vectors, notes, checks, strict=True)]
 
-    def _infer(self, weights: Acting, vectors: jax.Array) -> jax.Array:
-        """(B, A + F + 6 + 2): action, targets, and the flags redirected and aligned, of flat queries (B, S)."""
+    def _infer(self, weights: Acting, vectors: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """For queries (B, S): answers (B, A + F + 6), the flags redirected and aligned (B, 2), and checks (B, C)."""
         hand, task = self.layout.hand, self.layout.task
-        fields = self.layout.unpack(vectors)
+        fields, checks = self.layout.complete(vectors)
         flags = {name: fields[name] > 0.5 for name in ("contact_found", "table", "surface_minus", "asked")}
         state = SceneState(**{name: {**fields, **flags}[name] for name in SceneState._fields})
         surface = Surface(fields["surface_points"], flags["surface_minus"])
         mask = jnp.zeros((len(vectors), len(MASKS)))
         asked = Goal(**{name: mask if name == "mask" else fields[name] for name in Goal._fields})
-        resolution = resolve(hand, surface, Request(asked, *jnp.moveaxis(flags["asked"], -1, 0)))
+        resolution = resolve(hand, surface, Request(asked, *jnp.moveaxis(flags["asked"][:, 1:], -1, 0)))
         seen = features(hand, task, state, surface, resolution.goal)
         observed = observation.observe(task, state, seen, resolution.goal)
         mean = mean_action(observation.layout(hand, task), weights, observed)
         action = control.decode(hand, task.control, state, seen, resolution.goal, mean)
         notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
-        return jnp.concatenate([mean, action.q_target, action.u_target, notes], -1)
+        return jnp.concatenate([mean, action.q_target, action.u_target], -1), notes, checks
 
-    def _answer(self, query: Query, row: np.ndarray) -> Answer | Exception:
-        vector, (redirected, aligned) = row[:-2], row[-2:]
-        if not np.isfinite(row).all():
+    def _answer(self, query: Query, vector: np.ndarray, notes: np.ndarray, checks: np.ndarray) -> Answer | Exception:
+        redirected, aligned = notes
+        if complaint := self.layout.complaint(query, checks):
+            return complaint
+        if not np.isfinite(vector).all():
             return CongraspError("The policy's answer to this query is not finite.", "Check the state's magnitudes.")
         if not aligned:
             return CongraspError(

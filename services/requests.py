@@ -11,9 +11,11 @@ follows. Whoever asks a query of names for the `layout` gets it with the answer.
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from common.config import TaskConfig
@@ -24,7 +26,7 @@ from common.task.types import CONTACTS_PER_LINK, Goal, SceneState
 from common.wire.codec import Message
 
 CONSTRAINTS = ("heading", "affordance", "pose", "trajectory")
-"""Names that a query may ask for; the last three are bits in this order."""
+"""Names that a query may ask for, and the order of their bits."""
 GOAL_FIELDS = {
     "heading": ("heading_position", "heading_direction"),
     "affordance": (),
@@ -83,19 +85,13 @@ class Layout:
         self.hand = hand
         self.task = task
         self.shapes = {name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in names}
-        self.shapes |= {"surface_points": (points, 3), "surface_minus": (points,), "asked": (3,)}
+        self.shapes |= {"surface_points": (points, 3), "surface_minus": (points,), "asked": (len(CONSTRAINTS),)}
         self.offsets = {}
         self.size = 0
         for name, shape in self.shapes.items():
             self.offsets[name] = self.size
             self.size += math.prod(shape)
-        places = np.arange(self.size)
-        quaternions = [name for name in self.shapes if "quaternion" in name]
-        self._quaternions = np.concatenate([self._field(places, name).reshape(-1, 4) for name in quaternions])
-        # Which constraint a quaternion belongs to: an index into CONSTRAINTS, or the one after for the state's.
-        self._owners = np.concatenate(
-            [[_owner(name)] * (math.prod(self.shapes[name]) // 4) for name in quaternions]
-        ).astype(int)
+        self._directions = ["heading_direction", *(name for name in self.shapes if "quaternion" in name)]
         self.digest = hashlib.sha256(json.dumps(self.description()).encode()).hexdigest()[:16]
 
     def description(self) -> dict[str, Any]:
@@ -109,7 +105,10 @@ class Layout:
 
     def _field(self, vectors: Any, name: str) -> Any:
         """A field's numbers (..., n) in flat vectors (..., S)."""
-        return vectors[..., self.offsets[name] : self.offsets[name] + math.prod(self.shapes[name])]
+        return vectors[..., self._places(name)]
+
+    def _places(self, name: str) -> slice:
+        return slice(self.offsets[name], self.offsets[name] + math.prod(self.shapes[name]))
 
     def parse(self, message: Message) -> Query:
         """Lays a query out, unless it is packed already; a CongraspError says what is wrong with its form."""
@@ -120,7 +119,7 @@ class Layout:
             raise CongraspError(f"This server's policy is for the hand '{self.hand.name}', not '{hand}'.")
         asked = _asked(meta.get("constraints", ["heading"]))
         vector = self._packed(message) if PACKED in message.arrays else self._named(message.arrays, asked)
-        vector[self.offsets["asked"] :] = [name in asked for name in CONSTRAINTS[1:]]
+        vector[self._places("asked")] = [name in asked for name in CONSTRAINTS]
         return Query(vector, asked)
 
     def _packed(self, message: Message) -> np.ndarray:
@@ -148,39 +147,44 @@ class Layout:
             shape = self.shapes[name]
             if np.shape(value) != shape:
                 raise CongraspError(f"The field '{name}' has shape {np.shape(value)}; it must be {shape}.")
-            vector[self.offsets[name] : self.offsets[name] + math.prod(shape)] = np.ravel(value)
+            vector[self._places(name)] = np.ravel(value)
         return vector
 
-    def complete(self, vectors: np.ndarray, asked: Sequence[tuple[str, ...]]) -> list[CongraspError | None]:
-        """Checks the values of queries (B, S), makes quaternions and directions unit, fills in what nobody asked for.
+    def complete(self, vectors: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        """Makes quaternions and directions of queries unit, and fills in what nobody asked for; traced with the policy.
+
+        Args:
+          vectors: (B, S).
 
         Returns:
-          What is wrong with each query; the vectors of such are zero afterwards.
+          The fields (B, ...) by name, zero where a query is not finite, and what `complaint` looks at (B, C).
         """
-        errors: list[CongraspError | None] = [None] * len(vectors)
-        wanted = np.array([[*(name in names for name in CONSTRAINTS), True] for names in asked])
-        for row in np.flatnonzero(~np.isfinite(vectors).all(1)):
-            fields = self.unpack(vectors[row : row + 1])
+        finite = jnp.isfinite(vectors).all(1)
+        fields = self.unpack(jnp.where(finite[:, None], vectors, 0.0))
+        asked, minus = fields["asked"] > 0.5, fields["surface_minus"] > 0.5
+        checks = [finite, ~asked[:, CONSTRAINTS.index("affordance")] | minus.any(1) & ~minus.all(1)]
+        for name in self._directions:
+            owner = _owner(name)
+            wanted = jnp.ones_like(finite) if owner is None else asked[:, owner]
+            fields[name], lengths = _unit(fields[name], wanted, _IDENTITY if "quaternion" in name else _DOWN)
+            checks.append(lengths)
+        fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"])
+        return fields, jnp.stack(checks, 1)
+
+    def complaint(self, query: Query, checks: np.ndarray) -> CongraspError | None:
+        """What is wrong with the values of a query, by what `complete` found (C,)."""
+        finite, sided, *lengths = checks
+        if not finite:
+            fields = self.unpack(query.vector[None])
             bad = next(name for name, value in fields.items() if not np.isfinite(value).all())
-            errors[row] = CongraspError(f"The field '{bad}' is not finite.")
-            vectors[row] = 0.0
-        minus = self._field(vectors, "surface_minus") > 0.5
-        for row in np.flatnonzero(wanted[:, CONSTRAINTS.index("affordance")] & (minus.all(1) | ~minus.any(1))):
+            return CongraspError(f"The field '{bad}' is not finite.")
+        if not sided:
             text = "An affordance needs surface points on both sides."
-            errors[row] = errors[row] or CongraspError(text, "Set some of 'surface_minus'.")
-        direction = self._field(vectors, "heading_direction")
-        down, lengths = _unit(direction[:, None], wanted[:, :1], _DOWN)
-        turns, more = _unit(vectors[:, self._quaternions], wanted[:, self._owners], _IDENTITY)
-        lengths = np.concatenate([lengths, more], 1)
-        direction[:], vectors[:, self._quaternions] = down[:, 0], turns
-        starts = [self.offsets["heading_direction"], *self._quaternions[:, 0]]
-        for row, column in np.argwhere(np.abs(lengths - 1.0) > _UNIT_TOLERANCE):
-            name = max((n for n in self.offsets if self.offsets[n] <= starts[column]), key=self.offsets.__getitem__)
-            text = f"The field '{name}' has length {lengths[row, column]:.3f}, not 1."
-            errors[row] = errors[row] or CongraspError(text)
-        cross = self._field(vectors, "heading_cross")
-        cross[:] = _orthogonal(cross, direction)
-        return errors
+            return CongraspError(text, "Set some of 'surface_minus'.")
+        for name, length in zip(self._directions, lengths, strict=True):
+            if abs(length - 1.0) > _UNIT_TOLERANCE:
+                return CongraspError(f"The field '{name}' has length {length:.3f}, not 1.")
+        return None
 
     def _surface(self, arrays: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Points and labels, brought to the number that the policy looks at."""
@@ -198,16 +202,22 @@ class Layout:
         return points[index], minus[index]
 
 
-def _owner(name: str) -> int:
-    of = [number for number, constraint in enumerate(CONSTRAINTS) if name in GOAL_FIELDS[constraint]]
-    return of[0] if of else len(CONSTRAINTS)
+def _owner(name: str) -> int | None:
+    """Which constraint, of CONSTRAINTS, a field belongs to; None for the state's."""
+    return next((number for number, constraint in enumerate(CONSTRAINTS) if name in GOAL_FIELDS[constraint]), None)
 
 
-def _unit(vectors: np.ndarray, wanted: np.ndarray, default: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Wanted vectors (B, M, n) made unit, the default for the others, and the lengths (B, M) that were, 1 for those."""
-    lengths = np.where(wanted, np.sqrt(np.einsum("bmi,bmi->bm", vectors, vectors)), 1.0)
-    usable = wanted & (lengths > 0.5)
-    return np.where(usable[..., None], vectors / np.where(usable, lengths, 1.0)[..., None], default), lengths
+def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    """Vectors (B, ..., n) made unit where they are wanted (B,), the default elsewhere.
+
+    Returns:
+      The vectors, and the length (B,) that is farthest from 1 of those that were wanted, else 1.
+    """
+    lengths = jnp.linalg.norm(vectors, axis=-1, keepdims=True)
+    usable = wanted.reshape(-1, *[1] * (vectors.ndim - 1)) & (lengths > 0.5)
+    every = lengths.reshape(len(vectors), -1)
+    worst = jnp.where(every.max(1) - 1.0 > 1.0 - every.min(1), every.max(1), every.min(1))
+    return jnp.where(usable, vectors / jnp.where(usable, lengths, 1.0), default), jnp.where(wanted, worst, 1.0)
 
 
 def _asked(names: Any) -> tuple[str, ...]:
@@ -221,10 +231,10 @@ def _asked(names: Any) -> tuple[str, ...]:
     return tuple(name for name in CONSTRAINTS if name in names)
 
 
-def _orthogonal(cross: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def _orthogonal(cross: jax.Array, direction: jax.Array) -> jax.Array:
     """(B, 3) unit cross-finger directions orthogonal to the heading; any such where one is absent or parallel to it."""
-    cross = cross - np.sum(cross * direction, -1, keepdims=True) * direction
-    axis = np.eye(3, dtype=np.float32)[np.abs(direction).argmin(-1)]
-    other = axis - np.sum(axis * direction, -1, keepdims=True) * direction
-    cross = np.where(np.linalg.norm(cross, axis=-1, keepdims=True) < 1e-3, other, cross)
-    return cross / np.linalg.norm(cross, axis=-1, keepdims=True)
+    cross = cross - jnp.sum(cross * direction, -1, keepdims=True) * direction
+    axis = jnp.eye(3)[jnp.abs(direction).argmin(-1)]
+    other = axis - jnp.sum(axis * direction, -1, keepdims=True) * direction
+    cross = jnp.where(jnp.linalg.norm(cross, axis=-1, keepdims=True) < 1e-3, other, cross)
+    return cross / jnp.linalg.norm(cross, axis=-1, keepdims=True)

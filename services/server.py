@@ -86,7 +86,7 @@ class PolicyServer:
         )
         keys = Keys(run)
         transport.serve(keys.health, lambda key, request: Message({}, self.health()))
-        transport.serve(keys.act, self._act, depth=DEPTH)
+        transport.serve(keys.act, self._act, workers=2, depth=DEPTH)  # one may infer while the other receives
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
 

@@ -31,6 +31,8 @@ def serve(
     """
     import secrets
 
+    import jax
+
     from common.errors import CongraspError
     from common.policy.shipped import policy_file
     from common.transport.keys import Keys
@@ -45,6 +47,7 @@ def serve(
         raise CongraspError(
             f"The server can follow either {policy} or {connect}.", "Give one of --policy and --connect."
         )
+    jax.config.update("jax_cpu_enable_async_dispatch", False)  # handing over costs more than one policy's inference
     metrics, credentials = ServerMetrics(), listening(listen, certs, "server", insecure=insecure)
     with watch.watched("server", name, run if connect else "", metrics), on_signal() as stop:
         upstream = ZenohTransport(connect=[connect], credentials=credentials) if connect else None

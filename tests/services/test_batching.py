@@ -2,6 +2,7 @@
 
 import threading
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import pytest
 from hypothesis import given, settings
@@ -32,10 +33,17 @@ def gate():
     return Gate()
 
 
+def running(batcher, gate):
+    """Submits an item, 0, that runs alone in its caller's thread and is held at the gate."""
+    answer = Future()
+    threading.Thread(target=lambda: answer.set_result(batcher.submit(0, 10.0).result(10)), daemon=True).start()
+    assert gate.entered.acquire(timeout=10)
+    return answer
+
+
 def test_what_arrives_during_a_batch_makes_the_next_one(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=10)
-    futures = [batcher.submit(0, 10.0)]
-    assert gate.entered.acquire(timeout=10)
+    futures = [running(batcher, gate)]
     futures += [batcher.submit(i, 10.0) for i in range(1, 7)]
     gate.go.set()
     assert [future.result(10) for future in futures] == [0, 10, 20, 30, 40, 50, 60]
@@ -45,8 +53,7 @@ def test_what_arrives_during_a_batch_makes_the_next_one(gate):
 
 def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=2)
-    futures = [batcher.submit(0, 10.0)]
-    assert gate.entered.acquire(timeout=10)
+    futures = [running(batcher, gate)]
     futures += [batcher.submit(i, 10.0) for i in (1, 2)]
     with pytest.raises(Overloaded, match="Overloaded: 2 queries wait"):
         batcher.submit(3, 10.0)
@@ -57,8 +64,7 @@ def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
 
 def test_a_query_whose_deadline_passed_is_not_computed(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=4)
-    batcher.submit(0, 10.0)
-    assert gate.entered.acquire(timeout=10)
+    running(batcher, gate)
     late, patient = batcher.submit(1, 0.001), batcher.submit(2, 10.0)
     time.sleep(0.02)
     gate.go.set()
@@ -67,6 +73,29 @@ def test_a_query_whose_deadline_passed_is_not_computed(gate):
         late.result(10)
     assert gate.batches == [[0], [2]]
     batcher.close()
+
+
+def test_a_lone_item_runs_in_its_callers_thread_and_a_crowd_in_another():
+    threads, go = [], threading.Event()
+
+    def run(items, queued):
+        threads.append(threading.get_ident())
+        assert len(threads) == 1 or go.wait(10)
+        return items
+
+    batcher = Batcher(run, size=4, window=0.0, depth=4)
+    alone = threading.get_ident()
+    assert batcher.submit(1, 10.0).result(0) == 1
+    pool = ThreadPoolExecutor(1)
+    held = pool.submit(batcher.submit, 2, 10.0)
+    while len(threads) < 2:
+        time.sleep(0.001)
+    crowd = [batcher.submit(i, 10.0) for i in (3, 4)]
+    go.set()
+    assert [future.result(10) for future in (held.result(10), *crowd)] == [2, 3, 4]
+    assert threads[0] == alone and threads[2] not in (alone, threads[1]) and len(threads) == 3
+    batcher.close()
+    pool.shutdown()
 
 
 def test_a_failure_reaches_its_own_batch_alone():
@@ -85,8 +114,7 @@ def test_a_failure_reaches_its_own_batch_alone():
 
 def test_closing_refuses_what_waits_and_what_comes(gate):
     batcher = Batcher(gate, size=1, window=0.0, depth=4)
-    running = batcher.submit(0, 10.0)
-    assert gate.entered.acquire(timeout=10)
+    first = running(batcher, gate)
     waiting = batcher.submit(1, 10.0)
     closing = threading.Thread(target=batcher.close)
     closing.start()
@@ -95,7 +123,7 @@ def test_closing_refuses_what_waits_and_what_comes(gate):
             batcher.submit(2, 10.0)
             time.sleep(0.001)
     gate.go.set()
-    assert running.result(10) == 0
+    assert first.result(10) == 0
     with pytest.raises(CongraspError, match="shutting down"):
         waiting.result(10)
     closing.join(10)

@@ -1,5 +1,6 @@
 """Queries: where their fields land, what is completed, and what is refused."""
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -13,6 +14,7 @@ from services.requests import Layout
 
 HAND = get_hand("human")
 LAYOUT = Layout(HAND, TaskConfig(surface_points=8, trajectory_points=3))
+COMPLETE = jax.jit(LAYOUT.complete)
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 coordinate = st.floats(-1.0, 1.0, width=32)
 vector = st.tuples(coordinate, coordinate, coordinate).map(lambda v: np.array(v, np.float32))
@@ -35,39 +37,34 @@ def parse(constraints=("heading",), meta=None, **changes):
 
 
 def completed(query):
-    errors = LAYOUT.complete(query.vector[None], [query.asked])
-    if errors[0]:
-        raise errors[0]
-    return query
-
-
-def fields(query):
-    return {name: value[0] for name, value in LAYOUT.unpack(query.vector[None]).items()}
+    fields, checks = COMPLETE(query.vector[None])
+    if complaint := LAYOUT.complaint(query, np.asarray(checks[0])):
+        raise complaint
+    return query, {name: np.asarray(value[0]) for name, value in fields.items()}
 
 
 def test_fields_land_in_their_places_and_absent_sensors_read_zero():
-    sent, query = arrays(), parse()
-    received = fields(query)
+    sent, (query, received) = arrays(), parse()
     assert query.vector.shape == (LAYOUT.size,)
     for name, value in sent.items():
         np.testing.assert_array_equal(received[name], np.asarray(value, np.float32), err_msg=name)
     for name in ("q_velocity", "object_velocity", "contact_force", "contact_found"):
         assert not received[name].any()
-    np.testing.assert_array_equal(received["asked"], [0, 0, 0])
+    np.testing.assert_array_equal(received["asked"], [1, 0, 0, 0])
 
 
 def test_the_bits_say_what_was_asked_in_the_order_of_the_constraints():
     pose = {"pose_q": np.zeros(20), "pose_position": np.zeros(3), "pose_quaternion": IDENTITY}
-    query = parse(("pose", "affordance"), **pose)
+    query, fields = parse(("pose", "affordance"), **pose)
     assert query.asked == ("affordance", "pose")
-    np.testing.assert_array_equal(fields(query)["asked"], [1, 1, 0])
+    np.testing.assert_array_equal(fields["asked"], [0, 1, 1, 0])
 
 
 @given(vector, vector)
 def test_the_cross_direction_is_made_unit_and_orthogonal_to_the_heading(direction, cross):
     length = np.linalg.norm(direction)
     assume(length > 0.1)
-    received = fields(parse(heading_direction=direction / length, heading_cross=cross))
+    _, received = parse(heading_direction=direction / length, heading_cross=cross)
     assert np.linalg.norm(received["heading_cross"]) == pytest.approx(1.0, abs=1e-5)
     assert received["heading_cross"] @ received["heading_direction"] == pytest.approx(0.0, abs=1e-4)
 
@@ -75,7 +72,7 @@ def test_the_cross_direction_is_made_unit_and_orthogonal_to_the_heading(directio
 @pytest.mark.parametrize("count", [3, 8, 20])
 def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks_at(count):
     points = np.arange(count)[:, None] * np.ones(3)
-    received = fields(parse(surface_points=points, surface_minus=np.arange(count) >= count // 2))
+    _, received = parse(surface_points=points, surface_minus=np.arange(count) >= count // 2)
     kept = received["surface_points"][:, 0]
     assert kept[0] == 0 and np.all(np.diff(kept) >= 0) and len(set(kept)) == min(count, 8)
     np.testing.assert_array_equal(received["surface_minus"], kept >= count // 2)
@@ -91,7 +88,7 @@ def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks
         (["heading"], {"q": None}, "lacks the field 'q'"),
         (["heading"], {"q": np.zeros(22)}, r"'q' has shape \(22,\); it must be \(20,\)"),
         (["heading"], {"weight": np.zeros(1)}, "unknown field 'weight'"),
-        (["heading"], {"asked": np.ones(3)}, "unknown field 'asked'"),
+        (["heading"], {"asked": np.ones(4)}, "unknown field 'asked'"),
         (["heading"], {"u": np.full(6, np.inf)}, "'u' is not finite"),
         (["heading"], {"surface_points": np.zeros((0, 3))}, "surface_points"),
         (["heading"], {"surface_minus": np.zeros(5, bool)}, r"must be \(8,\)"),
@@ -133,11 +130,16 @@ def test_a_packed_query_is_the_vector_of_the_named_one():
 
 
 def test_a_bad_query_of_a_batch_spoils_no_other():
-    good, bad = parse(), LAYOUT.parse(Message(arrays(u=np.full(6, np.nan)), {}))
-    third = LAYOUT.parse(Message(arrays(base_quaternion=np.zeros(4)), {}))
-    vectors = np.stack([good.vector, bad.vector, good.vector, third.vector])
-    errors = LAYOUT.complete(vectors, [query.asked for query in (good, bad, good, third)])
+    good, bad, third = (
+        LAYOUT.parse(Message(arrays(**changes), {}))
+        for changes in ({}, {"u": np.full(6, np.nan)}, {"base_quaternion": np.zeros(4)})
+    )
+    queries = good, bad, good, third
+    fields, checks = COMPLETE(np.stack([query.vector for query in queries]))
+    errors = [LAYOUT.complaint(query, row) for query, row in zip(queries, np.asarray(checks), strict=True)]
     assert [error is not None for error in errors] == [False, True, False, True]
     assert "'u' is not finite" in str(errors[1]) and "base_quaternion" in str(errors[3])
-    np.testing.assert_allclose(vectors[[0, 2]], good.vector[None].repeat(2, 0), atol=1e-6)
-    assert np.isfinite(vectors).all()
+    _, alone = parse()
+    for name, value in fields.items():
+        np.testing.assert_allclose(np.asarray(value)[[0, 2]], alone[name][None].repeat(2, 0), atol=1e-6, err_msg=name)
+        assert np.isfinite(value).all()
