@@ -1,7 +1,11 @@
 """`congrasp export`: policies and motions for other programs, each file checked as it is written."""
 
 import pathlib
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
+
+from common.errors import CongraspError
 
 
 def policy(
@@ -32,4 +36,37 @@ def policy(
     return 0
 
 
-COMMANDS = {"policy": policy}
+def motion(
+    paths: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
+    to: Literal["glb", "usd", "bvh", "ros2", "lerobot"] = "glb",
+    out: pathlib.Path | None = None,
+    index: int = -1,
+    success: bool = False,
+) -> int:
+    """Write a grasp motion for another program, read the file back, and print its largest error in millimetres.
+
+    glb: Blender, the web, Unity, Unreal. usd: Isaac, Houdini, Maya. bvh: motion capture. ros2: a bag with joint
+    trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for each motion. docs/exports.md says what
+    is in each.
+
+    Args:
+      paths: Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot takes several.
+      to: The format.
+      out: The file or folder to write; the first motion's name in the working directory otherwise.
+      index: Which of the recorded episodes, from 0; -1 is the last.
+      success: Count only episodes that succeeded.
+    """
+    from services.export.frames import TOLERANCE_MM
+    from services.export.motion import FORMATS, export_motions, pick_motion
+
+    if not paths:
+        raise CongraspError("No motion was named.", "Name a .npz of 'congrasp grasp', a recording or a run's folder.")
+    target = out or pathlib.Path(f"{paths[0].stem}{FORMATS[to] or f'-{to}'}")
+    motions = [pick_motion(path, index, success=success) for path in paths]
+    error = export_motions(motions, to, target)
+    moments = sum(len(motion.time) for motion in motions)
+    print(f"{target}: {moments} moments, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
+    return 0
+
+
+COMMANDS = {"policy": policy, "motion": motion}

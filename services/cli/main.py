@@ -44,7 +44,7 @@ SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXTRAS = {
     **dict.fromkeys(("foxglove", "imageio_ffmpeg", "matplotlib"), "viz"),
-    **dict.fromkeys(("bvhio", "mcap_ros2", "onnx", "onnxruntime", "pxr", "pyarrow", "pygltflib"), "export"),
+    **dict.fromkeys(("bvhio", "mcap_ros2", "onnx", "onnxruntime", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
     "warp": "cuda",
 }
 

@@ -1,0 +1,138 @@
+"""Where every link and the object are at every moment: what each format is made from, and what each is checked by."""
+
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.logs.motion import GraspMotion
+
+OBJECT = "object"
+"""Name of the object's frame; the others have the names of the links."""
+TOLERANCE_MM = 0.1
+"""Files whose kinematics differ by more than this are not kept."""
+_LEVER = 0.1  # m; a point this far from a frame's origin shows its rotation
+_SAME_TIME = 1e-6  # s
+_STILL = 1e-6  # m; a link whose origin moves less than this in its parent's frame does not move there
+
+
+FROM_Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
+"""(4, 4) a world whose y axis points up to one whose z axis does: y to z, z to -y."""
+TO_Y_UP = Rotation.from_matrix(FROM_Y_UP[:3, :3].T)
+"""The inverse's rotation."""
+
+
+class Track(NamedTuple):
+    """What a file says about one motion, worked out by its reader."""
+
+    time: np.ndarray
+    """(T,) s, from zero."""
+    poses: dict[str, np.ndarray]
+    """(T, 4, 4) frame to world of every link and the object; metres, z up."""
+    triangles: np.ndarray | None = None
+    """(E, 3, 3) corners of the object's mesh in its frame, where the format has meshes."""
+
+
+class Body(NamedTuple):
+    """A link, or the object, in its parent's frame."""
+
+    name: str
+    parent: int
+    """Index of the body that carries it, -1 for the world."""
+    translation: np.ndarray
+    """(T, 3) m, or (1, 3) where it stays the same."""
+    rotation: Rotation
+    """T rotations."""
+
+
+def bodies(motion: GraspMotion) -> list[Body]:
+    """Links in their order, each after its parent, and the object last."""
+    turns = [Rotation.from_quat(q, scalar_first=True) for q in motion.link_quaternion.swapaxes(0, 1).astype(float)]
+    places = motion.link_position.swapaxes(0, 1).astype(float)
+    found = []
+    for i, (name, parent) in enumerate(zip(motion.link_names, motion.link_parent, strict=True)):
+        place, turn = places[i], turns[i]
+        if parent >= 0:
+            inverse = turns[parent].inv()
+            place, turn = inverse.apply(place - places[parent]), inverse * turn
+            middle = (place.min(0) + place.max(0)) / 2
+            place = middle[None] if np.abs(place - middle).max() < _STILL else place
+        found.append(Body(str(name), int(parent), place, turn))
+    turn = Rotation.from_quat(motion.object_quaternion, scalar_first=True)
+    return [*found, Body(OBJECT, -1, motion.object_position.astype(float), turn)]
+
+
+def quaternions(rotation: Rotation, *, scalar_first: bool) -> np.ndarray:
+    """(T, 4) without jumps of sign, so that what plays the file can interpolate between neighbours."""
+    q = rotation.as_quat(scalar_first=scalar_first)
+    flips = np.sign(np.sum(q[1:] * q[:-1], -1))
+    return q * np.cumprod(np.concatenate([[1.0], np.where(flips == 0, 1.0, flips)]))[:, None]
+
+
+def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
+    """(T, 4, 4) of positions (T, 3) and T rotations."""
+    matrices = np.tile(np.eye(4), (len(position), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = rotation.as_matrix(), position
+    return matrices
+
+
+def error_mm(motion: GraspMotion, track: Track) -> float:
+    """Largest distance in mm between where a point is and where the file has it.
+
+    The points are each frame's origin and three a decimetre away along its axes, at every moment, and the object's
+    triangles in its frame.
+
+    Raises:
+      CongraspError: the file has other frames or moments than the motion.
+    """
+    turns = Rotation.from_quat(motion.link_quaternion.reshape(-1, 4), scalar_first=True)
+    links = pose_matrices(motion.link_position.reshape(-1, 3), turns).reshape(*motion.link_position.shape[:2], 4, 4)
+    expected = dict(zip(map(str, motion.link_names), links.swapaxes(0, 1), strict=True))
+    turns = Rotation.from_quat(motion.object_quaternion, scalar_first=True)
+    expected[OBJECT] = pose_matrices(motion.object_position, turns)
+    if odd := sorted(expected.keys() ^ track.poses.keys()):
+        raise CongraspError(f"The file lacks or should not have the frame '{odd[0]}'.")
+    if track.time.shape != motion.time.shape or np.abs(track.time - motion.time).max() > _SAME_TIME:
+        raise CongraspError("The file has other moments than the motion.")
+    points = np.concatenate([np.zeros((1, 3)), _LEVER * np.eye(3)])
+    points = np.concatenate([points, np.ones((4, 1))], 1).T
+    distances = [np.linalg.norm(((expected[name] - track.poses[name]) @ points)[:, :3], axis=1) for name in expected]
+    worst = max(float(distance.max()) for distance in distances)
+    if track.triangles is not None:
+        corners = motion.object_vertices[motion.object_faces]
+        if track.triangles.shape != corners.shape:
+            raise CongraspError("The file's mesh has other triangles than the object.")
+        worst = max(worst, float(np.linalg.norm(track.triangles - corners, axis=-1).max()))
+    return 1000 * worst
+
+
+def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dict[str, Any]:
+    """What goes into every file: where the motion comes from, and what its numbers mean in this format."""
+    return {
+        "generator": "congrasp",
+        "hand": motion.hand,
+        "object": motion.object,
+        "success": motion.success,
+        "constraints": list(motion.constraints),
+        "control_dt": motion.control_dt,
+        "frame": frame,
+        "unit": unit,
+        "quaternion": quaternion,
+        "joints": motion.joint_names.tolist(),
+        "links": motion.link_names.tolist(),
+    }
+
+
+def identifiers(names: Sequence[str]) -> list[str]:
+    """The names with what is no letter, digit or underscore replaced, all different."""
+    plain: list[str] = []
+    for name in names:
+        word = re.sub(r"\W", "_", name, flags=re.ASCII)
+        word = f"_{word}" if word[:1].isdigit() or not word else word
+        while word in plain:
+            word += "_"
+        plain.append(word)
+    return plain

@@ -1,0 +1,198 @@
+"""A LeRobot dataset, version 3.0: one episode a motion; written with pyarrow, put together again from its own layout.
+
+`observation.state` is what the robot feels (finger joints, then the wrist's pose), `observation.environment_state` the
+object's pose, `action` the finger targets and the wrist's pose one step later. The hand is in `meta/hand.urdf`.
+"""
+
+import json
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.logs.motion import GraspMotion
+from services.export.frames import OBJECT, Track, facts, pose_matrices
+from services.export.urdf import forward_kinematics, hand_urdf
+
+VERSION = "v3.0"
+_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_PLACE = {"chunk_index": 0, "file_index": 0}
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_COUNTERS = {"frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_STATE, _OBJECT, _ACTION = "observation.state", "observation.environment_state", "action"
+
+
+def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
+    """Writes motions of one hand and one control step as a dataset, which is a folder."""
+    first = motions[0]
+    fps = round(1 / first.control_dt)
+    if abs(fps * first.control_dt - 1) > 1e-6:
+        raise CongraspError(f"A control step of {first.control_dt} s makes no whole number of frames a second.")
+    for motion in motions:
+        if (motion.hand, motion.control_dt) != (first.hand, first.control_dt):
+            raise CongraspError("A dataset has one hand and one control step; the motions differ.", "Export each set.")
+    tasks = list(dict.fromkeys(_task(motion) for motion in motions))
+    episodes = [_columns(motion, i, tasks) for i, motion in enumerate(motions)]
+    lengths = [len(motion.time) for motion in motions]
+    starts = np.cumsum([0, *lengths])
+    for columns, start, length in zip(episodes, starts, lengths, strict=False):
+        columns["index"] = start + np.arange(length)
+    every = {name: np.concatenate([columns[name] for columns in episodes]) for name in episodes[0]}
+    rows = []
+    for i, columns in enumerate(episodes):
+        stats = {f"stats/{name}/{key}": value for name, c in columns.items() for key, value in _statistics(c).items()}
+        rows.append(
+            {
+                "episode_index": i,
+                "tasks": [_task(motions[i])],
+                "length": lengths[i],
+                "data/chunk_index": 0,
+                "data/file_index": 0,
+                "dataset_from_index": int(starts[i]),
+                "dataset_to_index": int(starts[i + 1]),
+                **stats,
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+            }
+        )
+    _write_parquet(path / "data" / _FILE.format(**_PLACE), pa.table({n: _column(v) for n, v in every.items()}))
+    _write_parquet(path / "meta" / "episodes" / _FILE.format(**_PLACE), pa.Table.from_pylist(rows))
+    _write_parquet(path / "meta" / "tasks.parquet", _tasks_table(tasks))
+    about = {
+        **facts(first, frame="world: z up, table's top at z = 0", unit="m, rad, s", quaternion="qw, qx, qy, qz"),
+        "objects": [motion.object for motion in motions],
+        "success": [motion.success for motion in motions],
+        "action": "finger targets of the joints' position servos; the wrist's pose one step later",
+    }
+    del about["object"], about["constraints"]
+    meta = path / "meta"
+    (meta / "hand.urdf").write_text(hand_urdf(first))
+    (meta / "congrasp.json").write_text(json.dumps(about, indent=1))
+    (meta / "stats.json").write_text(
+        json.dumps({name: _statistics(values) for name, values in every.items()}, indent=1)
+    )
+    (meta / "info.json").write_text(json.dumps(_info(first, len(motions), int(starts[-1]), len(tasks), fps), indent=1))
+
+
+def _task(motion: GraspMotion) -> str:
+    return f"Grasp the object {motion.object} under {' and '.join(motion.constraints)}."
+
+
+def _columns(motion: GraspMotion, episode: int, tasks: Sequence[str]) -> dict[str, np.ndarray]:
+    count = len(motion.time)
+    wrist = np.concatenate([motion.wrist_position, motion.wrist_quaternion], 1)
+    return {
+        _STATE: np.concatenate([motion.joint_position, wrist], 1).astype(np.float32),
+        _OBJECT: np.concatenate([motion.object_position, motion.object_quaternion], 1).astype(np.float32),
+        _ACTION: np.concatenate([motion.joint_target, np.concatenate([wrist[1:], wrist[-1:]])], 1).astype(np.float32),
+        "timestamp": motion.time.astype(np.float32),
+        "frame_index": np.arange(count),
+        "episode_index": np.full(count, episode),
+        "index": np.arange(count),
+        "task_index": np.full(count, tasks.index(_task(motion))),
+    }
+
+
+def _column(values: np.ndarray) -> pa.Array:
+    if values.ndim == 1:
+        return pa.array(values)
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+
+
+def _tasks_table(tasks: Sequence[str]) -> pa.Table:
+    """Tasks as pandas writes a frame with one column and the tasks as its index: that is how LeRobot finds them."""
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+        for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    ]
+    pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+
+
+def _statistics(values: np.ndarray) -> dict[str, list[float]]:
+    columns = values.reshape(len(values), -1).astype(float)
+    return {
+        "min": columns.min(0).tolist(),
+        "max": columns.max(0).tolist(),
+        "mean": columns.mean(0).tolist(),
+        "std": columns.std(0).tolist(),
+        "count": [len(columns)],
+        **{name: np.quantile(columns, q, axis=0).tolist() for name, q in _QUANTILES.items()},
+    }
+
+
+def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table, path, compression="snappy")
+
+
+def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int) -> dict[str, Any]:
+    joints = motion.joint_names.tolist()
+    wrist = [f"wrist_{name}" for name in _POSE]
+    names = {
+        _STATE: [*joints, *wrist],
+        _OBJECT: [f"object_{name}" for name in _POSE],
+        _ACTION: [*(f"{name}_target" for name in joints), *(f"{name}_next" for name in wrist)],
+    }
+    features: dict[str, Any] = {
+        name: {"dtype": "float32", "shape": [len(parts)], "names": parts} for name, parts in names.items()
+    }
+    for name, dtype in {"timestamp": "float32", **_COUNTERS}.items():
+        features[name] = {"dtype": dtype, "shape": [1], "names": None}
+    return {
+        "codebase_version": VERSION,
+        "robot_type": f"congrasp_{motion.hand}",
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": tasks,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": fps,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": f"data/{_FILE}",
+        "video_path": None,
+        "features": features,
+    }
+
+
+def read(path: pathlib.Path) -> list[Track]:
+    """Every episode as the files describe it: features by name, kinematics by the URDF."""
+    info = json.loads((path / "meta" / "info.json").read_text())
+    urdf = (path / "meta" / "hand.urdf").read_text()
+    episodes = pq.read_table(path / "meta" / "episodes").to_pylist()
+    tracks = []
+    for episode in sorted(episodes, key=lambda row: row["episode_index"]):
+        place = {name: episode[f"data/{name}"] for name in _PLACE}
+        table = pq.read_table(path / info["data_path"].format(**place))
+        rows = table.filter(pc.equal(table["episode_index"], episode["episode_index"])).sort_by("index")
+        state = _named(info, rows, _STATE)
+        thing = _named(info, rows, _OBJECT)
+        angles = {name: state[name] for name in state if not name.startswith("wrist_")}
+        poses = forward_kinematics(urdf, angles, _pose(state, "wrist"))
+        poses[OBJECT] = _pose(thing, "object")
+        kept = {name: pose for name, pose in poses.items() if name in _links(path) or name == OBJECT}
+        tracks.append(Track(rows["frame_index"].to_numpy() / info["fps"], kept))
+    return tracks
+
+
+def _links(path: pathlib.Path) -> list[str]:
+    return json.loads((path / "meta" / "congrasp.json").read_text())["links"]
+
+
+def _named(info: Mapping[str, Any], rows: pa.Table, feature: str) -> dict[str, np.ndarray]:
+    values = np.array(rows[feature].to_pylist(), float)
+    return dict(zip(info["features"][feature]["names"], values.T, strict=True))
+
+
+def _pose(values: Mapping[str, np.ndarray], prefix: str) -> np.ndarray:
+    position, quaternion = np.split(np.stack([values[f"{prefix}_{name}"] for name in _POSE], -1), [3], -1)
+    return pose_matrices(position, Rotation.from_quat(quaternion, scalar_first=True))

@@ -1,0 +1,75 @@
+"""Grasp motions for other programs; each file is read back by another reader and compared before it is kept."""
+
+import importlib
+import pathlib
+import shutil
+import tempfile
+from collections.abc import Sequence
+
+from common.errors import CongraspError
+from common.logs.motion import GraspMotion, load_motion, motion_of_episode
+from services.export.frames import TOLERANCE_MM, error_mm
+from services.render import pick_episode
+
+FORMATS = {
+    "glb": ".glb",
+    "usd": ".usda",
+    "bvh": ".bvh",
+    "ros2": "",
+    "lerobot": "",
+}
+"""Name and suffix of each format; `services.export.<name>` writes and reads it. Those without a suffix are folders."""
+SEVERAL = ("lerobot",)
+"""Formats that hold more than one motion."""
+
+
+def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:
+    """The motion of an NPZ file, or one of the episodes recorded at `path` (see `services.render.pick_episode`)."""
+    if not path.exists():
+        raise CongraspError(f"There is no {path}.", "Name a motion (.npz), a recording (.mcap) or a run's folder.")
+    if path.suffix == ".npz":
+        return load_motion(path)
+    return motion_of_episode(pick_episode(path, index, success=success))
+
+
+def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path) -> float:
+    """Writes motions in a format, reads the file back and compares.
+
+    Args:
+      motions: one, or several where the format takes them.
+      kind: one of `FORMATS`.
+      path: the file or folder to write; a file that is there is replaced, a folder is not.
+
+    Returns:
+      The largest error in mm (see `services.export.frames.error_mm`).
+
+    Raises:
+      CongraspError: the error is above `TOLERANCE_MM`, and nothing was written; or `path` cannot be written.
+    """
+    if len(motions) > 1 and kind not in SEVERAL:
+        raise CongraspError(f"A {kind} file holds one motion, and {len(motions)} were named.", "Name one at a time.")
+    if path.is_dir():
+        raise CongraspError(f"The folder {path} is there already.", "Remove it or name another with --out.")
+    module = importlib.import_module(f"services.export.{kind}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        workplace = pathlib.Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    except OSError as error:
+        raise CongraspError(f"{path} cannot be written: {error.strerror}.", "Choose another with --out.") from None
+    try:
+        draft = workplace / path.name
+        module.write(draft, motions)
+        tracks = module.read(draft)
+        if len(tracks) != len(motions):
+            raise CongraspError(f"The {kind} file holds {len(tracks)} motions, not {len(motions)}.")
+        worst = max(error_mm(motion, track) for motion, track in zip(motions, tracks, strict=True))
+        if not worst <= TOLERANCE_MM:
+            raise CongraspError(
+                f"The {kind} file is off by {worst:.3g} mm; {TOLERANCE_MM} mm is let through.",
+                "Nothing was written. Is the motion's file intact?",
+            )
+        for made in workplace.iterdir():
+            made.replace(path.with_name(made.name))
+    finally:
+        shutil.rmtree(workplace, ignore_errors=True)
+    return worst

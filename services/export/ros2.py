@@ -1,0 +1,228 @@
+"""A ROS 2 bag (MCAP): written by rosbags, read back by mcap and mcap-ros2-support.
+
+Topics: `/robot_description` (URDF), `/joint_trajectory` (all moments, finger joints), `/wrist_trajectory` (all moments,
+the palm in the world), `/joint_states`, `/tf` (moment by moment) and `/object` (a marker with the mesh).
+"""
+
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.logs.motion import GraspMotion
+from services.export.frames import OBJECT, Body, Track, bodies, facts, pose_matrices
+from services.export.urdf import forward_kinematics, hand_urdf
+
+_WORLD = "world"
+_START = 10**9  # ns; TF takes a stamp of zero for "whenever"
+_COLOUR = (0.95, 0.62, 0.24, 1.0)
+
+
+def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
+    """Writes one motion as a bag, which is a folder; it begins at one second."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    (motion,) = motions
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    make = _Messages(store.types)
+    found, dt = bodies(motion), motion.control_dt
+    joints = motion.joint_names.tolist()
+    velocity = np.gradient(motion.joint_position, dt, axis=0) if len(motion.time) > 1 else 0 * motion.joint_position
+    palm = next(i for i, body in enumerate(found) if body.parent < 0)
+    root = str(motion.link_names[palm])
+    since = [round(1e9 * t) for t in motion.time]
+    stamps = [_START + t for t in since]
+    frames = [_transforms(make, found, t, stamp) for t, stamp in enumerate(stamps)]
+    never = QosTime(0x7FFFFFFF, 0xFFFFFFFF)
+    latched = Qos(
+        QosHistory.KEEP_LAST,
+        1,
+        QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL,
+        never,
+        never,
+        QosLiveliness.AUTOMATIC,
+        never,
+        False,
+    )
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        about = facts(motion, frame=f"{_WORLD}: z up; TF frames are the links", unit="m, rad, s", quaternion="by name")
+        bag.set_custom_data("congrasp", json.dumps(about))
+
+        def send(topic: str, kind: str, messages: Sequence[Any], *, once: bool = False) -> None:
+            channel = bag.add_connection(topic, kind, typestore=store, offered_qos_profiles=[latched] if once else [])
+            for stamp, message in zip(stamps, messages, strict=False):
+                bag.write(channel, stamp, store.serialize_cdr(message, kind))
+
+        send("/robot_description", "std_msgs/msg/String", [make("std_msgs/String", data=hand_urdf(motion))], once=True)
+        points = [
+            make(
+                "trajectory_msgs/JointTrajectoryPoint",
+                positions=motion.joint_position[t].astype(float),
+                velocities=velocity[t].astype(float),
+                accelerations=np.zeros(0),
+                effort=np.zeros(0),
+                time_from_start=make.duration(since[t]),
+            )
+            for t in range(len(since))
+        ]
+        trajectory = make(
+            "trajectory_msgs/JointTrajectory", header=make.header(0, root), joint_names=joints, points=points
+        )
+        send("/joint_trajectory", "trajectory_msgs/msg/JointTrajectory", [trajectory], once=True)
+        wrist = make(
+            "trajectory_msgs/MultiDOFJointTrajectory",
+            header=make.header(0, _WORLD),
+            joint_names=[root],
+            points=[
+                make(
+                    "trajectory_msgs/MultiDOFJointTrajectoryPoint",
+                    transforms=[frame.transforms[palm].transform],
+                    velocities=[],
+                    accelerations=[],
+                    time_from_start=make.duration(ns),
+                )
+                for frame, ns in zip(frames, since, strict=True)
+            ],
+        )
+        send("/wrist_trajectory", "trajectory_msgs/msg/MultiDOFJointTrajectory", [wrist], once=True)
+        send("/object", "visualization_msgs/msg/Marker", [_marker(make, motion)], once=True)
+        states = [
+            make(
+                "sensor_msgs/JointState",
+                header=make.header(stamp, root),
+                name=joints,
+                position=motion.joint_position[t].astype(float),
+                velocity=velocity[t].astype(float),
+                effort=np.zeros(0),
+            )
+            for t, stamp in enumerate(stamps)
+        ]
+        send("/joint_states", "sensor_msgs/msg/JointState", states)
+        send("/tf", "tf2_msgs/msg/TFMessage", frames)
+
+
+class _Messages:
+    """Makes messages by the names of their types and fields."""
+
+    def __init__(self, types: Any):
+        self._types = types
+
+    def __call__(self, kind: str, **fields: Any) -> Any:
+        package, name = kind.split("/")
+        return self._types[f"{package}/msg/{name}"](**fields)
+
+    def header(self, stamp: int, frame: str) -> Any:
+        time = self("builtin_interfaces/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+        return self("std_msgs/Header", stamp=time, frame_id=frame)
+
+    def duration(self, ns: int) -> Any:
+        return self("builtin_interfaces/Duration", sec=ns // 10**9, nanosec=ns % 10**9)
+
+    def vector(self, values: np.ndarray, kind: str = "Vector3") -> Any:
+        return self(f"geometry_msgs/{kind}", **dict(zip("xyz", map(float, values), strict=True)))
+
+    def quaternion(self, values: Sequence[float]) -> Any:
+        return self("geometry_msgs/Quaternion", **dict(zip("xyzw", map(float, values), strict=True)))
+
+
+def _transforms(make: _Messages, found: Sequence[Body], t: int, stamp: int) -> Any:
+    transforms = []
+    for body in found:
+        turn = body.rotation[t].as_quat()
+        place = body.translation[min(t, len(body.translation) - 1)]
+        parent = found[body.parent].name if body.parent >= 0 else _WORLD
+        transforms.append(
+            make(
+                "geometry_msgs/TransformStamped",
+                header=make.header(stamp, parent),
+                child_frame_id=body.name,
+                transform=make(
+                    "geometry_msgs/Transform", translation=make.vector(place), rotation=make.quaternion(turn)
+                ),
+            )
+        )
+    return make("tf2_msgs/TFMessage", transforms=transforms)
+
+
+def _marker(make: _Messages, motion: GraspMotion) -> Any:
+    corners = motion.object_vertices[motion.object_faces.ravel()]
+    image = make("sensor_msgs/CompressedImage", header=make.header(0, ""), format="", data=np.zeros(0, np.uint8))
+    return make(
+        "visualization_msgs/Marker",
+        header=make.header(0, OBJECT),
+        ns=motion.object,
+        id=0,
+        type=11,  # a list of triangles
+        action=0,
+        pose=make("geometry_msgs/Pose", position=make.vector(np.zeros(3), "Point"), orientation=_upright(make)),
+        scale=make.vector(np.ones(3)),
+        color=make("std_msgs/ColorRGBA", **dict(zip("rgba", _COLOUR, strict=True))),
+        lifetime=make.duration(0),
+        frame_locked=True,
+        points=[make.vector(corner, "Point") for corner in corners],
+        colors=[],
+        texture_resource="",
+        texture=image,
+        uv_coordinates=[],
+        text="",
+        mesh_resource="",
+        mesh_file=make("visualization_msgs/MeshFile", filename="", data=np.zeros(0, np.uint8)),
+        mesh_use_embedded_materials=False,
+    )
+
+
+def _upright(make: _Messages) -> Any:
+    return make.quaternion([0.0, 0.0, 0.0, 1.0])
+
+
+def read(path: pathlib.Path) -> list[Track]:
+    """What mcap-ros2-support decodes: poses by joint trajectory and URDF, having seen that TF says the same."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    (file,) = path.glob("*.mcap")
+    messages: dict[str, list[Any]] = {}
+    with file.open("rb") as stream:
+        for _, channel, _, message in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            messages.setdefault(channel.topic, []).append(message)
+    trees = [{t.child_frame_id: t for t in message.transforms} for message in messages["/tf"]]
+    first = trees[0]
+    local = {name: _poses([tree[name].transform for tree in trees]) for name in first}
+    tf: dict[str, np.ndarray] = {}
+
+    def visit(name: str) -> np.ndarray:
+        if name not in tf:
+            parent = first[name].header.frame_id
+            tf[name] = local[name] if parent == _WORLD else visit(parent) @ local[name]
+        return tf[name]
+
+    for name in first:
+        visit(name)
+    (trajectory,) = messages["/joint_trajectory"]
+    (wrist,) = messages["/wrist_trajectory"]
+    positions = np.array([list(point.positions) for point in trajectory.points])
+    angles = dict(zip(trajectory.joint_names, positions.T, strict=True))
+    base = _poses([point.transforms[0] for point in wrist.points])
+    described = forward_kinematics(messages["/robot_description"][0].data, angles, base)
+    poses = {name: described.get(name, tf[name]) for name in tf}
+    apart = max(float(np.abs(poses[name] - tf[name]).max()) for name in tf)
+    if apart > 1e-4:
+        raise CongraspError(f"The joint trajectory and TF contradict each other by {apart:.2g}.")
+    time = np.array([p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in trajectory.points])
+    (marker,) = messages["/object"]
+    corners = np.array([[p.x, p.y, p.z] for p in marker.points])
+    return [Track(time, poses, corners.reshape(-1, 3, 3))]
+
+
+def _poses(transforms: Sequence[Any]) -> np.ndarray:
+    """(T, 4, 4)."""
+    position = np.array([[t.translation.x, t.translation.y, t.translation.z] for t in transforms])
+    turns = Rotation.from_quat([[t.rotation.x, t.rotation.y, t.rotation.z, t.rotation.w] for t in transforms])
+    return pose_matrices(position, turns)

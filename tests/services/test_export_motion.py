@@ -1,0 +1,240 @@
+"""An exported motion is, for its reader, where the simulation had it; a file that is not so is not kept."""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pygltflib
+import pytest
+from pxr import Usd, UsdGeom
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.logs.channels import Entry
+from common.logs.entries import Converter
+from common.logs.motion import GraspMotion, motion_of_episode, save_motion
+from common.logs.poses import link_poses
+from common.logs.writer import LogWriter
+from services.cli.main import main
+from services.export import bvh, frames, glb, lerobot, motion, ros2, urdf, usd
+from tests.episodes import episode
+
+T = 7
+MODULES: dict[str, ModuleType] = {"glb": glb, "usd": usd, "bvh": bvh, "ros2": ros2, "lerobot": lerobot}
+FORMATS = list(motion.FORMATS)
+
+
+def posed(motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], seed: int) -> GraspMotion:
+    """A wild motion of the same hand: any wrist, any fingers within their limits, any object pose."""
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(*motion.joint_limits.T, (T, len(motion.joint_names)))
+    wrist, place = Rotation.random(T, rng=rng), rng.normal(scale=0.3, size=(T, 3))
+    local = [link(angles) for angles in q]
+    position = np.stack([wrist[t].apply(local[t][0]) + place[t] for t in range(T)])
+    own = [Rotation.from_quat(quaternion, scalar_first=True) for _, quaternion in local]
+    turns = [(wrist[t] * own[t]).as_quat(scalar_first=True) for t in range(T)]
+    return dataclasses.replace(
+        motion,
+        time=motion.control_dt * np.arange(T),
+        joint_position=q,
+        joint_target=q + 0.01,
+        wrist_position=place,
+        wrist_quaternion=wrist.as_quat(scalar_first=True),
+        link_position=position,
+        link_quaternion=np.stack(turns),
+        object_position=rng.normal(scale=0.2, size=(T, 3)),
+        object_quaternion=Rotation.random(T, rng=rng).as_quat(scalar_first=True),
+    )
+
+
+@pytest.fixture(scope="module")
+def human() -> GraspMotion:
+    hand = get_hand("human")
+    return posed(motion_of_episode(episode(T)), lambda q: link_poses(hand, q), 0)
+
+
+@pytest.fixture(scope="module")
+def odd_hand(human: GraspMotion) -> GraspMotion:
+    """A hand with what URDF has no single joint for: two joints of one link at two places, a link without joints, and
+    names that other formats do not take."""
+    axes = Rotation.random(3, rng=np.random.default_rng(3)).as_matrix()[:, 0]
+    anchors = np.array([[0.02, 0.0, 0.03], [0.03, 0.01, 0.05], [0.05, 0.0, 0.09]])
+    names, parents, joint_link = ["palm", "1st phalanx", "plate", "tip/1"], [-1, 0, 1, 1], [1, 1, 3]
+
+    def link(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        turns, places = [Rotation.identity()], [np.zeros(3)]  # x = turn x0 + place for points of the zero pose
+        for i in range(1, 4):
+            turn, place = turns[parents[i]], places[parents[i]]
+            for j in np.flatnonzero(np.array(joint_link) == i):
+                own = Rotation.from_rotvec(q[j] * axes[j])
+                place = place + turn.apply(anchors[j] - own.apply(anchors[j]))
+                turn = turn * own
+            turns.append(turn)
+            places.append(place)
+        origins = [np.zeros(3), anchors[0], np.zeros(3), anchors[2]]
+        position = [turn.apply(o) + place for turn, o, place in zip(turns, origins, places, strict=True)]
+        return np.array(position), np.array([turn.as_quat(scalar_first=True) for turn in turns])
+
+    hand = dataclasses.replace(
+        human,
+        joint_names=np.array(["a b", "b", "c"]),
+        joint_link=np.array(joint_link),
+        joint_axis=axes,
+        joint_anchor=anchors,
+        joint_limits=np.array([[-1.5, 1.5]] * 3),
+        link_names=np.array(names),
+        link_parent=np.array(parents),
+        capsule_link=np.array([1, 2]),
+        capsule_ends=np.array([[[0, 0, 0], [0.01, 0.0, 0.02]], [[0, 0, 0], [0, 0, 0]]]),
+        capsule_radius=np.array([0.01, 0.02]),
+    )
+    return posed(hand, link, 5)
+
+
+def export(motions: Sequence[GraspMotion], kind: str, folder: pathlib.Path) -> tuple[pathlib.Path, float]:
+    path = folder / f"motion{motion.FORMATS[kind]}"
+    return path, motion.export_motions(motions, kind, path)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_reader_finds_hand_and_object_where_they_were(
+    human: GraspMotion, odd_hand: GraspMotion, kind: str, tmp_path: pathlib.Path
+) -> None:
+    for name, which in (("human", human), ("odd", odd_hand)):
+        path, error = export([which], kind, tmp_path / name)
+        assert error < 0.01
+        (track,) = MODULES[kind].read(path)
+        assert frames.error_mm(which, track) == error
+        beside = [".json"] if kind == "bvh" else []
+        assert {p.name for p in path.parent.iterdir()} == {path.name, *(path.name + suffix for suffix in beside)}
+
+
+@pytest.mark.parametrize(
+    ("kind", "fault"),
+    [
+        *((kind, fault) for kind in FORMATS for fault in ("shift", "inverted quaternion")),
+        *((kind, "joint order") for kind in ("ros2", "lerobot")),  # the others have no joint angles
+    ],
+)
+def test_a_file_that_is_off_is_not_kept(
+    human: GraspMotion, kind: str, fault: str, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The writer is given another motion than the one that the file is compared with."""
+    inverse = Rotation.from_quat(human.object_quaternion, scalar_first=True).inv().as_quat(scalar_first=True)
+    wrong = {
+        "shift": dataclasses.replace(human, object_position=human.object_position + 2e-4),
+        "inverted quaternion": dataclasses.replace(human, object_quaternion=inverse),
+        "joint order": dataclasses.replace(human, joint_position=human.joint_position[:, ::-1]),
+    }[fault]
+    write = MODULES[kind].write
+    monkeypatch.setattr(MODULES[kind], "write", lambda path, motions: write(path, [wrong]))
+    with pytest.raises(CongraspError, match=r"off by|contradict"):
+        export([human], kind, tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_glb_is_y_up_for_others_and_names_its_units(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    path, _ = export([human], "glb", tmp_path)
+    file: Any = pygltflib.GLTF2().load(str(path))
+    (root,) = [file.nodes[i] for i in file.scenes[0].nodes]
+    np.testing.assert_allclose(Rotation.from_quat(root.rotation).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
+    assert root.extras["unit"] == "m" and root.extras["quaternion"] == "x, y, z, w"
+    assert root.extras["joints"] == human.joint_names.tolist()
+    assert all(node.matrix is None for node in file.nodes)
+
+
+def test_neighbouring_quaternions_do_not_jump() -> None:
+    flipped = Rotation.from_rotvec(np.outer(np.linspace(0, 12, 50), [0, 0, 1]))
+    q = frames.quaternions(flipped, scalar_first=False)
+    assert (np.sum(q[1:] * q[:-1], -1) > 0).all()
+
+
+def test_usd_shapes_are_where_the_capsules_are(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    path, _ = export([human], "usd", tmp_path)
+    stage = Usd.Stage.Open(str(path))
+    assert "w, x, y, z" in json.loads(stage.GetRootLayer().customLayerData["congrasp"])["quaternion"]
+    cache = UsdGeom.XformCache(3.0)
+    k = 9
+    link = int(human.capsule_link[k])
+    prim = next(p for p in stage.Traverse() if p.GetName() == f"capsule_{k}")
+    half = UsdGeom.Capsule(prim).GetHeightAttr().Get() / 2
+    matrix = np.array(cache.GetLocalToWorldTransform(prim)).T
+    ends = (matrix @ [[0, 0], [0, 0], [-half, half], [1, 1]])[:3].T
+    turn = Rotation.from_quat(human.link_quaternion[3, link], scalar_first=True)
+    np.testing.assert_allclose(ends, turn.apply(human.capsule_ends[k]) + human.link_position[3, link], atol=1e-6)
+
+
+def test_a_dataset_of_several_motions(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    hand = get_hand("human")
+    other = dataclasses.replace(posed(human, lambda q: link_poses(hand, q), 9), object="mug", constraints=("heading",))
+    path, error = export([human, other, human], "lerobot", tmp_path)
+    assert error < 0.01
+    info = json.loads((path / "meta" / "info.json").read_text())
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"], info["fps"]) == (3, 3 * T, 2, 100)
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(path / "data")
+    assert table["index"].to_pylist() == list(range(3 * T))
+    assert table["task_index"].to_pylist() == [0] * T + [1] * T + [0] * T
+    action = np.array(table["action"].to_pylist())[T : 2 * T]
+    np.testing.assert_allclose(action[:-1, -7:-4], other.wrist_position[1:], atol=1e-6)
+    names = info["features"]["action"]["names"]
+    assert names[:2] == ["thumb_cmc_abduction_target", "thumb_cmc_flexion_target"] and len(names) == action.shape[1]
+    pose = names.index("index_pip_target")
+    joint = human.joint_names.tolist().index("index_pip")
+    np.testing.assert_allclose(action[:, pose], other.joint_target[:, joint], atol=1e-6)
+    stats = json.loads((path / "meta" / "stats.json").read_text())
+    np.testing.assert_allclose(stats["action"]["mean"], np.array(table["action"].to_pylist()).mean(0), atol=1e-6)
+    # pandas finds the tasks as its index
+    schema = json.loads(pq.read_schema(path / "meta" / "tasks.parquet").metadata[b"pandas"])
+    assert schema["index_columns"] == ["task"]
+
+
+def test_a_described_hand_says_what_it_is(odd_hand: GraspMotion) -> None:
+    text = urdf.hand_urdf(odd_hand)
+    angles = dict(zip(odd_hand.joint_names, odd_hand.joint_position.T, strict=True))
+    wrist = frames.pose_matrices(
+        odd_hand.wrist_position, Rotation.from_quat(odd_hand.wrist_quaternion, scalar_first=True)
+    )
+    poses = urdf.forward_kinematics(text, angles, wrist)
+    for i, name in enumerate(odd_hand.link_names):
+        np.testing.assert_allclose(poses[str(name)][:, :3, 3], odd_hand.link_position[:, i], atol=1e-8)
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(["export", "motion", *arguments])
+    return int(end.value.code or 0)
+
+
+def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    entries: list[Entry] = Converter()("congrasp/run/log/episode/actor/a0", episode(T), 10**15)
+    with_log = LogWriter(tmp_path / "logs", "log")
+    with_log.write(*entries)
+    with_log.close()
+    save_motion(tmp_path / "mug.npz", motion_of_episode(episode(T)))
+    assert run("logs", "--to", "bvh") == 0
+    assert run("mug.npz") == 0
+    assert "mug.glb: 7 moments, largest error" in capsys.readouterr().out
+    assert run("mug.npz", "logs", "--to", "lerobot") == 0
+    made = {"logs.bvh", "logs.bvh.json", "mug-lerobot", "mug.glb"}
+    assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *made}
+    capsys.readouterr()
+    for arguments, words in (
+        (["mug.npz", "logs", "--to", "glb"], "one motion, and 2 were named"),
+        (["mug.npz", "--to", "lerobot"], "is there already"),
+        (["nothing.npz"], "There is no nothing.npz"),
+        (["logs", "--index", "4"], "holds 1 episodes"),
+        ([], "No motion was named"),
+    ):
+        assert run(*arguments) == 2
+        said = capsys.readouterr().err
+        assert words in said and said.count("\n") == 1
