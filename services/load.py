@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import psutil
 
 from common.errors import CongraspError, TransportError
 from services.client import PolicyClient
@@ -19,8 +20,10 @@ from services.train import free_port
 
 
 @contextlib.contextmanager
-def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[str]:
-    """A server of a policy file on this machine while the block runs; its endpoint, at which it may still compile.
+def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]]:
+    """A server of a policy file on this machine while the block runs: its endpoint, and the number of its process.
+
+    It may still be compiling.
 
     Args:
       policy: the file.
@@ -39,7 +42,7 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[str]:
         )
     take_along(server)
     try:
-        yield endpoint
+        yield endpoint, server.pid
     finally:
         server.terminate()
         try:
@@ -47,6 +50,12 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[str]:
         except subprocess.TimeoutExpired:
             server.kill()
             server.wait()
+
+
+def processor_seconds(process: int) -> float:
+    """Processor time that a process has taken, in all its threads."""
+    times = psutil.Process(process).cpu_times()
+    return times.user + times.system
 
 
 def wait_until_ready(client: PolicyClient, seconds: float = 180.0) -> None:

@@ -273,7 +273,7 @@ def _compare(before: list[Row], after: list[Row]) -> None:
 def _live_query(run_dir: pathlib.Path) -> None:
     """Serves the policy from a process of its own, and asks it for one action."""
     console.print("\n[bold]One live query[/] of a policy server in a process of its own:")
-    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as endpoint:
+    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
         episode = example_episode(HELD_OUT_SEED)
         with PolicyClient(endpoint, wait=60.0, timeout=5.0) as client:
             wait_until_ready(client)

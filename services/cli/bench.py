@@ -25,6 +25,8 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
 def query(repeat: int = 1000, concurrency: int = 1) -> int:
     """Latency of a policy server in a process of its own that serves an untrained policy, over the loopback interface.
 
+    The clients take their share of the machine; the server's own processor time for an answer is printed beside.
+
     Args:
       repeat: Queries in all.
       concurrency: Clients at the same time.
@@ -33,18 +35,20 @@ def query(repeat: int = 1000, concurrency: int = 1) -> int:
 
     from common.policy import bundle as bundles
     from services.client import PolicyClient
-    from services.load import example_episode, measure, serving, wait_until_ready
+    from services.load import example_episode, measure, processor_seconds, serving, wait_until_ready
     from services.presets import get_preset
     from services.quickstart import untrained
 
     with tempfile.TemporaryDirectory() as folder:
         policy = pathlib.Path(folder, "policy.safetensors")
         bundles.save(untrained(get_preset("quickstart")), policy)
-        with serving(policy, pathlib.Path(folder, "serve.log")) as endpoint:
+        with serving(policy, pathlib.Path(folder, "serve.log")) as (endpoint, server):
             episode = example_episode(1_000_000)
             with PolicyClient(endpoint, wait=60.0) as client:
                 wait_until_ready(client)
+            before = processor_seconds(server)
             result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0)
+            result["server_cpu_ms"] = 1e3 * (processor_seconds(server) - before) / repeat
     print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
     return 0
 
@@ -96,6 +100,29 @@ def security(repeats: int = 5) -> int:
         f"{found['flood_turned_away']:.0f} requests were turned away\n"
         f"opening the learner:    {found['secure_open_ms']:.0f} ms secured, {found['plain_open_ms']:.0f} ms plain"
     )
+    return 0
+
+
+def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: int = 4, versions: int = 100) -> int:
+    """Rollouts of 8 MB into one learner, beside bare PUSH/PULL sockets (pyzmq); and 4 MB of weights to its actors.
+
+    Args:
+      senders: Actor processes that send rollouts.
+      seconds: Length of one measurement.
+      repeats: Measurements of each kind of ingest, alternating; medians are printed.
+      actors: Actor processes that wait for weights.
+      versions: Publications of weights, four a second.
+    """
+    from services.bench_transport import measure_ingest, measure_weights
+
+    ours, bare = measure_ingest(senders, seconds, repeats)
+    print(
+        f"rollouts of 8 MB: {ours:.0f} MB/s into the learner, {bare:.0f} MB/s bare (ratio {ours / bare:.2f})",
+        flush=True,
+    )
+    delays = measure_weights(actors, versions, 4.0)
+    p50, p99 = (1e3 * delays[int(share * (len(delays) - 1))] for share in (0.5, 0.99))
+    print(f"weights of 4 MB to {actors} actors: p50 {p50:.0f} ms, p99 {p99:.0f} ms, longest {1e3 * delays[-1]:.0f} ms")
     return 0
 
 
@@ -182,6 +209,7 @@ COMMANDS = {
     "query": query,
     "shutdown": shutdown,
     "security": security,
+    "transport": transport,
     "staleness": staleness,
     "faults": faults,
     "recording": recording,
