@@ -134,7 +134,12 @@ def start(
 ) -> EnvironmentState:
     """Fresh episodes in every world; `stationary` () bool holds the objects in place (the paper's first phase)."""
     key, episode_key = jax.random.split(key)
-    world, goal, surface, variant, hold = sample_episodes(hand, task, taskset, episode_key, batch, stationary)
+    return begin(*sample_episodes(hand, task, taskset, episode_key, batch, stationary), key)
+
+
+def begin(world: World, goal: Goal, surface: Surface, variant: Array, hold: Array, key: Array) -> EnvironmentState:
+    """Episodes that begin as they are told; see `EnvironmentState` for the arguments."""
+    batch = world.q.shape[0]
     zero, no, index = jnp.zeros(batch), jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32)
     return EnvironmentState(
         key=key,

@@ -181,7 +181,7 @@ class RolloutWorker:
         self, weights: Any, env: EnvironmentState, readout: Readout, target: Action, action: Array
     ) -> tuple[EnvironmentState, environment.Score, SceneState, Features, tuple[Trace, Any]]:
         env, score, scene, seen = environment.score(self._hand, self._task, weights, env, readout, target)
-        return env, score, scene, seen, (_trace(scene, seen, action, score), self._probe(scene, seen))
+        return env, score, scene, seen, (traced(scene, seen, action, score), self._probe(scene, seen))
 
     def _advance(
         self,
@@ -281,22 +281,25 @@ class RolloutWorker:
         return carry, Rollout(*(*columns, last, env.finished, env.has_finished, trace, probed))
 
 
-def _trace(scene: SceneState, seen: Features, action: Array, score: environment.Score) -> Trace:
-    force = jnp.sum(jnp.where(scene.contact_found[0][..., None], scene.contact_force[0], 0.0), -2)
+def traced(
+    scene: SceneState, seen: Features, action: Array, score: environment.Score, worlds: int | slice = 0
+) -> Trace:
+    """What is kept of a step of one world, or of several."""
+    force = jnp.sum(jnp.where(scene.contact_found[worlds][..., None], scene.contact_force[worlds], 0.0), -2)
     return Trace(
-        q=scene.q[0],
-        u=scene.u[0],
-        q_target=scene.q_target[0],
-        u_target=scene.u_target[0],
-        wrist_position=seen.wrist_position[0],
-        wrist_quaternion=seen.wrist_quaternion[0],
-        object_position=scene.object_position[0],
-        object_quaternion=scene.object_quaternion[0],
+        q=scene.q[worlds],
+        u=scene.u[worlds],
+        q_target=scene.q_target[worlds],
+        u_target=scene.u_target[worlds],
+        wrist_position=seen.wrist_position[worlds],
+        wrist_quaternion=seen.wrist_quaternion[worlds],
+        object_position=scene.object_position[worlds],
+        object_quaternion=scene.object_quaternion[worlds],
         contact_force=force,
-        action=action[0],
-        terms=score.terms[0],
-        table=scene.table[0],
-        terminal=score.terminal[0],
+        action=action[worlds],
+        terms=score.terms[worlds],
+        table=scene.table[worlds],
+        terminal=score.terminal[worlds],
     )
 
 

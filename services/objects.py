@@ -3,6 +3,7 @@
 import pathlib
 from collections.abc import Callable
 
+from common.errors import CongraspError
 from common.objects import store
 from common.objects.meshes import ImportOptions, import_source
 from common.objects.sources import find_sources
@@ -31,3 +32,17 @@ def objects_of(
         objects.append(import_source(source, ImportOptions())[0])
         advance(len(objects))
     return objects
+
+
+def one_object(path: pathlib.Path, options: ImportOptions) -> GraspObject:
+    """The one object of a path; see `objects_of`.
+
+    Raises:
+      CongraspError: there is none or there are several, or it cannot be imported.
+    """
+    if path.suffix == store.SUFFIX:
+        return store.load(path)
+    sources = find_sources(path)
+    if len(sources) > 1:
+        raise CongraspError(f"{path} holds {len(sources)} objects.", "Name one of them.")
+    return import_source(sources[0], options)[0]

@@ -242,6 +242,11 @@ def episode_sheet(episode: Message, *, moments: int = 8, size: tuple[int, int] =
     return contact_sheet(images, labels, columns=min(4, len(steps)), title=episode_title(episode))
 
 
+def thumbnail(episode: Message, size: tuple[int, int] = (300, 225)) -> np.ndarray:
+    """The last moment of an episode."""
+    return next(render_episode_frames(episode, [len(episode.arrays["table"]) - 1], size))
+
+
 def episode_strip(
     episode: Message, moments: int, size: tuple[int, int], first: str, last: str
 ) -> tuple[list[np.ndarray], list[str]]:
@@ -285,14 +290,14 @@ def episode_title(episode: Message) -> str:
 def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
     """The hand open, half closed and closed (columns), from the palm, the thumb's side and between (rows)."""
     poses = {"open": hand.q_open, "half closed": (hand.q_open + hand.q_closed) / 2, "closed": hand.q_closed}
-    upright = _upright(hand)
+    up = upright(hand)
     placed = {}
     for name, q in poses.items():
         position, quaternion = link_poses(hand, q)
-        turned = (upright * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
-        placed[name] = hand_shapes(hand, upright.apply(position), turned)
-    points = np.concatenate([_ends(shape) for shapes in placed.values() for shape in shapes])
-    thumb = np.sign(upright.apply(hand.keypoints[len(hand.links)])[1])
+        turned = (up * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
+        placed[name] = hand_shapes(hand, up.apply(position), turned)
+    points = np.concatenate([shape_points(shape) for shapes in placed.values() for shape in shapes])
+    thumb = np.sign(up.apply(hand.keypoints[len(hand.links)])[1])
     images, labels = [], []
     for view, azimuth in {"palm": 0.0, "between": 50.0, "thumb's side": 95.0}.items():
         angle = thumb * np.radians(azimuth)
@@ -303,7 +308,7 @@ def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
     return contact_sheet(images, labels, columns=len(poses), title=title)
 
 
-def _upright(hand: Hand) -> Rotation:
+def upright(hand: Hand) -> Rotation:
     """Turns the wrist frame so that the fingers point up and the palm, where the fingers curl to, faces +x."""
     fingers = hand.keypoints[len(hand.links) + 1 :].mean(0)
     up = fingers / np.linalg.norm(fingers)
@@ -314,11 +319,13 @@ def _upright(hand: Hand) -> Rotation:
     return Rotation.from_matrix(np.stack([palm, np.cross(up, palm), up]))
 
 
-def _ends(capsule: Shape) -> np.ndarray:
-    """(12, 3) points around both ends of a capsule."""
-    turn = Rotation.from_quat(capsule.quaternion, scalar_first=True)
-    ends = capsule.position + turn.apply([[0, 0, capsule.size[1]], [0, 0, -capsule.size[1]]])
-    return (ends[:, None] + capsule.size[0] * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
+def shape_points(shape: Shape) -> np.ndarray:
+    """(n, 3) points of the world that a picture of a capsule or a mesh must hold."""
+    turn = Rotation.from_quat(shape.quaternion, scalar_first=True)
+    if shape.vertices is not None:
+        return turn.apply(shape.vertices) + shape.position
+    ends = shape.position + turn.apply([[0, 0, shape.size[1]], [0, 0, -shape.size[1]]])
+    return (ends[:, None] + shape.size[0] * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
 
 
 def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Message:

@@ -19,6 +19,7 @@ _BREADTH = 0.03  # half the breadth of the slab in which the local width is meas
 _BEYOND = 0.01  # the slab ends this far beyond the heading position, where the fingertips close
 _TUBE = 0.01  # radius around the approach in which nothing may stand before the surface point
 _MARGIN = 0.01  # an approach stays this far from O-, and closing fingers, which are this thick, meet none of it
+_FACING = 0.5  # least cosine between a surface's inward normal and a direction that is given
 _ROLLS = 4
 _BATCH = 320
 _PREFERENCE = 0.015  # m of width for which a roll becomes e times less likely
@@ -47,6 +48,8 @@ def sample_headings(
     max_width: float = MAX_WIDTH,
     back_off: float = BACK_OFF,
     attempts: int = 6,
+    along: np.ndarray | None = None,
+    at: np.ndarray | None = None,
 ) -> Headings | None:
     """Samples an object's heading set by the paper's rules.
 
@@ -74,6 +77,8 @@ def sample_headings(
       max_width: largest local width, m.
       back_off: length of the approach that is checked, m.
       attempts: batches of candidates.
+      along: (3,) unit, the direction of all of them, if it is not to be drawn; surface points that face it are taken.
+      at: (3,) the position of all of them, m, if it is not to be drawn.
 
     Returns:
       H headings, float32; None if O+ cannot be approached.
@@ -82,13 +87,20 @@ def sample_headings(
     sources = np.flatnonzero(~minus)
     if len(sources) == 0:
         sources = np.arange(len(minus))
+    if along is not None:
+        facing = -obj.normals[sources] @ along
+        sources = sources[facing >= min(_FACING, facing.max())]
     points = obj.points.astype(np.float32)
     found: list[Headings] = []
     total = 0
     for _ in range(attempts):
         surface = rng.choice(sources, _BATCH)
         direction = _in_cone(-obj.normals[surface], cone, rng)
+        if along is not None:
+            direction = np.broadcast_to(np.float32(along), direction.shape)
         position = points[surface] + np.float32(inward) * direction
+        if at is not None:
+            position = np.broadcast_to(np.float32(at), position.shape)
         faults = _faults(points, minus, position, direction, inward, back_off)
         position, direction, faults = (part[faults.argsort(kind="stable")] for part in (position, direction, faults))
         clean = int((faults == 0).sum())

@@ -6,7 +6,6 @@ import logging
 import os
 import pathlib
 from collections.abc import Iterable, Sequence
-from typing import Literal
 
 import numpy as np
 import trimesh
@@ -16,20 +15,15 @@ from common.errors import CongraspError
 from common.objects import decompose, shapes, store
 from common.objects.procedural import MASS_RANGE
 from common.objects.resting import rest_poses
+from common.objects.sizes import Unit, metres_per_unit
 from common.objects.sources import MeshFile, Source, find_sources, read_mesh
 from common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
 from common.objects.surface import halves, mass_properties, sample_mesh
 
-Unit = Literal["auto", "m", "cm", "mm", "in"]
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-_UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""
-_PLAUSIBLE = (0.01, 0.6)
-_POSSIBLE = (0.005, 1.0)
-_CACHE_VERSION = 2
+_CACHE_VERSION = 3
 _MAX_FACES = 20_000
-_THINNEST = 2e-4
 _log = logging.getLogger(__name__)
 
 
@@ -38,7 +32,8 @@ class ImportOptions:
     """How meshes become objects; the string under a field is its help on the command line."""
 
     unit: Unit = "auto"
-    """Unit of the files' numbers; auto takes metres if that makes an object of 1 to 60 cm, and asks otherwise."""
+    """Unit of the files' numbers; auto takes metres if that makes an object of 1 to 60 cm, and asks otherwise; guess
+    then takes the unit that fits, if only one does."""
     scale: float = 1.0
     """Factor on the size, after the unit."""
     density: float = 500.0
@@ -70,7 +65,7 @@ def import_source(source: Source, options: ImportOptions) -> tuple[GraspObject, 
     without them is labelled by its two halves, the slimmer one graspable.
 
     Returns:
-      The object, and what the user should know about it (none if it came from the cache).
+      The object, and what the user should know about it.
 
     Raises:
       CongraspError: see `import_paths`.
@@ -80,7 +75,8 @@ def import_source(source: Source, options: ImportOptions) -> tuple[GraspObject, 
     cached = _cache_folder(options) / f"{key}{store.SUFFIX}"
     if cached.is_file():
         try:
-            return store.load(cached), []
+            obj = store.load(cached)
+            return obj, list(obj.notes)
         except CongraspError:
             cached.unlink()
     notes: list[str] = []
@@ -118,7 +114,8 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
     visuals = [read_mesh(file.path) for file in source.visuals] or [
         shapes.triangulate(_corners(file)) for file in source.pieces
     ]
-    factor = _unit_factor(source, _joined(visuals), options)
+    sides = tuple(_joined(visuals).extents.tolist())
+    factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
     meshes = [_scaled(mesh, factor) for mesh in visuals]
     whole = _joined(meshes)
     closed = all(mesh.is_volume for mesh in meshes)
@@ -160,6 +157,8 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
         visual_vertices=np.asarray(picture.vertices, np.float32),
         visual_faces=np.asarray(picture.faces, np.int32),
         origin=tuple((-center).tolist()),
+        file_scale=factor,
+        notes=tuple(notes),
     )
     return dataclasses.replace(obj, rest_poses=rest_poses(obj))
 
@@ -177,47 +176,6 @@ def _reduced(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def _corners(file: MeshFile) -> np.ndarray:
     return np.asarray(read_mesh(file.path).vertices, np.float64)
-
-
-def _unit_factor(source: Source, mesh: trimesh.Trimesh, options: ImportOptions) -> float:
-    """Metres per unit of the files, with the scale; complains about sizes that no hand can grasp."""
-    unit = "m" if options.unit == "auto" else options.unit
-    factor = METRES[unit] * options.scale
-    extent = float(mesh.extents.max())
-    size = extent * factor
-    low, high = _PLAUSIBLE if options.unit == "auto" else _POSSIBLE
-    if not low <= size <= high:
-        fitting = [
-            u for u in ("mm", "cm", "in", "m") if 0.02 <= extent * METRES[u] * options.scale <= 0.4 and u != unit
-        ]
-        remedy = f"Set '--scale {_round(0.1 / (extent * METRES[unit]))}' for an object of 10 cm."
-        if fitting:
-            then = extent * METRES[fitting[0]] * options.scale
-            remedy = (
-                f"If they are {_UNIT_NAMES[fitting[0]]}, add '--unit {fitting[0]}' ({_length(then)}); or set --scale."
-            )
-        raise CongraspError(
-            f"{source.path} is {_length(size)} long if its numbers are {_UNIT_NAMES[unit]}: too "
-            f"{'large' if size > high else 'small'} for a hand.",
-            remedy,
-        )
-    if float(mesh.extents.min()) * factor < _THINNEST:
-        raise CongraspError(
-            f"{source.path} is flat: it is {_length(float(mesh.extents.min()) * factor)} thick.",
-            "Give it a thickness in a modelling program.",
-        )
-    return factor
-
-
-def _round(value: float) -> str:
-    return f"{value:.3g}"
-
-
-def _length(metres: float) -> str:
-    for limit, unit, factor in ((0.01, "mm", 1000.0), (1.0, "cm", 100.0), (1000.0, "m", 1.0)):
-        if metres < limit:
-            return f"{metres * factor:.3g} {unit}"
-    return f"{metres / 1000:.3g} km"
 
 
 def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:

@@ -60,6 +60,10 @@ class GraspObject:
     visual_vertices: np.ndarray
     visual_faces: np.ndarray
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    file_scale: float = 1.0
+    """Metres per unit of that file."""
+    notes: tuple[str, ...] = ()
+    """What its import mended, or what else the user should know."""
 
     @property
     def primitive(self) -> bool:

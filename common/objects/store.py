@@ -122,6 +122,10 @@ def _to_message(obj: GraspObject) -> Message:
     }
     if any(obj.origin):
         meta["origin"] = list(obj.origin)
+    if obj.file_scale != 1.0:
+        meta["file_scale"] = obj.file_scale
+    if obj.notes:
+        meta["notes"] = list(obj.notes)
     return Message(arrays, meta)
 
 
@@ -147,5 +151,7 @@ def _from_message(message: Message) -> GraspObject:
         part_names=tuple(meta["part_names"]),
         mass=meta["mass"],
         origin=tuple(meta.get("origin", (0.0, 0.0, 0.0))),
+        file_scale=meta.get("file_scale", 1.0),
+        notes=tuple(meta.get("notes", ())),
         **{name: arrays[name] for name in _ARRAYS},
     )

@@ -23,6 +23,7 @@ COMMANDS = {
     "learner": "the learner alone; actors connect to it, from this machine or others",
     "actor": "one actor that works for a learner elsewhere",
     "serve": "answer live queries with a run's newest policy or a policy file",
+    "grasp": "a grasp motion for an object of your own, under constraints",
     "evaluate": "measure a policy by the paper's protocol",
     "query": "ask a policy server for one action, or measure its latency",
     "objects": "generate, import, list and show objects",

@@ -1,0 +1,129 @@
+"""`congrasp grasp`: motions for the user's own objects."""
+
+import pathlib
+import sys
+from typing import Annotated
+
+import tyro
+
+from common.errors import CongraspError
+from common.objects.meshes import ImportOptions
+
+NOT_HELD, BAD_INPUT = 1, 2
+
+
+def grasp(
+    objects: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
+    out: pathlib.Path = pathlib.Path("grasps"),
+    heading: str = "",
+    at: str = "",
+    affordance: str = "",
+    avoid: str = "",
+    pose: str = "",
+    trajectory: str = "",
+    video: bool = False,
+    pictures: bool = True,
+    policy: pathlib.Path | None = None,
+    hand: str = "human",
+    tries: int = 32,
+    seed: int = 0,
+    again: bool = False,
+    options: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
+) -> int:
+    """Make grasp motions for objects of your own.
+
+    Every object gets a folder in --out: grasp.npz (arrays that say what they mean), grasp.mcap (Foxglove, Rerun),
+    grasp.png, object.png (before and after its import, beside a hand at true scale) and result.json. Several tries are
+    simulated at once, and the best is kept: first one that holds the object for two seconds without the table, then
+    small errors, a quiet object and gentle forces. Interrupted runs go on where they stopped.
+
+    Args:
+      objects: Meshes (STL, OBJ, PLY, GLB), object files, or folders of them.
+      out: Folder for the results.
+      heading: The way the hand comes, three numbers in the axes of the object's file ("0 0 -1"), or 'above'. Free by
+        default.
+      at: Where the middle of the grasping hand should be, three numbers in metres, in the coordinates of the file.
+      affordance: What to grasp: a mesh of that part in the coordinates of the object's file, or names of its parts.
+      avoid: What not to touch, likewise.
+      pose: Reference pose: a grasp.npz, a constraint set (FILE:NUMBER), or JSON with joints, position, quaternion.
+      trajectory: Wrist path: a grasp.npz, a constraint set, JSON with position and quaternion, or CSV (x y z w x y z).
+      video: Also write grasp.mp4, at half speed, with the constraints drawn.
+      pictures: Write pictures.
+      policy: A policy file; by default the one that comes with the package.
+      hand: Hand whose shipped policy is taken.
+      tries: Grasps that are simulated side by side.
+      seed: Draws what is tried.
+      again: Also grasp anew what is done already.
+      options: How meshes become objects.
+    """
+    import logging
+
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    from common.policy import bundle as bundles
+    from common.policy.shipped import policy_file
+    from services.grasp import Grasper
+    from services.grasp_jobs import SHEET, Result, Settings, find_jobs, run_job, save_summary
+
+    if not objects:
+        raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
+    if tries < 1:
+        raise CongraspError(f"--tries is {tries}.", "It must be at least 1.")
+    logging.getLogger("common.objects.meshes").setLevel(logging.ERROR)  # its notes are in the results
+    console = Console(highlight=False)
+    file = policy_file(policy, hand)
+    loaded = bundles.load(file)
+    jobs, results = find_jobs(objects)
+    constraints = {
+        "heading": heading,
+        "at": at,
+        "affordance": affordance,
+        "avoid": avoid,
+        "pose": pose,
+        "trajectory": trajectory,
+    }
+    identity = (bundles.content_hash(file.read_bytes()), tries, seed)
+    settings = Settings(out, options, constraints, identity, video, pictures, again)
+    grasper = Grasper(loaded, tries=tries, seed=seed)
+
+    def say(result: Result) -> None:
+        results.append(result)
+        if result.error:
+            print(f"congrasp: error: {result.error}", file=sys.stderr)
+            return
+        done = " (done before)" if result.skipped else ""
+        console.print(f"[bold]{escape(result.name)}[/]{done}: {escape(result.line())}", soft_wrap=True)
+        for note in result.facts["notes"]:
+            console.print(f"  {escape(note)}", soft_wrap=True)
+
+    for result in results[:]:
+        results.remove(result)
+        say(result)
+    bars = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*bars, console=Console(stderr=True), transient=True) as bar:
+        whole = bar.add_task("Objects", total=len(jobs), visible=len(jobs) > 1)
+        part = bar.add_task("Starting", total=None)
+        for job in jobs:
+
+            def progress(what: str, done: int, total: int, name: str = job.name) -> None:
+                bar.update(part, description=f"{escape(name)}: {what}", completed=done, total=total if done else None)
+
+            say(run_job(job, grasper, settings, progress))
+            bar.advance(whole)
+    grasper.close()
+    if jobs:
+        save_summary(out, results)
+    held = sum(bool(result.facts.get("success")) for result in results)
+    failed = [result for result in results if result.error]
+    if len(results) > 1:
+        console.print(
+            f"{held} of {len(results)} objects are held; {len(failed)} could not be used. {out / SHEET} shows them."
+        )
+    if len(jobs) > len(failed):
+        console.print(f"Everything is in {escape(str(out))}.", soft_wrap=True)
+    return BAD_INPUT if failed else NOT_HELD if held < len(results) else 0
+
+
+COMMAND = grasp
