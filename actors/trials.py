@@ -104,6 +104,11 @@ class Trials:
         flags = (np.asarray(redirected), np.asarray(aligned))
         return Outcome(env.goal, *flags, dict(zip(METRICS, metrics, strict=True)), trace)
 
+    def renew(self, bundle: PolicyBundle) -> None:
+        """Newer weights of the same policy; nothing is compiled anew."""
+        self._bundle.spec.require(bundle.spec, "that was to take its place")
+        self._bundle = bundle
+
     def close(self) -> None:
         """Ends the physics' threads."""
         if self._physics is not None:

@@ -116,7 +116,7 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         object_faces=arrays["visual_faces"],
         object_file_origin=np.asarray(meta.pop("object_file_origin", (0.0, 0.0, 0.0)), np.float64),
         object_file_scale=np.asarray(meta.pop("object_file_scale", 1.0), np.float64),
-        **_hand_arrays(hand),
+        **hand_arrays(hand),
         surface_points=arrays["surface_points"],
         surface_minus=arrays["surface_minus"].astype(bool),
         heading_position=arrays["goal/heading_position"],
@@ -129,7 +129,8 @@ def motion_of_episode(episode: Message) -> GraspMotion:
     )
 
 
-def _hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
+def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
+    """Joints, links and capsules of a hand, by the names of a motion's arrays."""
     index = {link.name: i for i, link in enumerate(hand.links)}
     capsules = [(i, link, capsule) for i, link in enumerate(hand.links) for capsule in link.capsules]
     ends = [np.subtract([capsule.start, capsule.end], link_origin(link)) for _, link, capsule in capsules]

@@ -32,6 +32,7 @@ COMMANDS = {
     "plot": "draw a run's learning curves and reward terms",
     "export": "a policy as ONNX or StableHLO, a motion as GLB, USD, BVH, ROS 2 or LeRobot",
     "render": "draw the hand, or an episode of a run",
+    "view": "the constraint studio and a window on a training, in the browser",
     "status": "who works on a run, and how it goes",
     "audit": "what became of every rollout of a run",
     "bench": "benchmarks, as ratios against a reference",

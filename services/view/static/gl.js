@@ -1,0 +1,148 @@
+// Draws triangle meshes with WebGL 2: light is worked out at the vertices, so that a processor without a graphics card
+// keeps up too.
+
+import { IDENTITY } from "./math.js";
+
+const VERTEX = `#version 300 es
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+layout(location = 2) in vec3 colour;
+uniform mat4 view, model;
+uniform vec4 tint;
+uniform float lit;
+out vec4 shade;
+void main() {
+  vec3 n = normalize(mat3(model) * normal);
+  float light = 0.50 + 0.16 * n.z + 0.40 * max(dot(n, normalize(vec3(0.35, -0.5, 0.8))), 0.0)
+    + 0.12 * max(dot(n, normalize(vec3(-0.7, 0.5, 0.25))), 0.0);
+  shade = vec4(colour * tint.rgb * mix(1.0, light, lit), tint.a);
+  gl_Position = view * model * vec4(position, 1.0);
+}`;
+
+const FRAGMENT = `#version 300 es
+precision mediump float;
+in vec4 shade;
+out vec4 result;
+void main() { result = shade; }`;
+
+function compile(gl, kind, source) {
+  const shader = gl.createShader(kind);
+  gl.shaderSource(shader, source);
+  gl.compileShader(shader);
+  if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+  return shader;
+}
+
+// Whether WebGL runs on the processor, where every pixel counts.
+function drawnInSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return false;
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software/i.test(name);
+}
+
+export class Renderer {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.software = drawnInSoftware();
+    this.coarse = 1; // share of the pixels, along each side, while something moves
+    this.mean = 0; // ms of a picture
+    const gl = canvas.getContext("webgl2", { antialias: !this.software, alpha: false });
+    if (!gl) throw new Error("This browser offers no WebGL 2. Use a newer one, or allow hardware acceleration.");
+    this.gl = gl;
+    const program = gl.createProgram();
+    gl.attachShader(program, compile(gl, gl.VERTEX_SHADER, VERTEX));
+    gl.attachShader(program, compile(gl, gl.FRAGMENT_SHADER, FRAGMENT));
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+    gl.useProgram(program);
+    this.places = Object.fromEntries(
+      ["view", "model", "tint", "lit"].map((name) => [name, gl.getUniformLocation(program, name)]),
+    );
+    gl.enable(gl.DEPTH_TEST);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+  }
+
+  // A mesh {positions, normals, colours} of three vertices a triangle, or with `indices`, as the card keeps it.
+  mesh({ positions, normals, colours, indices }) {
+    const gl = this.gl;
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    const buffers = [positions, normals, colours].map((data, place) => {
+      const buffer = gl.createBuffer();
+      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+      gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
+      gl.enableVertexAttribArray(place);
+      gl.vertexAttribPointer(place, 3, gl.FLOAT, false, 0, 0);
+      return buffer;
+    });
+    if (indices) {
+      buffers.push(gl.createBuffer());
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers[3]);
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
+    }
+    gl.bindVertexArray(null);
+    return { array, buffers, indexed: Boolean(indices), count: indices ? indices.length : positions.length / 3 };
+  }
+
+  recolour(mesh, colours) {
+    const gl = this.gl;
+    gl.bindBuffer(gl.ARRAY_BUFFER, mesh.buffers[2]);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, colours);
+  }
+
+  release(mesh) {
+    this.gl.deleteVertexArray(mesh.array);
+    for (const buffer of mesh.buffers) this.gl.deleteBuffer(buffer);
+  }
+
+  // Told how long a picture took while something moves: without a graphics card fewer pixels are drawn until it is fast.
+  pace(milliseconds, slowest) {
+    if (!this.software) return;
+    this.mean += 0.1 * (milliseconds - this.mean);
+    if (this.mean > 0.85 * slowest && this.coarse > 0.45) {
+      this.coarse *= 0.9;
+      this.mean = 0.7 * slowest;
+    }
+  }
+
+  // Fits the picture to the space that the page gives it.
+  resize(moving) {
+    const ratio = this.software ? (moving ? this.coarse : 1) : Math.min(window.devicePixelRatio || 1, 2);
+    const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));
+    const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
+    if (this.canvas.width !== width || this.canvas.height !== height) {
+      this.canvas.width = width;
+      this.canvas.height = height;
+    }
+    this.gl.viewport(0, 0, width, height);
+  }
+
+  // Draws things {mesh, model, tint, alpha, lit} with the camera's matrix; those that are seen through come last.
+  draw(view, things, background, moving) {
+    const gl = this.gl;
+    this.resize(moving);
+    gl.clearColor(...background, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.uniformMatrix4fv(this.places.view, false, view);
+    gl.disable(gl.BLEND);
+    gl.depthMask(true);
+    for (const thing of things) if ((thing.alpha ?? 1) === 1) this.#draw(thing);
+    gl.enable(gl.BLEND);
+    gl.depthMask(false);
+    for (const thing of things) if ((thing.alpha ?? 1) < 1) this.#draw(thing);
+    gl.depthMask(true);
+  }
+
+  #draw({ mesh, model = IDENTITY, tint = [1, 1, 1], alpha = 1, lit = 1 }) {
+    const gl = this.gl;
+    gl.uniformMatrix4fv(this.places.model, false, model);
+    gl.uniform4f(this.places.tint, ...tint, alpha);
+    gl.uniform1f(this.places.lit, lit);
+    gl.bindVertexArray(mesh.array);
+    if (mesh.indexed) gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 0);
+    else gl.drawArrays(gl.TRIANGLES, 0, mesh.count);
+  }
+}

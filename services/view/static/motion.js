@@ -1,0 +1,92 @@
+// A recorded motion: the moment at a time, between two steps too.
+
+import { blend, mix, norm } from "./math.js";
+
+const MASKS = ["affordance", "pose_finger", "pose_wrist", "trajectory"];
+
+function rows({ shape, data }) {
+  const width = shape[shape.length - 1];
+  const pick = (i) => Array.from(data.subarray(i * width, (i + 1) * width));
+  if (shape.length === 2) return Array.from({ length: shape[0] }, (_, i) => pick(i));
+  return Array.from({ length: shape[0] }, (_, t) => Array.from({ length: shape[1] }, (_, k) => pick(t * shape[1] + k)));
+}
+
+export class Motion {
+  constructor(id, { arrays, meta }) {
+    this.id = id;
+    this.meta = meta;
+    this.hand = meta.hand;
+    this.dt = meta.control_dt;
+    this.vertices = arrays.visual_vertices.data;
+    this.faces = arrays.visual_faces.data;
+    this.positions = rows(arrays.link_position);
+    this.quaternions = rows(arrays.link_quaternion);
+    this.objects = rows(arrays.object_position);
+    this.turns = rows(arrays.object_quaternion);
+    this.forces = rows(arrays.contact_force);
+    this.table = arrays.table.data;
+    this.steps = this.objects.length;
+    this.center = this.objects[0];
+    const mask = arrays["goal/mask"].data;
+    this.active = MASKS.filter((_, i) => mask[i] > 0);
+    this.goal = {
+      position: Array.from(arrays["goal/heading_position"].data),
+      direction: Array.from(arrays["goal/heading_direction"].data),
+      path: this.active.includes("trajectory") ? rows(arrays["goal/trajectory_position"]) : null,
+    };
+    this.minus = this.active.includes("affordance") ? this.#labels(arrays) : null;
+    this.rewards = {};
+    for (const [name, { data }] of Object.entries(arrays)) if (name.startsWith("reward/")) this.rewards[name.slice(7)] = data;
+    this.lanes = Object.entries(meta.lanes).map(([name, words]) => {
+      const errors = {};
+      for (const key of Object.keys(arrays)) {
+        const [, lane, unit] = key.match(/^lane\/([^/]+)\/(.+)$/) ?? [];
+        if (lane === name && unit !== "met" && unit !== "counts") errors[unit] = arrays[key].data;
+      }
+      return { name, words, errors, met: arrays[`lane/${name}/met`].data, counts: arrays[`lane/${name}/counts`].data };
+    });
+    this.totalForce = this.forces.map((links) => links.reduce((sum, force) => sum + norm(force), 0));
+    this.totalReward = this.forces.map((_, t) => Object.values(this.rewards).reduce((sum, term) => sum + term[t], 0));
+  }
+
+  get duration() {
+    return (this.steps - 1) * this.dt;
+  }
+
+  // Each vertex has the label of the surface point nearest to it.
+  #labels(arrays) {
+    const { data: points } = arrays.surface_points;
+    const { data: minus } = arrays.surface_minus;
+    const labels = new Uint8Array(this.vertices.length / 3);
+    for (let v = 0; v < labels.length; v++) {
+      let nearest = Infinity;
+      for (let p = 0; p < minus.length; p++) {
+        const x = points[3 * p] - this.vertices[3 * v];
+        const y = points[3 * p + 1] - this.vertices[3 * v + 1];
+        const z = points[3 * p + 2] - this.vertices[3 * v + 2];
+        const far = x * x + y * y + z * z;
+        if (far < nearest) [nearest, labels[v]] = [far, minus[p]];
+      }
+    }
+    return labels;
+  }
+
+  step(time) {
+    return Math.min(this.steps - 1, Math.max(0, Math.round(time / this.dt)));
+  }
+
+  at(time) {
+    const exact = Math.min(Math.max(time / this.dt, 0), this.steps - 1);
+    const before = Math.min(Math.floor(exact), this.steps - 1);
+    const after = Math.min(before + 1, this.steps - 1);
+    const share = exact - before;
+    const between = (list, how) => list[before].map((row, i) => how(row, list[after][i], share));
+    return {
+      step: this.step(time),
+      links: { position: between(this.positions, mix), quaternion: between(this.quaternions, blend) },
+      object: { position: mix(this.objects[before], this.objects[after], share), quaternion: blend(this.turns[before], this.turns[after], share) },
+      forces: this.forces[this.step(time)],
+      table: this.table[before] > 0,
+    };
+  }
+}

@@ -1,0 +1,201 @@
+// What is seen: hand, object, constraints and contacts, as things for the renderer.
+
+import { add, cross, dot, norm, pose, rotate, scale, sub, unit, perpendicular, IDENTITY } from "./math.js";
+import * as shapes from "./shapes.js";
+
+const SKIN = [0.72, 0.75, 0.81];
+const OBJECT = [0.95, 0.64, 0.28];
+const MINUS = [0.8, 0.22, 0.22];
+const TOUCHING = [0.13, 0.74, 0.63];
+const HEADING = [0.22, 0.4, 0.86];
+const REDIRECTED = [0.45, 0.62, 0.95];
+const PATH = [0.53, 0.3, 0.75];
+const FORCE = [0.93, 0.26, 0.21];
+const GHOST = [0.22, 0.4, 0.86];
+
+export const ARROW = 0.1; // length of the approach arrow, m
+const FULL = 2; // N at which a link has its full colour
+const LEAST = 0.05; // N from which a force is drawn
+const FORCE_LENGTH = 0.015; // m per newton
+const LONGEST = 0.09; // m
+const TABLE = 0.3; // m
+
+// The matrix that lays a mesh along +z onto a line from a point.
+function along(start, direction, stretch = 1) {
+  const x = perpendicular(direction);
+  const y = cross(direction, x);
+  return [...x, 0, ...y, 0, ...scale(direction, stretch), 0, ...start, 1];
+}
+
+// An object's mesh for drawing, painting and picking.
+export class Body {
+  constructor(renderer, vertices, faces) {
+    this.renderer = renderer;
+    this.vertices = vertices;
+    this.faces = faces;
+    const mesh = shapes.smooth(vertices, faces);
+    this.corners = mesh.positions;
+    this.colours = mesh.colours;
+    this.normals = mesh.normals;
+    this.mesh = renderer.mesh(mesh);
+    this.paint(null);
+    this.radius = 0;
+    for (let i = 0; i < vertices.length; i += 3) this.radius = Math.max(this.radius, Math.hypot(vertices[i], vertices[i + 1], vertices[i + 2]));
+  }
+
+  // Colours by a label for each vertex; all alike without labels.
+  paint(minus) {
+    for (let corner = 0; corner < this.faces.length; corner++) this.colours.set(minus && minus[this.faces[corner]] ? MINUS : OBJECT, 3 * corner);
+    this.renderer.recolour(this.mesh, this.colours);
+  }
+
+  // Colours what a brush at a point of the object frame touches, until the server's answer is there.
+  brush(point, radius, minus) {
+    const colour = minus ? MINUS : OBJECT;
+    for (let i = 0; i < this.corners.length; i += 3) {
+      const [x, y, z] = [this.corners[i] - point[0], this.corners[i + 1] - point[1], this.corners[i + 2] - point[2]];
+      if (x * x + y * y + z * z <= radius * radius) this.colours.set(colour, i);
+    }
+    this.renderer.recolour(this.mesh, this.colours);
+  }
+
+  // Where a ray of the object frame meets the surface first: {point, normal}, or null.
+  hit(origin, direction) {
+    let nearest = Infinity;
+    let normal = null;
+    const c = this.corners;
+    for (let i = 0; i < c.length; i += 9) {
+      const e1x = c[i + 3] - c[i], e1y = c[i + 4] - c[i + 1], e1z = c[i + 5] - c[i + 2];
+      const e2x = c[i + 6] - c[i], e2y = c[i + 7] - c[i + 1], e2z = c[i + 8] - c[i + 2];
+      const px = direction[1] * e2z - direction[2] * e2y;
+      const py = direction[2] * e2x - direction[0] * e2z;
+      const pz = direction[0] * e2y - direction[1] * e2x;
+      const determinant = e1x * px + e1y * py + e1z * pz;
+      if (Math.abs(determinant) < 1e-14) continue;
+      const tx = origin[0] - c[i], ty = origin[1] - c[i + 1], tz = origin[2] - c[i + 2];
+      const u = (tx * px + ty * py + tz * pz) / determinant;
+      if (u < 0 || u > 1) continue;
+      const qx = ty * e1z - tz * e1y, qy = tz * e1x - tx * e1z, qz = tx * e1y - ty * e1x;
+      const v = (direction[0] * qx + direction[1] * qy + direction[2] * qz) / determinant;
+      if (v < 0 || u + v > 1) continue;
+      const far = (e2x * qx + e2y * qy + e2z * qz) / determinant;
+      if (far > 1e-6 && far < nearest) {
+        nearest = far;
+        normal = unit([e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, e1x * e2y - e1y * e2x]);
+      }
+    }
+    if (!normal) return null;
+    return { point: add(origin, scale(direction, nearest)), normal: dot(normal, direction) > 0 ? scale(normal, -1) : normal };
+  }
+
+  release() {
+    this.renderer.release(this.mesh);
+  }
+}
+
+export class Scene {
+  constructor(renderer) {
+    this.renderer = renderer;
+    this.hands = new Map(); // link meshes by hand
+    this.body = null;
+    this.table = renderer.mesh(shapes.table(TABLE));
+    this.shaft = renderer.mesh(shapes.arrow(ARROW, 0.0028));
+    this.force = renderer.mesh(shapes.arrow(1, 0.03));
+    this.ball = renderer.mesh(shapes.capsules([{ start: [0, 0, 0], end: [0, 0, 0], radius: 0.006 }]));
+    this.beads = null;
+    this.drawnPath = "";
+  }
+
+  setHand(name, { arrays, meta }) {
+    const lists = meta.links.map(() => []);
+    const { data: links } = arrays.capsule_link;
+    const { data: ends } = arrays.capsule_ends;
+    links.forEach((link, i) => lists[link].push({ start: [...ends.slice(6 * i, 6 * i + 3)], end: [...ends.slice(6 * i + 3, 6 * i + 6)], radius: arrays.capsule_radius.data[i] }));
+    this.hands.set(name, lists.map((list) => this.renderer.mesh(shapes.capsules(list))));
+  }
+
+  setObject(vertices, faces) {
+    this.body?.release();
+    this.body = new Body(this.renderer, vertices, faces);
+  }
+
+  #links(hand, poses, style) {
+    const meshes = this.hands.get(hand) ?? [];
+    return meshes.map((mesh, i) => ({ mesh, model: pose(poses.position[i], poses.quaternion[i]), tint: SKIN, ...style(i) }));
+  }
+
+  #arrow(tip, direction, tint, alpha) {
+    return { mesh: this.shaft, model: along(sub(tip, scale(direction, ARROW)), direction), tint, alpha };
+  }
+
+  #path(points, place, alpha) {
+    const key = JSON.stringify(points);
+    if (key !== this.drawnPath) {
+      if (this.beads) this.renderer.release(this.beads);
+      this.beads = this.renderer.mesh(shapes.beads(points, 0.0035));
+      this.drawnPath = key;
+    }
+    return { mesh: this.beads, model: pose(place.position, place.quaternion), tint: PATH, alpha };
+  }
+
+  #table(center) {
+    return { mesh: this.table, model: [...IDENTITY.slice(0, 12), center[0], center[1], 0, 1], lit: 0 };
+  }
+
+  // Things while constraints are edited. `arrow`: {tip, direction} in the world.
+  editing(state, arrow, handles) {
+    const place = state.rest;
+    const things = [this.#table(place.position)];
+    if (this.body) things.push({ mesh: this.body.mesh, model: pose(place.position, place.quaternion) });
+    things.push(...this.#links(state.hand, state.start, () => ({})));
+    things.push(this.#arrow(arrow.tip, arrow.direction, HEADING, 1));
+    for (const [name, point] of Object.entries(handles.points))
+      things.push({ mesh: this.ball, model: [...IDENTITY.slice(0, 12), ...point, 1], tint: name === handles.hover ? [1, 0.8, 0.2] : HEADING, lit: 0.5 });
+    if (state.active.redirected) {
+      const direction = rotate(place.quaternion, state.active.direction);
+      things.push(this.#arrow(add(place.position, rotate(place.quaternion, state.active.position)), direction, REDIRECTED, 0.55));
+    }
+    if (state.path && state.asked.includes("trajectory")) things.push(this.#path(state.path, place, 1));
+    if (state.pose && state.asked.includes("pose")) {
+      const turned = {
+        position: state.pose.position.map((p) => add(place.position, rotate(place.quaternion, p))),
+        quaternion: state.pose.quaternion.map((q) => product(place.quaternion, q)),
+      };
+      things.push(...this.#links(state.hand, turned, () => ({ tint: GHOST, alpha: 0.28 })));
+    }
+    return things;
+  }
+
+  // Things of a moment of a motion; see `Motion.at`.
+  playing(motion, body, moment) {
+    const place = moment.object;
+    const things = [];
+    if (moment.table) things.push(this.#table(motion.center));
+    things.push({ mesh: body.mesh, model: pose(place.position, place.quaternion) });
+    const share = moment.forces.map((force) => Math.min(norm(force) / FULL, 1));
+    things.push(...this.#links(motion.hand, moment.links, (i) => {
+      const touch = share[i] * FULL > LEAST ? 0.45 + 0.55 * share[i] : 0;
+      return { tint: SKIN.map((c, k) => c + (TOUCHING[k] - c) * touch) };
+    }));
+    moment.forces.forEach((force, i) => {
+      const strength = norm(force);
+      if (strength > LEAST) things.push({ mesh: this.force, model: along(moment.links.position[i], scale(force, 1 / strength), Math.min(FORCE_LENGTH * strength, LONGEST)).map((x, k) => (k < 8 ? 0.09 * x : x)), tint: FORCE });
+    });
+    const { goal } = motion;
+    const direction = rotate(place.quaternion, goal.direction);
+    const target = add(place.position, rotate(place.quaternion, goal.position));
+    things.push(this.#arrow(target, direction, HEADING, 0.6));
+    if (goal.path) things.push(this.#path(goal.path, place, 0.7));
+    return things;
+  }
+}
+
+function product(a, b) {
+  return [
+    a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+    a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+    a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+    a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+  ];
+}
+

@@ -1,0 +1,187 @@
+// The studio's panel: what is asked for, what the rules make of it, and the motions that came of it.
+
+import { ask, download, tell, upload } from "./wire.js";
+
+const $ = (id) => document.getElementById(id);
+const MASK_NAMES = { affordance: "affordance", pose_finger: "pose: fingers", pose_wrist: "pose: wrist", trajectory: "trajectory" };
+const POLL = 200; // ms between two looks at a job
+
+function fill(select, names, chosen) {
+  if ([...select.options].map((o) => o.value).join("\n") !== names.map(([value]) => value).join("\n"))
+    select.replaceChildren(...names.map(([value, text]) => new Option(text, value)));
+  select.value = chosen;
+}
+
+export class StudioPanel {
+  // `app` has: takeState(state), play(id), canvas.
+  constructor(app) {
+    this.app = app;
+    this.queue = Promise.resolve(true);
+    $("hand").addEventListener("change", () => this.act("hand", { name: $("hand").value }));
+    $("object").addEventListener("change", () => this.act("object", { name: $("object").value }));
+    $("rest").addEventListener("change", () => this.act("lay", { rest: Number($("rest").value) }));
+    $("file").addEventListener("change", () => {
+      if ($("file").files.length) this.take($("file").files[0]);
+      $("file").value = "";
+    });
+    for (const box of document.querySelectorAll("[data-ask]")) box.addEventListener("change", () => this.act("ask", { constraint: box.dataset.ask, on: box.checked }));
+    for (const button of document.querySelectorAll("[data-suggest]"))
+      button.addEventListener("click", async () => {
+        const constraint = button.dataset.suggest;
+        if ((await this.act("suggest", { constraint })) && constraint !== "heading") this.act("ask", { constraint, on: true });
+      });
+    $("all-plus").addEventListener("click", () => this.act("fill", { minus: false }));
+    $("close-hand").addEventListener("click", async () => {
+      if (await this.act("close_hand", {})) this.act("ask", { constraint: "pose", on: true });
+    });
+    $("roll").addEventListener("input", () => {
+      const angle = (($("roll").value - (this.rolled ?? 0)) * Math.PI) / 180;
+      this.rolled = Number($("roll").value);
+      this.act("roll", { angle });
+    });
+    $("grasp").addEventListener("click", () => this.act("grasp", {}));
+    this.#drops();
+  }
+
+  // Asks the server to do something, one thing after another; false if it would not.
+  act(action, values) {
+    this.queue = this.queue.then(async () => {
+      this.busy(true);
+      try {
+        this.show(await tell("/api/do", { action, ...values }));
+        this.error("");
+        return true;
+      } catch (error) {
+        this.error(error.message);
+        this.show(await ask("/api/state").catch(() => this.state));
+        return false;
+      } finally {
+        this.busy(false);
+      }
+    });
+    return this.queue;
+  }
+
+  busy(on) {
+    document.body.style.cursor = on ? "progress" : "";
+  }
+
+  error(text) {
+    $("error").textContent = text;
+  }
+
+  async take(file) {
+    try {
+      await upload("/api/upload", file);
+      this.error("");
+      this.show(await ask("/api/state"));
+    } catch (error) {
+      this.error(error.message);
+    }
+  }
+
+  show(state) {
+    const { studio } = state;
+    this.state = state;
+    fill($("hand"), state.hands.map((name) => [name, name]), studio.hand);
+    fill($("object"), state.objects.map((name) => [name, name]), state.chosen);
+    const rests = Array.from({ length: studio.object.rests }, (_, i) => [String(i), i ? `resting pose ${i + 1}` : "as it lies best"]);
+    fill($("rest"), rests, String(studio.rest.index));
+    const { size_cm: size, mass_g: mass, faces } = studio.object;
+    $("facts").textContent = [`${size.join(" × ")} cm, ${mass} g, ${faces} faces`, ...state.notes].join(". ");
+    $("policy").textContent = `${state.policy.source}, version ${state.policy.version}`;
+    for (const box of document.querySelectorAll("[data-ask]")) box.checked = studio.asked.includes(box.dataset.ask);
+    $("share").textContent = studio.minus ? `${Math.round(100 * studio.minus)} % painted` : "nothing painted";
+    $("masks").replaceChildren(...Object.entries({ heading: true, ...studio.active.masks }).map(([name, on]) => {
+      const mask = document.createElement("span");
+      mask.className = "mask";
+      mask.dataset.mask = name;
+      mask.dataset.on = on;
+      mask.textContent = `${MASK_NAMES[name] ?? name} ${on ? "on" : "off"}`;
+      return mask;
+    }));
+    $("words").replaceChildren(...studio.words.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+    $("trouble").textContent = studio.trouble;
+    this.#job(state.job);
+    $("grasp").disabled = Boolean(studio.trouble) || state.job.running;
+    this.#motions(state.motions);
+    this.app.takeState(state);
+  }
+
+  #job(job) {
+    $("job").hidden = !job.running;
+    $("share-done").value = job.share;
+    $("doing").textContent = job.text;
+    if (job.running && !this.watching) {
+      this.watching = true;
+      this.#watch(job.number, this.state.motions[0]?.id);
+    }
+  }
+
+  async #watch(number, newest) {
+    let job;
+    do {
+      await new Promise((resolve) => setTimeout(resolve, POLL));
+      job = await ask("/api/job").catch(() => null);
+      if (job) this.#job(job);
+    } while (!job || (job.number === number && job.running));
+    this.watching = false;
+    const state = await ask("/api/state").catch(() => null);
+    if (!state) return;
+    this.show(state);
+    this.error(job.error);
+    if (state.motions.length && state.motions[0].id !== newest) this.app.play(state.motions[0].id);
+  }
+
+  #motions(motions) {
+    $("motions-title").hidden = !motions.length;
+    $("motions").replaceChildren(...motions.map((motion) => {
+      const item = document.createElement("li");
+      const name = document.createElement("button");
+      name.className = "name";
+      name.textContent = `${motion.id}. ${motion.object}: ${motion.held ? "held" : motion.success ? "held a moment" : "not held"}`;
+      name.title = motion.note;
+      name.classList.add(motion.held ? "good" : "bad");
+      name.addEventListener("click", () => this.app.play(motion.id));
+      const save = document.createElement("select");
+      save.title = "save this motion";
+      save.append(new Option("save as …", ""), ...this.state.exports.map((kind) => new Option(kind, kind)));
+      save.addEventListener("change", () => {
+        this.#save(motion.id, save.value);
+        save.value = "";
+      });
+      item.append(name, save);
+      return item;
+    }));
+  }
+
+  async #save(id, kind) {
+    this.error("");
+    try {
+      await download("/api/export", { id, kind });
+    } catch (error) {
+      this.error(error.message);
+    }
+  }
+
+  #drops() {
+    const drop = $("drop");
+    let inside = 0;
+    addEventListener("dragenter", (event) => {
+      event.preventDefault();
+      inside++;
+      drop.hidden = false;
+    });
+    addEventListener("dragleave", () => {
+      inside--;
+      drop.hidden = inside > 0 ? drop.hidden : true;
+    });
+    addEventListener("dragover", (event) => event.preventDefault());
+    addEventListener("drop", (event) => {
+      event.preventDefault();
+      inside = 0;
+      drop.hidden = true;
+      if (event.dataTransfer.files.length) this.take(event.dataTransfer.files[0]);
+    });
+  }
+}

@@ -1,0 +1,234 @@
+// The window on a training: how it goes, its curves, its actors, and the episodes of a moment.
+
+import { ask } from "./wire.js";
+
+const $ = (id) => document.getElementById(id);
+const EVERY = 1000; // ms
+const COLOURS = ["#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a"];
+
+const short = (x) => (x === null || x === undefined ? "" : Math.abs(x) >= 1000 ? x.toLocaleString("en", { maximumFractionDigits: 0 }) : Number(x.toPrecision(3)).toString());
+
+function row(cells, kind = "td") {
+  const line = document.createElement("tr");
+  line.append(...cells.map((text) => Object.assign(document.createElement(kind), { textContent: text })));
+  return line;
+}
+
+export class TrainingPanel {
+  // `app` has: play(id), recordings (bool).
+  constructor(app) {
+    this.app = app;
+    this.chosen = [];
+    this.watched = ""; // the actor whose newest episode is played
+    this.seen = -1;
+    $("more-curves").addEventListener("change", () => {
+      if ($("more-curves").value) this.chosen.push($("more-curves").value);
+      $("more-curves").value = "";
+      this.look();
+    });
+    $("filter").addEventListener("input", () => this.view && this.#actors(this.view.actors));
+    $("actors").addEventListener("click", (event) => {
+      const line = event.target.closest("[data-actor]");
+      if (!line) return;
+      this.watched = line.dataset.actor;
+      this.seen = -1;
+      this.look();
+    });
+  }
+
+  open(on) {
+    clearInterval(this.timer);
+    if (!on) return;
+    this.look();
+    this.timer = setInterval(() => this.look(), EVERY);
+  }
+
+  async look() {
+    if (this.looking) return;
+    this.looking = true;
+    try {
+      this.view = await ask("/api/training", { names: this.chosen.join(",") });
+      $("run-trouble").textContent = this.view.away && this.view.version !== null ? "The learner is away." : this.view.warnings.join(" ");
+      this.#show();
+    } catch (error) {
+      $("run-trouble").textContent = error.message;
+    } finally {
+      this.looking = false;
+    }
+  }
+
+  #show() {
+    const { view } = this;
+    if (!this.chosen.length) this.chosen = Object.keys(view.curves);
+    const tiles = {
+      run: view.run,
+      version: view.version ?? "–",
+      actors: view.actors.filter((actor) => actor.alive).length,
+      "steps/s": short(view.rates.steps_per_second),
+      "rollouts/s": short(view.rates.rollouts_per_second),
+      "largest lag": Math.max(0, ...view.actors.map((actor) => actor.lag ?? 0)),
+      queue: view.queue ? `${view.queue.length} of ${view.queue.limit}` : "–",
+    };
+    $("tiles").replaceChildren(...Object.entries(tiles).map(([name, value]) => {
+      const tile = document.createElement("div");
+      tile.dataset.tile = name;
+      tile.innerHTML = "<span class='quiet'></span><b></b>";
+      tile.firstChild.textContent = name;
+      tile.lastChild.textContent = value;
+      return tile;
+    }));
+    this.#curves();
+    $("bars").replaceChildren(...Object.entries(view.constraints).map(([name, share]) => {
+      const bar = document.createElement("div");
+      bar.className = "bar";
+      bar.dataset.constraint = name;
+      bar.innerHTML = "<span></span><i><b></b></i><span></span>";
+      bar.firstChild.textContent = name;
+      bar.querySelector("b").style.width = `${100 * share}%`;
+      bar.lastChild.textContent = `${(100 * share).toFixed(1)} %`;
+      return bar;
+    }));
+    this.#actors(view.actors);
+    $("ledger").replaceChildren(...Object.entries(view.ledger).map(([name, value]) => row([name, String(value)])));
+    $("events").replaceChildren(...view.events.map(({ time, level, text }) => {
+      const item = document.createElement("li");
+      item.textContent = `${new Date(1000 * time).toLocaleTimeString()} ${text}`;
+      item.classList.toggle("bad", level === "error" || level === "fatal");
+      return item;
+    }));
+  }
+
+  #actors(actors) {
+    const wanted = $("filter").value.trim().toLowerCase();
+    const shown = actors.filter((actor) => actor.id.toLowerCase().includes(wanted));
+    const head = row(["actor", "version", "lag", "rollouts", "steps/s", "episodes", "success", "object"], "th");
+    $("actors").replaceChildren(head, ...shown.map((actor) => {
+      const success = actor.success === undefined ? "" : `${Math.round(100 * actor.success)} %`;
+      const line = row([actor.id, short(actor.version), short(actor.lag), short(actor.rollouts), short(actor.steps_per_second), String(actor.episodes), success, actor.object ?? ""]);
+      line.dataset.actor = actor.id;
+      line.setAttribute("aria-selected", String(actor.id === this.watched));
+      if (!actor.alive) line.className = "quiet";
+      return line;
+    }));
+    const watched = actors.find((actor) => actor.id === this.watched);
+    if (watched && watched.episodes !== this.seen && watched.episodes) {
+      this.seen = watched.episodes;
+      this.app.play(`actor:${watched.id}`);
+    }
+  }
+
+  #curves() {
+    const { view } = this;
+    const names = view.names.filter((name) => !this.chosen.includes(name));
+    if ($("more-curves").options.length !== names.length + 1) $("more-curves").replaceChildren(new Option("add …", ""), ...names.map((name) => new Option(name, name)));
+    const places = $("curves");
+    const known = new Map([...places.children].map((figure) => [figure.dataset.curve, figure]));
+    const figures = Object.keys(view.curves).map((name) => known.get(name) ?? this.#figure(name));
+    if (figures.some((figure, i) => places.children[i] !== figure) || places.children.length !== figures.length) places.replaceChildren(...figures);
+    figures.forEach((figure, i) => this.#draw(figure, view.curves[figure.dataset.curve], COLOURS[i % COLOURS.length]));
+  }
+
+  #figure(name) {
+    const figure = document.createElement("figure");
+    figure.dataset.curve = name;
+    figure.innerHTML = "<figcaption><span></span><span class='quiet'></span><button title='hide'>×</button></figcaption><canvas></canvas>";
+    figure.querySelector("span").textContent = name;
+    figure.querySelector("button").addEventListener("click", () => {
+      this.chosen = this.chosen.filter((other) => other !== name);
+      this.look();
+    });
+    const canvas = figure.querySelector("canvas");
+    canvas.addEventListener("mousemove", (event) => this.#point(figure, event));
+    canvas.addEventListener("mouseleave", () => {
+      figure.near = null;
+      this.#draw(figure, this.view.curves[name]);
+    });
+    canvas.addEventListener("click", (event) => {
+      this.#point(figure, event);
+      if (figure.near !== null) this.#moment(name, figure.near);
+    });
+    return figure;
+  }
+
+  // The point of the curve that is nearest to the mouse.
+  #point(figure, event) {
+    const curve = this.view.curves[figure.dataset.curve];
+    const box = event.target.getBoundingClientRect();
+    const share = (event.clientX - box.left) / box.width;
+    const [first, last] = [curve.steps[0], curve.steps[curve.steps.length - 1]];
+    const wanted = first + share * (last - first);
+    figure.near = curve.steps.reduce((best, step, i) => (Math.abs(step - wanted) < Math.abs(curve.steps[best] - wanted) ? i : best), 0);
+    this.#draw(figure, curve);
+  }
+
+  #draw(figure, curve, colour = figure.colour) {
+    figure.colour = colour;
+    const canvas = figure.querySelector("canvas");
+    const ratio = window.devicePixelRatio || 1;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    canvas.width = width * ratio;
+    canvas.height = height * ratio;
+    const g = canvas.getContext("2d");
+    g.scale(ratio, ratio);
+    const { steps, values } = curve;
+    if (!steps.length) return;
+    const low = Math.min(...values, values[0] >= 0 ? 0 : Infinity);
+    const high = Math.max(...values, low + 1e-9);
+    const x = (i) => (steps.length < 2 ? 0 : ((steps[i] - steps[0]) / (steps[steps.length - 1] - steps[0])) * width);
+    const y = (i) => height - 14 - ((values[i] - low) / (high - low)) * (height - 22);
+    g.strokeStyle = "#e3e6ea";
+    g.beginPath();
+    for (const part of [0, 0.5, 1]) {
+      g.moveTo(0, 8 + part * (height - 22));
+      g.lineTo(width, 8 + part * (height - 22));
+    }
+    g.stroke();
+    g.fillStyle = "#667080";
+    g.font = "10px system-ui, sans-serif";
+    g.fillText(short(high), 2, 8 - 0 + 2);
+    g.fillText(short(low), 2, height - 16);
+    g.fillText(`update ${short(steps[0])}`, 2, height - 2);
+    g.textAlign = "right";
+    g.fillText(short(steps[steps.length - 1]), width - 2, height - 2);
+    g.textAlign = "left";
+    g.strokeStyle = colour;
+    g.lineWidth = 1.5;
+    g.beginPath();
+    values.forEach((_, i) => g.lineTo(x(i), y(i)));
+    g.stroke();
+    const near = figure.near ?? null;
+    const shown = near !== null && near < values.length ? near : values.length - 1;
+    figure.querySelector(".quiet").textContent = near === null ? short(values[shown]) : `update ${short(steps[shown])}: ${short(values[shown])}`;
+    g.fillStyle = colour;
+    g.beginPath();
+    g.arc(x(shown), y(shown), 3, 0, 7);
+    g.fill();
+  }
+
+  async #moment(name, index) {
+    const curve = this.view.curves[name];
+    const gaps = curve.times.slice(1).map((time, i) => time - curve.times[i]).sort((a, b) => a - b);
+    const seconds = Math.min(600, Math.max(2, 1.5 * (gaps[gaps.length >> 1] ?? 2)));
+    const found = $("found");
+    found.hidden = false;
+    found.textContent = "Searching the recordings …";
+    try {
+      const episodes = await ask("/api/moment", { time: curve.times[index], seconds });
+      const title = document.createElement("p");
+      title.textContent = `${episodes.length} episodes within ${short(seconds)} s of update ${short(curve.steps[index])}, ${episodes.filter((e) => e.success).length} succeeded`;
+      found.replaceChildren(title, ...episodes.map((episode) => {
+        const button = document.createElement("button");
+        button.dataset.episode = episode.id;
+        button.className = episode.success ? "good" : "bad";
+        button.textContent = `${new Date(1000 * episode.time).toLocaleTimeString()}  ${episode.actor}  ${episode.object}  version ${episode.version}  ${episode.success ? "success" : "no success"}`;
+        button.addEventListener("click", () => {
+          this.watched = "";
+          this.app.play(`record:${episode.id}`);
+        });
+        return button;
+      }));
+    } catch (error) {
+      found.textContent = error.message;
+    }
+  }
+}

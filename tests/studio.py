@@ -1,0 +1,123 @@
+"""A studio without a policy, and a run that nobody trains, for tests of what is around them."""
+
+import functools
+import pathlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+from common.config import TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.logs.channels import JsonChannels
+from common.logs.scene import episode_entries
+from common.logs.writer import LogWriter
+from common.objects import procedural
+from common.objects.spec import GraspObject
+from common.transport.keys import Keys
+from common.wire.codec import Message
+from services.view.jobs import Progress
+from services.view.session import Catalogue, Session
+from services.view.state import Asked
+from services.view.training import TrainingWindow
+from tests.episodes import episode
+
+STEPS, REMOVAL = 60, 40
+DIP = 30
+"""The update at which the made-up curve dips."""
+BEGIN = 1_700_000_000.0
+"""Time of the made-up run's first update, s."""
+
+
+class MadeUpGrasping:
+    """Answers every request with the made-up episode, after saying how far it is."""
+
+    def __init__(self) -> None:
+        self.hand, self.task = get_hand("human"), TaskConfig()
+        self.asked: list[Asked] = []
+        self.fails = ""
+
+    def newest(self) -> dict[str, Any]:
+        return {"source": "made up", "version": 7, "trouble": ""}
+
+    def grasp(self, asked: Asked, progress: Progress) -> Message:
+        self.asked.append(asked)
+        progress("grasping", 0.5)
+        if self.fails:
+            raise RuntimeError(self.fails)
+        found = episode(STEPS, removal=REMOVAL, mask=tuple(int(name in asked.constraints) for name in
+                        ("affordance", "pose", "pose", "trajectory")))  # fmt: skip
+        return Message(found.arrays, {**found.meta, "metrics": {**found.meta["metrics"], "held": 1.0}, "note": ""})
+
+
+def objects() -> Catalogue:
+    makers: dict[str, Callable[[], GraspObject]] = {
+        "mug": lambda: procedural.generate(1, "mug"),
+        "box": lambda: procedural.generate(1, "box"),
+    }
+    return Catalogue(makers)
+
+
+@functools.cache
+def _short() -> Message:
+    return episode(6, removal=4)
+
+
+def actor_episode(number: int, success: bool = True) -> Message:
+    """A short one; which actor's it is says its object."""
+    meta = {**_short().meta, "actor": f"a{number:03d}", "object": f"thing-{number}", "success": success}
+    return Message(_short().arrays, meta)
+
+
+def status(actors: int, version: int = 12) -> dict[str, Any]:
+    """What the learner of a run with many actors says."""
+    roles = [
+        {"role": "actor", "id": f"a{n:03d}", "incarnation": "i", "version": version - n % 3, "lag": n % 3,
+         "rollouts": 5 * n, "rollouts_per_second": 0.5, "steps_per_second": 1000.0 + n}
+        for n in range(actors)
+    ]  # fmt: skip
+    ledger = {"granted": 3, "running": 1, "redeemed": 2, "returned": 0, "expired": 0}
+    return {
+        "run": "made-up", "version": version, "epoch": "e", "finished": False, "roles": roles, "warnings": [],
+        "rates": {"rollouts_per_second": 50.0, "steps_per_second": 123456.0},
+        "queue": {"length": 1, "limit": 4}, "ledger": ledger,
+    }  # fmt: skip
+
+
+def metrics(update: int) -> Message:
+    """A learner's figures; its success dips at `DIP`."""
+    success = 0.1 if update == DIP else min(0.95, 0.02 * update)
+    values = {"episode/success": success, "episode/return": 3.0 * update, "staleness_mean": 0.5,
+              "steps_per_second": 1e5, "success/heading": success, "success/pose": 0.5}  # fmt: skip
+    return Message({}, {"time": BEGIN + 10.0 * update, "update": update, "version": update, "values": values})
+
+
+def window(actors: int = 100, updates: int = 60) -> TrainingWindow:
+    """What is known of a run with many actors after some updates."""
+    made, keys, now = TrainingWindow("made-up"), Keys("made-up"), time.time()
+    for update in range(updates):
+        made.take(keys.log("metrics", "learner", "0"), metrics(update), now)
+    made.take_status(status(actors), now)
+    for number in range(actors):
+        made.take(keys.log("episode", "actor", f"a{number:03d}"), actor_episode(number, number % 4 > 0), now)
+    return made
+
+
+def record(folder: pathlib.Path, moments: list[tuple[float, int]]) -> None:
+    """Recordings of episodes: times (s since 1970) and numbers of actors."""
+    writer, channels = LogWriter(folder, "log", run="made-up"), JsonChannels()
+    for when, number in moments:
+        writer.write(*episode_entries(f"a{number:03d}", actor_episode(number), int(1e9 * when), 0, channels))
+    writer.close()
+
+
+def take_mesh(path: pathlib.Path) -> tuple[GraspObject, list[str]]:
+    """Whatever the file holds, it is a bottle."""
+    if path.suffix != ".stl":
+        raise CongraspError(f"{path} is not an STL file.", "Convert it.")
+    return procedural.generate(5, "bottle"), ["It was a bit small"]
+
+
+def session(grasping: MadeUpGrasping | None = None, **more: Any) -> Session:
+    made = grasping or MadeUpGrasping()
+    return Session({"human": lambda: made}, objects(), take_mesh, **more)
