@@ -18,6 +18,7 @@ quickstart: install
 	$(VENV)/bin/congrasp train --preset quickstart
 
 test: install
+	@tests/install_browser.sh $(VENV)/bin/python
 	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 2 --dist loadfile -m "not gpu" --cov --cov-report=term $(ARGS)
 
 lint: install

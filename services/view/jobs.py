@@ -20,10 +20,10 @@ class Jobs:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="studio")
         self._lock = threading.Lock()
         self._number = 0
-        self._state: dict[str, Any] = {"number": 0, "running": False, "text": "", "share": 0.0, "error": ""}
+        self._state: dict[str, Any] = _state(0, running=False)
 
-    def start(self, text: str, work: Callable[[Progress], None]) -> dict[str, Any]:
-        """Begins a job; returns its state.
+    def start(self, text: str, work: Callable[[Progress], str | None]) -> dict[str, Any]:
+        """Begins a job, which may return the name of what it made; returns its state.
 
         Raises:
           CongraspError: another one is still running.
@@ -32,12 +32,12 @@ class Jobs:
             if self._state["running"]:
                 raise CongraspError(f"Please wait: {self._state['text']}.")
             self._number += 1
-            self._state = {"number": self._number, "running": True, "text": text, "share": 0.0, "error": ""}
+            self._state = _state(self._number, text=text)
             self._pool.submit(self._run, work)
             return dict(self._state)
 
     def state(self) -> dict[str, Any]:
-        """The present job, or the last one: number, running, text, share and error."""
+        """The present job, or the last one: number, running, text, share, error, and what it made."""
         with self._lock:
             return dict(self._state)
 
@@ -45,18 +45,22 @@ class Jobs:
         """Takes no more jobs, and waits for none."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def _run(self, work: Callable[[Progress], None]) -> None:
-        error = ""
+    def _run(self, work: Callable[[Progress], str | None]) -> None:
+        error, made = "", None
         try:
-            work(self._progress)
+            made = work(self._progress)
         except CongraspError as found:
             error = str(found)
         except Exception as found:  # whatever goes wrong in a job, the page is told and the studio goes on
             error = f"This went wrong and is a fault of congrasp: {type(found).__name__}: {found}."
             say("error", error)
         with self._lock:
-            self._state |= {"running": False, "share": 1.0, "error": error}
+            self._state |= {"running": False, "share": 1.0, "error": error, "made": made}
 
     def _progress(self, text: str, share: float) -> None:
         with self._lock:
             self._state |= {"text": text, "share": min(1.0, max(0.0, share))}
+
+
+def _state(number: int, *, running: bool = True, text: str = "") -> dict[str, Any]:
+    return {"number": number, "running": running, "text": text, "share": 0.0, "error": "", "made": None}

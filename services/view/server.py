@@ -171,7 +171,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         try:
             found = work()
         except (CongraspError, TransportError) as error:
-            self._send(400, "application/json", json.dumps({"error": str(error)}).encode())
+            self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
             return
         except Exception as error:  # whatever a page asks for, the server goes on
             say("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")

@@ -282,13 +282,14 @@ class Session:
         asked = self._studio.request
         grasping = self._grasping
 
-        def work(progress: Progress) -> None:
+        def work(progress: Progress) -> str:
             episode = grasping.grasp(asked, progress)
             with self._lock:
                 self._number += 1
                 self._motions[str(self._number)] = episode
                 while len(self._motions) > MOTIONS:
                     del self._motions[next(iter(self._motions))]
+                return str(self._number)
 
         self._jobs.start("grasping", work)
 

@@ -292,7 +292,7 @@ class Studio:
                 "masks": bits,
                 "position": goal.heading_position.tolist(),
                 "direction": goal.heading_direction.tolist(),
-                "redirected": bool(resolution.redirected),
+                "overruled": bool(resolution.redirected) or not self.asked.isdisjoint(("pose", "trajectory")),
             },
             "words": self.words,
             "trouble": self.trouble,

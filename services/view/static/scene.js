@@ -8,7 +8,7 @@ const OBJECT = [0.95, 0.64, 0.28];
 const MINUS = [0.8, 0.22, 0.22];
 const TOUCHING = [0.13, 0.74, 0.63];
 const HEADING = [0.22, 0.4, 0.86];
-const REDIRECTED = [0.45, 0.62, 0.95];
+const COUNTS = [0.1, 0.62, 0.85];
 const PATH = [0.53, 0.3, 0.75];
 const FORCE = [0.93, 0.26, 0.21];
 const GHOST = [0.22, 0.4, 0.86];
@@ -148,13 +148,12 @@ export class Scene {
     const things = [this.#table(place.position)];
     if (this.body) things.push({ mesh: this.body.mesh, model: pose(place.position, place.quaternion) });
     things.push(...this.#links(state.hand, state.start, () => ({})));
-    things.push(this.#arrow(arrow.tip, arrow.direction, HEADING, 1));
+    // An arrow that the rules overrule is faint, and beside it is the one that counts.
+    const counts = add(place.position, rotate(place.quaternion, state.active.position));
+    things.push(this.#arrow(arrow.tip, arrow.direction, HEADING, state.active.overruled ? 0.3 : 1));
+    if (state.active.overruled) things.push(this.#arrow(counts, rotate(place.quaternion, state.active.direction), COUNTS, 1));
     for (const [name, point] of Object.entries(handles.points))
       things.push({ mesh: this.ball, model: [...IDENTITY.slice(0, 12), ...point, 1], tint: name === handles.hover ? [1, 0.8, 0.2] : HEADING, lit: 0.5 });
-    if (state.active.redirected) {
-      const direction = rotate(place.quaternion, state.active.direction);
-      things.push(this.#arrow(add(place.position, rotate(place.quaternion, state.active.position)), direction, REDIRECTED, 0.55));
-    }
     if (state.path && state.asked.includes("trajectory")) things.push(this.#path(state.path, place, 1));
     if (state.pose && state.asked.includes("pose")) {
       const turned = {

@@ -48,8 +48,9 @@ export class StudioPanel {
     this.queue = this.queue.then(async () => {
       this.busy(true);
       try {
-        this.show(await tell("/api/do", { action, ...values }));
+        const state = await tell("/api/do", { action, ...values });
         this.error("");
+        this.show(state);
         return true;
       } catch (error) {
         this.error(error.message);
@@ -72,8 +73,8 @@ export class StudioPanel {
 
   async take(file) {
     try {
-      await upload("/api/upload", file);
       this.error("");
+      await upload("/api/upload", file);
       this.show(await ask("/api/state"));
     } catch (error) {
       this.error(error.message);
@@ -108,29 +109,31 @@ export class StudioPanel {
     this.app.takeState(state);
   }
 
+  // Shows a job's progress while it runs, and once what came of it.
   #job(job) {
     $("job").hidden = !job.running;
     $("share-done").value = job.share;
     $("doing").textContent = job.text;
-    if (job.running && !this.watching) {
-      this.watching = true;
-      this.#watch(job.number, this.state.motions[0]?.id);
+    this.settled ??= job.number; // what was done before this page was opened is of no interest
+    if (job.running && !this.watching) this.#watch();
+    else if (!job.running && job.number !== this.settled) {
+      this.settled = job.number;
+      this.error(job.error);
+      if (!job.error && job.made) this.app.play(job.made);
     }
   }
 
-  async #watch(number, newest) {
+  async #watch() {
+    this.watching = true;
     let job;
     do {
       await new Promise((resolve) => setTimeout(resolve, POLL));
       job = await ask("/api/job").catch(() => null);
-      if (job) this.#job(job);
-    } while (!job || (job.number === number && job.running));
+      if (job?.running) this.#job(job);
+    } while (!job || job.running);
     this.watching = false;
     const state = await ask("/api/state").catch(() => null);
-    if (!state) return;
-    this.show(state);
-    this.error(job.error);
-    if (state.motions.length && state.motions[0].id !== newest) this.app.play(state.motions[0].id);
+    if (state) this.show(state);
   }
 
   #motions(motions) {

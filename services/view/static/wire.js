@@ -20,26 +20,21 @@ export function decode(buffer) {
   return { arrays, meta: JSON.parse(header.__metadata__.meta) };
 }
 
+// The answer, or what the studio says against it: a refusal is an answer too, and no fault of the network.
 async function answered(response) {
-  if (response.ok) return response;
-  const text = await response.text();
-  let said = text;
-  try {
-    said = JSON.parse(text).error;
-  } catch {
-    // What came is not from the studio; its own words are all there is.
-  }
-  throw new Error(said || `The studio answered ${response.status}.`);
+  if (!response.ok) throw new Error(`The studio answered ${response.status}: ${(await response.text()).slice(0, 200)}`);
+  if (response.headers.has("X-Refused")) throw new Error((await response.json()).error);
+  return response;
 }
 
+const address = (path, query) => `${path}?${new URLSearchParams(query)}`;
+
 export async function ask(path, query = {}) {
-  const url = `${path}?${new URLSearchParams(query)}`;
-  return (await answered(await fetch(url))).json();
+  return (await answered(await fetch(address(path, query)))).json();
 }
 
 export async function fetchMessage(path, query = {}) {
-  const url = `${path}?${new URLSearchParams(query)}`;
-  return decode(await (await answered(await fetch(url))).arrayBuffer());
+  return decode(await (await answered(await fetch(address(path, query)))).arrayBuffer());
 }
 
 export async function tell(path, body) {
@@ -48,14 +43,13 @@ export async function tell(path, body) {
 }
 
 export async function upload(path, file) {
-  const url = `${path}?${new URLSearchParams({ name: file.name })}`;
   const options = { method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: file };
-  return (await answered(await fetch(url, options))).json();
+  return (await answered(await fetch(address(path, { name: file.name }), options))).json();
 }
 
 // Lets the browser save what the server answers with, under the name that it gives.
 export async function download(path, query) {
-  const response = await answered(await fetch(`${path}?${new URLSearchParams(query)}`));
+  const response = await answered(await fetch(address(path, query)));
   const link = document.createElement("a");
   link.href = URL.createObjectURL(await response.blob());
   link.download = decodeURIComponent((response.headers.get("Content-Disposition") ?? "").split("''")[1] ?? "motion");
