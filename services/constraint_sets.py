@@ -228,6 +228,24 @@ def load(path: pathlib.Path) -> Message:
     return message
 
 
+def load_for(folder: pathlib.Path, objects: Sequence[GraspObject]) -> tuple[list[GraspObject], list[Message]]:
+    """The objects that have a set in a folder, and their sets.
+
+    Raises:
+      CongraspError: a set cannot be read, or was made for another object of the same name.
+    """
+    chosen, sets = [], []
+    for obj in objects:
+        path = folder / f"{obj.name}{SUFFIX}"
+        if path.is_file():
+            made = load(path)
+            if made.meta["object_digest"] != store.digest(obj):
+                raise CongraspError(f"{path} was made for another object '{obj.name}'.", "Name that object's folder.")
+            chosen.append(obj)
+            sets.append(made)
+    return chosen, sets
+
+
 def describe(constraints: Message) -> dict[str, str]:
     """What a set holds, in words."""
     arrays, meta = constraints.arrays, constraints.meta

@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import functools
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
@@ -14,7 +16,7 @@ from actors.environment import METRICS, EnvironmentState
 from actors.episode import episode_message
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes, goal_of_world
-from actors.taskset import build_taskset
+from actors.taskset import TaskSet, build_taskset
 from common.config import PhysicsName, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
@@ -24,6 +26,7 @@ from common.policy.bundle import PolicyBundle, mean_action
 from common.task.features import Features
 from common.task.types import Array, SceneState, Surface
 from common.wire.codec import Message
+from services.noise import LEVELS, Noise, disturbed
 from services.scores import Row, Sample, active_mask, joined, matching, summarise
 
 HOLD_SECONDS = 2.0
@@ -69,6 +72,7 @@ class Evaluator:
         seed: int = 0,
         task: TaskConfig | None = None,
         hold_steps: int | None = None,
+        taskset: TaskSet | None = None,
     ):
         """Builds the constraint sets.
 
@@ -81,6 +85,8 @@ class Evaluator:
           seed: seed of constraints and episodes.
           task: where it is not to be the bundle's; mass and friction are in the middle of their ranges.
           hold_steps: control steps without the table; the task's, which count for success, if not given.
+          taskset: constraints to draw from, of these objects in this order (`services.constraint_sets.taskset_of`);
+            made from the seed if not given.
         """
         base = task or bundle.task
         hold = hold_steps or base.hold_steps
@@ -97,8 +103,8 @@ class Evaluator:
         self._hand = get_hand(bundle.spec.hand)
         self._physics, self._threads, self._seed = physics, threads, seed
         self._batch = batch or _BATCH[physics]
-        self._taskset = build_taskset(self._hand, self.task, objects, seed)
-        self._referred = False
+        self._taskset = taskset or build_taskset(self._hand, self.task, objects, seed)
+        self._referred = taskset is not None
 
     def samples(
         self, constraints: Sequence[str], episodes: int, progress: Callable[[int], None] = lambda done: None
@@ -141,6 +147,34 @@ class Evaluator:
                 worker.replace_objects(objects, self._taskset)
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
+
+    def rows_under_noise(self, progress: Callable[[int], None], episodes: int) -> list[Row]:
+        """A row for each of `services.noise.LEVELS`; see there. The same references are disturbed in all of them.
+
+        Args:
+          progress: is told how many episodes of all rows there are.
+          episodes: for each row.
+        """
+        rows: list[Row] = []
+        for constraint, group in itertools.groupby(LEVELS, lambda noise: noise.constraint):
+            with self._worker(mixture(self.task, [constraint]), episodes) as worker:
+                self._refer(worker, [constraint])
+                for noise in group:
+                    worker.replace_objects(self.objects, disturbed(self._hand, self._taskset, noise, self._seed))
+                    worker.restart()
+                    advance = functools.partial(lambda done, n: progress(done + n), len(rows) * episodes)
+                    sample = self._gather(worker, [constraint], episodes, advance)
+                    rows.append(self.row(constraint, sample[constraint], noise.label))
+        return rows
+
+    def noisy_episode(self, noise: Noise, tries: int = 1) -> Message:
+        """An episode under a noisy reference: the first that succeeds, or the last of `tries`."""
+        taskset = self._taskset
+        try:
+            self._taskset = disturbed(self._hand, taskset, noise, self._seed)
+            return self.episode(noise.constraint, tries)
+        finally:
+            self._taskset = taskset
 
     def _refer(self, worker: RolloutWorker, constraints: Sequence[str]) -> None:
         """References from the policy's own grasps under headings, as the paper makes them for its hands; once."""

@@ -10,9 +10,11 @@ from common.config import PhysicsName
 from common.errors import CongraspError
 
 if TYPE_CHECKING:
+    from actors.taskset import TaskSet
     from common.objects.spec import GraspObject
 
-Table = Literal["single", "composed", "objects", "all"]
+Split = Literal["all", "training", "held-out"]
+Table = Literal["single", "composed", "objects", "noise", "all"]
 _POOL = 64
 _PICTURED = 4
 _MOST = 50_000
@@ -24,6 +26,8 @@ def evaluate(
     policy: pathlib.Path | None = None,
     table: tuple[Table, ...] = ("single",),
     objects: pathlib.Path | None = None,
+    constraints: pathlib.Path | None = None,
+    split: Split = "all",
     episodes: int = 1000,
     physics: PhysicsName = "auto",
     pool: int = 0,
@@ -42,9 +46,13 @@ def evaluate(
     Args:
       policy: A policy file (policy.safetensors of a run); by default the one that comes with the package.
       table: single: one constraint a row; composed: two; objects: the heading alone on many objects, by size, mass and
-        family; all: everything. Several may be named.
+        family; noise: poses and trajectories with errors, as captured ones have; all: everything. Several may be
+        named.
       objects: Objects to grasp: a folder as 'congrasp objects import' takes it, or one that it made. By default
         procedural objects of seeds that training never uses.
+      constraints: Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import'; its
+        references are used instead of the policy's own grasps. Objects without a set are left out.
+      split: Of these sets all constraints, the 80 % for training, or those that are held out.
       episodes: Episodes in each row; of the table 'objects', episodes in all.
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
       pool: Number of procedural objects; 0 takes 64, and for the table 'objects' one an episode, at most 50,000.
@@ -62,6 +70,7 @@ def evaluate(
     from common.objects.pool import HELD_OUT_SEED
     from common.policy import bundle as bundles
     from common.policy.shipped import policy_file
+    from services.noise import LEVELS
     from services.objects import objects_of
     from services.scores import TABLES, tables_of, write_json
 
@@ -81,10 +90,19 @@ def evaluate(
 
         given = objects_of(objects, track) if objects else None
         settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed}
-        constraints = [name for key in TABLES if key in table or "all" in table for name in TABLES[key]]
-        if constraints:
-            evaluator = _evaluator(loaded, given, pool or _POOL, settings, track)
-            rows += evaluator.rows(constraints, episodes, track("Episodes", len(constraints) * episodes))
+        taskset = None
+        if constraints is not None:
+            given, taskset = _captured(constraints, split, given, objects)
+        names = [name for key in TABLES if key in table or "all" in table for name in TABLES[key]]
+        evaluator: Any = None
+        noisy: list[Any] = []
+        if names:
+            evaluator = _evaluator(loaded, given, taskset, pool or _POOL, settings, track)
+            rows += evaluator.rows(names, episodes, track("Episodes", len(names) * episodes))
+        if "noise" in table or "all" in table:
+            evaluator = evaluator or _evaluator(loaded, given, taskset, pool or _POOL, settings, track)
+            noisy = evaluator.rows_under_noise(track("Episodes under noise", len(LEVELS) * episodes), episodes)
+            rows += noisy
         if "objects" in table or "all" in table:
             rows += _object_rows(loaded, given, pool or min(episodes, _MOST), episodes, settings, track)
     source = str(objects) if objects else "held-out procedural objects"
@@ -97,20 +115,47 @@ def evaluate(
             "objects": source,
             "first_object_seed": None if objects else HELD_OUT_SEED,
             "headings": loaded.task.headings,
+            "constraints": str(constraints) if constraints else None,
+            "split": split if constraints else None,
             **settings,
         }
         write_json(rows, json, about)
-    if pictures is not None and constraints:
+    if pictures is not None and noisy:
+        from services.noise_sheet import draw_noise
+
+        title = f"{loaded.spec.hand} hand, version {loaded.version}: {episodes} episodes a level"
+        draw_noise(evaluator, noisy, pictures, title)
+        console.print(f"Curves and examples of noisy references are drawn in {pictures}.", soft_wrap=True)
+    if pictures is not None and names:
         from services.failures import failure_sheet
 
-        for name in constraints:
+        for name in names:
             failure_sheet(evaluator, loaded, name, pictures / f"{name}.png", _PICTURED, _PICTURED)
             console.print(f"Episodes of '{name}' are drawn in {pictures}.", soft_wrap=True)
     return 0
 
 
+def _captured(
+    folder: pathlib.Path, split: Split, given: "list[GraspObject] | None", objects: pathlib.Path | None
+) -> "tuple[list[GraspObject], TaskSet]":
+    """The objects that have a constraint set in a folder, and the task set of their sets."""
+    from services.constraint_sets import load_for, taskset_of
+
+    if given is None:
+        raise CongraspError("--constraints needs the sets' objects.", "Name their folder with --objects.")
+    chosen, sets = load_for(folder, given)
+    if not sets:
+        raise CongraspError(f"{folder} holds no constraint set of an object in {objects}.", "Name matching folders.")
+    return chosen, taskset_of(sets, split)
+
+
 def _evaluator(
-    bundle: Any, given: "list[GraspObject] | None", pool: int, settings: dict[str, Any], track: Track
+    bundle: Any,
+    given: "list[GraspObject] | None",
+    taskset: "TaskSet | None",
+    pool: int,
+    settings: dict[str, Any],
+    track: Track,
 ) -> Any:
     import os
 
@@ -124,6 +169,7 @@ def _evaluator(
         given or load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED)),
         threads=os.cpu_count() or 1,
         hold_steps=two_seconds(bundle.task),
+        taskset=taskset,
         **settings,
     )
 

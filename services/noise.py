@@ -1,0 +1,67 @@
+"""Noisy references: what a policy makes of captured poses and trajectories that are wrong (paper, noisy constraints).
+
+Each kind of noise is added to the reference poses or trajectories of a task set, and the same episodes are evaluated as
+those without noise; errors are measured against what was asked for, noise included.
+"""
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from actors.taskset import TaskSet
+from common.hands.kinematics import grasp_frame
+from common.hands.spec import Hand
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """One kind of noise at one level."""
+
+    constraint: str
+    """The row that it disturbs: pose or trajectory."""
+    kind: str
+    """joints, depth or jitter; empty for none."""
+    level: float
+    """rad of joints, m otherwise."""
+
+    @property
+    def label(self) -> str:
+        """Such as "joints 0.2 rad"; empty without noise."""
+        amount = f"{self.level:g} rad" if self.kind == "joints" else f"{100 * self.level:g} cm"
+        return f"{self.kind} {amount}" if self.kind else ""
+
+
+LEVELS = (
+    Noise("pose", "", 0.0),
+    *(Noise("pose", "joints", level) for level in (0.1, 0.2)),
+    *(Noise("pose", "depth", level) for level in (0.005, 0.01)),
+    Noise("trajectory", "", 0.0),
+    *(Noise("trajectory", "jitter", level) for level in (0.005, 0.01)),
+)
+"""Rows of the table."""
+
+
+def disturbed(hand: Hand, taskset: TaskSet, noise: Noise, seed: int) -> TaskSet:
+    """The task set with noisy references.
+
+    * joints: an independent normal error of standard deviation `level` on every finger joint, kept within its limits.
+    * depth: the wrist is moved along the hand's heading axis, into the object, by a uniform share of `level`.
+    * jitter: an independent normal error of standard deviation `level` on every coordinate of every waypoint.
+    """
+    rng = np.random.default_rng(seed)
+    if noise.kind == "joints":
+        q = np.asarray(taskset.pose_q)
+        noisy = np.clip(q + rng.normal(0.0, noise.level, q.shape), hand.lower, hand.upper)
+        return taskset._replace(pose_q=noisy.astype(np.float32))
+    if noise.kind == "depth":
+        position, quaternion = np.asarray(taskset.pose_position), np.asarray(taskset.pose_quaternion)
+        turn = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
+        inward = turn.apply(grasp_frame(hand).heading).reshape(position.shape)
+        depth = rng.uniform(0.0, noise.level, (*position.shape[:-1], 1))
+        return taskset._replace(pose_position=(position + depth * inward).astype(np.float32))
+    if noise.kind == "jitter":
+        path = np.asarray(taskset.trajectory_position)
+        noisy = path + rng.normal(0.0, noise.level, path.shape)
+        return taskset._replace(trajectory_position=noisy.astype(np.float32))
+    return taskset
