@@ -15,6 +15,7 @@ import numpy as np
 
 from common.errors import CongraspError
 
+_REMEDY = "Only pickles of plain values and arrays are read; get the file again."
 _LARGEST = 256 * 2**20
 _ARRAY = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 _BUFFER = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
@@ -24,9 +25,23 @@ _SPARSE = ("scipy.sparse.csc.csc_matrix", "scipy.sparse._csc.csc_matrix")
 _VARIABLE, _SELECTION = "chumpy.ch.Ch", "chumpy.reordering.Select"
 _ENCODE = "_codecs.encode"
 _SETS = ("__builtin__.set", "builtins.set")
+_TENSOR, _STORAGE_BYTES = "torch._utils._rebuild_tensor_v2", "torch.storage._load_from_bytes"
+_STORAGES = {
+    "torch.DoubleStorage": "<f8",
+    "torch.FloatStorage": "<f4",
+    "torch.HalfStorage": "<f2",
+    "torch.LongStorage": "<i8",
+    "torch.IntStorage": "<i4",
+    "torch.ShortStorage": "<i2",
+    "torch.ByteStorage": "<u1",
+    "torch.BoolStorage": "?",
+}
+_TORCH_MAGIC = 0x1950A86A20F9469CFC6C
 _PASSIVE = ("numpy.ndarray", "__builtin__.object", "builtins.object")
 KNOWN = {*_ARRAY, *_BUFFER, *_SCALAR, _DTYPE, *_OBJECT, *_SPARSE, _VARIABLE, _SELECTION, _ENCODE, *_SETS, *_PASSIVE}
 """Names that a file may use."""
+TORCH = {_TENSOR, _STORAGE_BYTES, *_STORAGES, "collections.OrderedDict"}
+"""Names that a file with PyTorch's tensors may use besides."""
 _OPCODES: dict[str, Any] = {opcode.code: opcode for opcode in pickletools.opcodes}
 _ENDED, _MARK = object(), object()
 
@@ -50,31 +65,47 @@ class _Refused(Exception):
     """Why a file is not read, in words."""
 
 
-def read_pickle(path: pathlib.Path) -> Any:
+def read_pickle(path: pathlib.Path, *, mixed: bool = False) -> Any:
     """The file's value: plain Python values and NumPy arrays, which sparse matrices and chumpy's variables become, too.
 
     Strings of Python 2 are read as Latin-1.
+
+    Args:
+      path: the file.
+      mixed: arrays may also hold values of any kind, and PyTorch's tensors are read as arrays.
 
     Raises:
       CongraspError: there is no such file, or it is no pickle of arrays; the line says which name or opcode it is.
     """
     try:
         if path.stat().st_size > _LARGEST:
-            raise _Refused(f"has more than {_LARGEST >> 20} MB")
-        return _Plain()(_run(io.BytesIO(path.read_bytes())))
+            raise CongraspError(f"{path} has more than {_LARGEST >> 20} MB.", _REMEDY)
+        return parse_pickle(path.read_bytes(), str(path), mixed=mixed)
     except OSError as error:
         raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
+
+
+def parse_pickle(data: bytes, name: str, *, mixed: bool = False) -> Any:
+    """The value of a pickle in memory; see `read_pickle`.
+
+    Args:
+      data: the pickle.
+      name: where it comes from, for error messages.
+      mixed: see there.
+    """
+    try:
+        return _Plain(mixed)(_run(io.BytesIO(data), KNOWN | TORCH if mixed else KNOWN))
     except _Refused as error:
         what = str(error)
     except RecursionError:
         what = "is nested too deeply"
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, LookupError, MemoryError, OverflowError):
         what = "is damaged"
-    raise CongraspError(f"{path} {what}.", "Only pickles of plain values and arrays are read; get the file again.")
+    raise CongraspError(f"{name} {what}.", _REMEDY)
 
 
-def _run(stream: io.BytesIO) -> Any:
-    """What the opcodes leave on the stack at their end."""
+def _run(stream: io.BytesIO, known: set[str]) -> Any:
+    """What the opcodes leave on the stack at their end; globals must have known names."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     while True:
@@ -90,7 +121,7 @@ def _run(stream: io.BytesIO) -> Any:
             argument = opcode.arg.reader(stream) if opcode.arg else None
         if opcode.name == "STOP":
             return stack.pop()
-        _step(opcode.name, argument, stack, memo)
+        _step(opcode.name, argument, stack, memo, known)
 
 
 _CONSTANTS: dict[str, Any] = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
@@ -101,7 +132,7 @@ _LITERALS = {
 }
 
 
-def _step(name: str, argument: Any, stack: list[Any], memo: dict[int, Any]) -> None:
+def _step(name: str, argument: Any, stack: list[Any], memo: dict[int, Any], known: set[str]) -> None:
     """Carries out one opcode."""
     match name:
         case "PROTO" | "FRAME":
@@ -148,15 +179,17 @@ def _step(name: str, argument: Any, stack: list[Any], memo: dict[int, Any]) -> N
         case "POP_MARK":
             _since_mark(stack)
         case "GLOBAL":
-            stack.append(_known(argument.replace(" ", ".")))
+            stack.append(_known(argument.replace(" ", "."), known))
         case "STACK_GLOBAL":
             module, attribute = stack.pop(-2), stack.pop()
-            stack.append(_known(f"{module}.{attribute}"))
+            stack.append(_known(f"{module}.{attribute}", known))
         case "REDUCE" | "NEWOBJ":
             made_of, arguments = stack.pop(-2), stack.pop()
             if not (isinstance(made_of, _Name) and isinstance(arguments, tuple)):
                 raise _Refused("makes an object of something that is no name")
             stack.append(_Made(made_of.text, arguments))
+        case "BINPERSID" if known >= TORCH:
+            stack.append(_Made("", stack.pop()))
         case "BUILD":
             state = stack.pop()
             _of(_Made, stack).state = state
@@ -182,8 +215,8 @@ def _of(kind: type, stack: list[Any]) -> Any:
     return stack[-1]
 
 
-def _known(name: str) -> _Name:
-    if name not in KNOWN:
+def _known(name: str, known: set[str]) -> _Name:
+    if name not in known:
         raise _Refused(f"names {name[:80]!r}, which stands for no array")
     return _Name(name)
 
@@ -191,7 +224,8 @@ def _known(name: str) -> _Name:
 class _Plain:
     """From what was read to plain values and arrays; what the file shares is turned once."""
 
-    def __init__(self) -> None:
+    def __init__(self, mixed: bool) -> None:
+        self._mixed = mixed
         self._done: dict[int, Any] = {}
 
     def __call__(self, value: Any) -> Any:
@@ -215,6 +249,12 @@ class _Plain:
             name = arguments[0].text
         if name in _ARRAY:
             _, shape, kind, fortran, data = state
+            if self._mixed and isinstance(kind, _Made) and kind.arguments[0] in ("O8", "O"):
+                items = self(data)
+                array = np.empty(len(items), object)
+                for i, item in enumerate(items):
+                    array[i] = item
+                return array.reshape(tuple(shape), order="F" if fortran else "C")
             dtype = _dtype(kind)
             return np.frombuffer(_bytes(self(data)), dtype).copy().reshape(tuple(shape), order="F" if fortran else "C")
         if name in _BUFFER:
@@ -235,6 +275,15 @@ class _Plain:
             return text.encode("latin-1")
         if name in _SETS:
             return set(self(arguments[0]))
+        if name == _STORAGE_BYTES:
+            return _storage(_bytes(self(arguments[0])))
+        if name == _TENSOR:
+            flat, start, shape, strides = (self(argument) for argument in arguments[:4])
+            last = start + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
+            if start < 0 or min((*shape, *strides), default=1) < 0 or (0 not in shape and last >= len(flat)):
+                raise _Refused("has a tensor that is larger than its data")
+            size = flat.itemsize
+            return np.lib.stride_tricks.as_strided(flat[start:], shape, [size * step for step in strides]).copy()
         return None
 
 
@@ -251,6 +300,21 @@ def _dtype(made: Any) -> np.dtype[Any]:
     if dtype.kind not in "biuf":
         raise _Refused(f"has an array of {kind[:20]!r}, not of numbers")
     return dtype
+
+
+def _storage(data: bytes) -> np.ndarray:
+    """The numbers of a PyTorch storage in the format of before version 1.6, which pickled tensors still use.
+
+    Five pickles follow one another (a magic number, a version, facts about the machine, a reference to the storage and
+    the keys of all storages), then the number of elements as an integer of eight bytes, and the elements.
+    """
+    stream = io.BytesIO(data)
+    magic, _, machine, reference, keys = (_run(stream, TORCH) for _ in range(5))
+    if magic != _TORCH_MAGIC or not machine["little_endian"] or len(keys) != 1:
+        raise _Refused("has a tensor of an unknown format")
+    kind = np.dtype(_STORAGES[reference.arguments[1].text])
+    count = int.from_bytes(stream.read(8), "little")
+    return np.frombuffer(stream.read(), kind, count=count).copy()
 
 
 def _dense(state: dict[str, Any]) -> np.ndarray:

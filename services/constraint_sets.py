@@ -152,12 +152,9 @@ def taskset_of(sets: Sequence[Message], split: Split = "all") -> TaskSet:
 def _row(made: Message, split: Split) -> TaskSet:
     """One set as a row of a task set, with what belongs to the split alone, and resting poses that allow a heading."""
     arrays = made.arrays
-    kinds = ("heading", "pose")
-    chosen = {
-        kind: {"all": True, "training": arrays[f"{kind}/training"], "held-out": ~arrays[f"{kind}/training"]}[split]
-        for kind in kinds
-    }
-    heading, pose = (arrays[f"{kind}/allowed"] & np.expand_dims(chosen[kind], 1) for kind in kinds)
+    heading, pose = (
+        arrays[f"{kind}/allowed"] & _belongs(arrays[f"{kind}/training"], split)[:, None] for kind in ("heading", "pose")
+    )
     usable = np.flatnonzero(heading[0].any(-1))
     if len(usable) == 0:
         raise CongraspError(
@@ -184,6 +181,11 @@ def _row(made: Message, split: Split) -> TaskSet:
         pose_valid=pose[:, usable],
         has_affordance=arrays["surface/minus"].any() & heading[1].any(-1),
     )
+
+
+def _belongs(training: np.ndarray, split: Split) -> np.ndarray:
+    """(V, M) bool, what belongs to a split, of what is for training (V, M)."""
+    return {"all": np.ones_like(training), "training": training, "held-out": ~training}[split]
 
 
 def _filled(row: TaskSet, rests: int, poses: int) -> TaskSet:

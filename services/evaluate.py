@@ -167,12 +167,12 @@ class Evaluator:
                     rows.append(self.row(constraint, sample[constraint], noise.label))
         return rows
 
-    def noisy_episode(self, noise: Noise, tries: int = 1) -> Message:
-        """An episode under a noisy reference: the first that succeeds, or the last of `tries`."""
+    def noisy_example(self, noise: Noise) -> Message | None:
+        """An episode under a noisy reference in which the object is held to the end, if there is one."""
         taskset = self._taskset
         try:
             self._taskset = disturbed(self._hand, taskset, noise, self._seed)
-            return self.episode(noise.constraint, tries)
+            return next(iter(self.examples(noise.constraint, 1, 0)), None)
         finally:
             self._taskset = taskset
 

@@ -21,7 +21,7 @@ _TITLES = {
     "jitter": "Trajectory: normal error of every waypoint",
 }
 _SUCCESS, _HELD, _ANGLE, _LENGTH = "#2f6fdb", "#1f9d88", "#b5373a", "#e08a2c"
-_MOMENTS, _TRIES = 5, 6
+_MOMENTS = 5
 _SIZE = (300, 225)
 
 
@@ -42,13 +42,16 @@ def draw_noise(evaluator: Evaluator, rows: Sequence[Row], folder: pathlib.Path, 
     labels: list[str] = []
     for kind in _TITLES:
         noise = max((noise for noise in LEVELS if noise.kind == kind), key=lambda noise: noise.level)
-        episode = evaluator.noisy_episode(noise, _TRIES)
-        result = ", success" if episode.meta["success"] else ", no success"
+        episode = evaluator.noisy_example(noise)
+        if episode is None:
+            continue
         first = f"{noise.constraint}, {noise.label}: {episode.meta['object']}"
-        pictures, words = episode_strip(episode, _MOMENTS, _SIZE, first, result)
+        pictures, words = episode_strip(episode, _MOMENTS, _SIZE, first, ", held")
         images += pictures
         labels += words
-    text = "What is asked for (blue hand, violet path) has errors; what is done is a grasp"
+    if not images:
+        return
+    text = "Asked for: the blue hand or the violet path, with errors. Done: the grey hand"
     save_png(folder / "noise_examples.png", contact_sheet(images, labels, columns=_MOMENTS, title=text))
 
 
@@ -103,5 +106,5 @@ def _errors(axes: Any, x: Sequence[float], rows: Sequence[Row], prefix: str) -> 
     for name, factor, unit, colour in (("rad", 1.0, "rad", _ANGLE), ("m", 10.0, "dm", _LENGTH)):
         values = [factor * value if (value := row.errors[f"{prefix}_{name}"]) is not None else np.nan for row in rows]
         axes.plot(x, values, "s-", color=colour, label=f"error, {unit}")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.1 * axes.get_ylim()[1])
     axes.legend(frameon=False, fontsize=8)

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import json
+import os
 import pathlib
 from typing import Annotated, Any, Literal
 
@@ -35,7 +36,7 @@ class ConstraintsImport:
     meshes: tuple[pathlib.Path, ...] = ()
     """Folders with the objects' meshes, where they are not in their place in the data set."""
     mano: pathlib.Path | None = None
-    """Your MANO_RIGHT.pkl; dexycb needs it, and grab and oakink are more exact with it."""
+    """Your MANO_RIGHT.pkl, or CONGRASP_MANO; dexycb needs it, and grab and oakink are more exact with it."""
     hand: str = "human"
     """Hand of the sets; any other than human gets the captured headings and affordance, and poses of its own."""
     headings: Literal["sampled", "demonstrated"] = "sampled"
@@ -86,10 +87,12 @@ class ConstraintsImport:
         return 0 if report.kept else 2
 
     def _sequences(self) -> Any:
+        from common.hands.mano import VARIABLE, read_mano
         from services.importers.objects import Meshes
 
+        own = self.mano or (pathlib.Path(text) if (text := os.environ.get(VARIABLE)) else None)
         module = importlib.import_module(f"services.importers.{self.format}")
-        return module.read(self.path, Meshes(self.meshes))
+        return module.read(self.path, Meshes(self.meshes), read_mano(own) if own else None)
 
 
 def _say(report: Any, sets: int, out: pathlib.Path, objects: pathlib.Path) -> None:

@@ -37,7 +37,7 @@ BEYOND = 0.1
 _RADII = np.array([[0.010] * 3, *[[0.009, 0.0075, 0.0075]] * 3, [0.009, 0.0065, 0.0065]])
 """(5, 3) m, skin radius of each bone: those that GraspXL gives the MANO hand."""
 _ALONG = (0.25, 0.5, 0.75, 1.0)
-_SAMPLES = 4000
+_SPACING, _SAMPLES = 0.0015, (4000, 40_000)
 
 
 class Surface:
@@ -45,7 +45,8 @@ class Surface:
 
     def __init__(self, obj: GraspObject):
         mesh = trimesh.Trimesh(obj.visual_vertices, obj.visual_faces, process=False)
-        points, face = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
+        count = int(np.clip(mesh.area / _SPACING**2, *_SAMPLES))
+        points, face = trimesh.sample.sample_surface(mesh, count, seed=0)
         self.points, self._normals = np.asarray(points), np.asarray(mesh.face_normals)[face]
         self._tree = cKDTree(self.points)
 
@@ -55,15 +56,9 @@ class Surface:
         inside = ((points - self.points[nearest]) * self._normals[nearest]).sum(-1) < 0
         return np.where(inside, -away, away)
 
-    def near(self, points: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        """(N,) bool: samples of the surface within any of the balls (M, 3), (M,)."""
-        tree = cKDTree(points)
-        largest = float(radii.max())
-        close = tree.query_ball_point(self.points, largest)
-        away = [
-            any(np.linalg.norm(self.points[i] - points[j]) <= radii[j] for j in near) for i, near in enumerate(close)
-        ]
-        return np.array(away, bool)
+    def within(self, points: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        """(n, 3) samples of the surface within any of the balls (M, 3), (M,)."""
+        return self.points[sorted(set().union(*self._tree.query_ball_point(points, radii)))]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +125,7 @@ def extract(
         q=np.clip(found.q, HUMAN.lower, HUMAN.upper),
         position=path,
         quaternion=turns,
-        contact=surface.points[surface.near(*_skin_balls(skin[frame], CONTACT))],
+        contact=surface.within(*_skin_balls(skin[frame], CONTACT)),
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.hands.human import HUMAN
+from common.hands.mano import ManoModel
 from services.importers.fit import joint_positions
 from services.importers.objects import Meshes
 from services.importers.sequence import Dropped, Sequence
@@ -31,8 +32,8 @@ _OBJECT = np.array([0.0, 0.0, 0.035])
 _LARGEST = 2 * np.pi
 
 
-def read(path: pathlib.Path, meshes: Meshes) -> Iterator[Sequence | Dropped]:
-    """The sequences of a file, or of all NPZ files of a folder."""
+def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None = None) -> Iterator[Sequence | Dropped]:
+    """The sequences of a file, or of all NPZ files of a folder; MANO has no part in them."""
     for file in sorted(path.glob("**/*.npz")) if path.is_dir() else [path]:
         try:
             yield _sequence(file, meshes)

@@ -18,20 +18,41 @@ class Meshes:
 
     folders: tuple[pathlib.Path, ...]
 
-    def find(self, sequence: str, name: str) -> pathlib.Path:
+    def beside(self, *folders: pathlib.Path) -> "Meshes":
+        """These, and then the data set's own folders."""
+        return Meshes((*self.folders, *folders))
+
+    def has(self, name: str) -> bool:
+        """Whether there is a mesh of that name."""
+        return self._look(name, "") is not None
+
+    def find(self, sequence: str, name: str, inside: str = "") -> pathlib.Path:
         """The mesh file `<name>.*`, or the folder `<name>` with one.
+
+        Args:
+          sequence: that needs it.
+          name: of the object.
+          inside: the file in the folder, where that has several.
 
         Raises:
           Dropped: there is none.
         """
+        found = self._look(name, inside)
+        if found is None:
+            where = ", ".join(map(str, self.folders)) or "no folder"
+            raise Dropped(sequence, "no mesh", f"there is no mesh of '{name}' in {where} (--meshes)")
+        return found
+
+    def _look(self, name: str, inside: str) -> pathlib.Path | None:
         for folder in self.folders:
             for suffix in SUFFIXES:
                 if (file := folder / f"{name}{suffix}").is_file():
                     return file
+            if inside and (folder / name / inside).is_file():
+                return folder / name / inside
             if (folder / name).is_dir():
                 return folder / name
-        where = ", ".join(map(str, self.folders)) or "no folder"
-        raise Dropped(sequence, "no mesh", f"there is no mesh of '{name}' in {where} (--meshes)")
+        return None
 
 
 def load_object(mesh: pathlib.Path, name: str) -> GraspObject:

@@ -8,7 +8,10 @@ import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
 from common.hands.human import HUMAN
+from common.hands.mano import MANO_FINGERS
+from common.logs.poses import link_poses
 from services.importers.fit import joint_positions
+from services.importers.mano import TO_HUMAN
 
 FRAMES, GRASP = 90, 60
 """Frames of a sequence, and the one in which the fingers have closed."""
@@ -57,7 +60,7 @@ class Known:
         return position, Slerp(length, self.turns)(wanted)
 
 
-def make(name: str, object_name: str, seed: int = 0, *, farthest: float = 0.27, size_seed: int = 0) -> Known:
+def make(name: str, object_name: str, seed: int = 0, *, farthest: float = 0.27, tail: float = 0.0) -> Known:
     """A grasp of a box.
 
     Args:
@@ -65,9 +68,9 @@ def make(name: str, object_name: str, seed: int = 0, *, farthest: float = 0.27, 
       object_name: of the box.
       seed: of poses, path and world.
       farthest: metres from which the wrist comes, along its approach.
-      size_seed: grasps of one object have the same.
+      tail: metres by which the box is longer than its pinched end, away from the wrist along its -z axis.
     """
-    q = q_closed(np.random.default_rng(size_seed))
+    q = q_closed(np.random.default_rng(0))
     rng = np.random.default_rng(seed)
     tips = joint_positions(HUMAN, q)[:2, 3]
     middle, across = tips.mean(0), tips[1] - tips[0]
@@ -77,8 +80,8 @@ def make(name: str, object_name: str, seed: int = 0, *, farthest: float = 0.27, 
     y = np.cross(x, [0, -1.0, 0])
     y /= np.linalg.norm(y)
     box = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], -1))  # object frame to wrist frame
-    size = np.array([width - 0.016, 0.03, 0.03])
-    grasp_turn, grasp_at = box.inv(), -box.inv().apply(middle)
+    size = np.array([width - 0.016, 0.03, 0.03 + tail])
+    grasp_turn, grasp_at = box.inv(), -box.inv().apply(middle) + [0, 0, tail / 2]
 
     outward = grasp_turn.apply([0, 1.0, 0.3]) / np.linalg.norm([0, 1.0, 0.3])
     side = np.cross(outward, rng.normal(size=3))
@@ -133,3 +136,26 @@ def check(arrays: dict[str, np.ndarray], m: int, known: Known) -> None:
     np.testing.assert_allclose(arrays["pose/position"][0, m], position[-1], atol=1e-3)
     last = Rotation.from_quat(arrays["pose/quaternion"][0, m], scalar_first=True)
     assert (last * turns[-1].inv()).magnitude() < 0.01
+
+
+def mano_rotations(fingers: np.ndarray) -> np.ndarray:
+    """(T, 15, 3, 3) rotations of MANO's joints against their parents that pose the human hand like angles (T, 20)."""
+    names = [link.name for link in HUMAN.links]
+    rows = []
+    different, which = np.unique(fingers, axis=0, return_inverse=True)
+    for q in different:
+        turns = Rotation.from_quat(link_poses(HUMAN, q)[1], scalar_first=True).as_matrix()
+        turns = TO_HUMAN.T @ turns @ TO_HUMAN
+        for finger in MANO_FINGERS:
+            links = ("metacarpal", "proximal", "distal") if finger == "thumb" else ("proximal", "middle", "distal")
+            parent = np.eye(3)
+            for link in links:
+                turn = turns[names.index(f"{finger}_{link}")]
+                rows.append(parent.T @ turn)
+                parent = turn
+    return np.array(rows).reshape(-1, 15, 3, 3)[which]
+
+
+def mano_root(rotation: Rotation) -> Rotation:
+    """MANO's root rotations from those of the human hand's wrist frame."""
+    return rotation * Rotation.from_matrix(TO_HUMAN)
