@@ -44,7 +44,7 @@ def test_poses_sink_along_the_heading(taskset):
     v = np.stack(v, -1)
     heading = axis + 2 * np.cross(v, np.cross(v, axis) + w[..., None] * axis)
     depth = (moved * heading).sum(-1)
-    assert 0 <= depth.min() and 0.0095 < depth.max() <= 0.01001
+    assert depth.min() >= 0 and 0.0095 < depth.max() <= 0.01001
     np.testing.assert_allclose(moved, depth[..., None] * heading, atol=1e-6)
 
 
