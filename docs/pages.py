@@ -1,0 +1,129 @@
+"""Pages of the reference that are made from the code, so that they cannot fall behind it."""
+
+import contextlib
+import dataclasses
+import inspect
+import io
+import os
+import re
+import typing
+from collections.abc import Iterator
+
+from docutils import nodes
+from docutils.parsers.rst import Directive
+from sphinx.application import Sphinx
+
+from common.config import RunConfig
+from common.wire import messages
+from common.wire.messages import MessageSpec
+from services.cli import main
+
+_DEFAULT = 60
+"""Characters of a default value that are shown."""
+
+
+class Commands(Directive):
+    """The help of every command and its subcommands."""
+
+    def run(self) -> list[nodes.Node]:
+        """A section for each command."""
+        return [
+            _section(f"congrasp {' '.join(words)}", [_literal(_help(words))])
+            for name in main.COMMANDS
+            for words in _words(name)
+        ]
+
+
+class Configuration(Directive):
+    """Every field of a run's configuration: its name on the command line, its default, and what it means."""
+
+    def run(self) -> list[nodes.Node]:
+        """A table."""
+        rows = [(f"--{name}", _short(value), text) for name, value, text in _fields(RunConfig(), "")]
+        return [_table(("option", "default", "meaning"), rows)]
+
+
+class Messages(Directive):
+    """What every kind of message on the wire holds."""
+
+    def run(self) -> list[nodes.Node]:
+        """A section for each kind."""
+        specs = [value for value in vars(messages).values() if isinstance(value, MessageSpec)]
+        return [_section(spec.kind, [_table(("entry", "type", "shape"), list(_entries(spec)))]) for spec in specs]
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Makes the directives known to Sphinx."""
+    for name, directive in (("commands", Commands), ("configuration", Configuration), ("messages", Messages)):
+        app.add_directive(name, directive)
+    return {"parallel_read_safe": True}
+
+
+def _words(command: str) -> Iterator[list[str]]:
+    yield [command]
+    for below in re.findall(r"^│   • (\S+)", _help([command]), re.M):
+        yield [command, below]
+
+
+def _help(words: list[str]) -> str:
+    said = io.StringIO()
+    os.environ["COLUMNS"] = "100"
+    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+        main.load(words[0])([*words[1:], "--help"])
+    return said.getvalue().rstrip()
+
+
+def _fields(config: typing.Any, prefix: str) -> Iterator[tuple[str, typing.Any, str]]:
+    """Name, default and docstring of every field, those of nested dataclasses after a dot."""
+    docs = dict(re.findall(r'^    (\w+): [^\n]*\n    """(.+?)"""', inspect.getsource(type(config)), re.M | re.S))
+    for field in dataclasses.fields(config):
+        value, name = getattr(config, field.name), f"{prefix}{field.name}".replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            yield from _fields(value, f"{prefix}{field.name}.")
+        else:
+            yield name, value, " ".join(docs[field.name].split())
+
+
+def _entries(spec: MessageSpec) -> Iterator[tuple[str, str, str]]:
+    for name, array in spec.arrays.items():
+        shape = "any" if array.shape is None else f"({', '.join(map(str, array.shape))})"
+        yield name, " or ".join(array.dtypes), shape + (", may be absent" if array.optional else "")
+    for name, kind in spec.meta.items():
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        yield name, " or ".join(one.__name__ for one in kinds), "metadata"
+
+
+def _short(value: typing.Any) -> str:
+    text = "" if value == "" else str(value)
+    return text if len(text) <= _DEFAULT else text[:_DEFAULT] + "…"
+
+
+def _section(title: str, content: list[nodes.Node]) -> nodes.section:
+    section = nodes.section(ids=[nodes.make_id(title)])
+    section += nodes.title(text=title)
+    section.extend(content)
+    return section
+
+
+def _literal(text: str) -> nodes.literal_block:
+    block = nodes.literal_block(text, text)
+    block["language"] = "text"
+    return block
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> nodes.table:
+    group = nodes.tgroup(cols=len(head))
+    group.extend(nodes.colspec(colwidth=1) for _ in head)
+    body = nodes.tbody()
+    for row in rows:
+        body += _row([nodes.literal(text=row[0]), *(nodes.Text(cell) for cell in row[1:])])
+    group += nodes.thead("", _row([nodes.Text(cell) for cell in head]))
+    group += body
+    return nodes.table("", group)
+
+
+def _row(cells: list[nodes.Node]) -> nodes.row:
+    row = nodes.row()
+    for cell in cells:
+        row += nodes.entry("", nodes.paragraph("", "", cell))
+    return row
