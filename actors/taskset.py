@@ -15,12 +15,21 @@ import numpy as np
 
 from common import rotations
 from common.config import TaskConfig
-from common.constraints.headings import Headings, above, clear_table, feasible, sample_headings
+from common.constraints.headings import (
+    INWARD,
+    MAX_WIDTH,
+    Headings,
+    above,
+    clear_table,
+    feasible,
+    sample_headings,
+)
 from common.constraints.poses import Poses, closed_poses
 from common.constraints.trajectories import make_trajectories
 from common.errors import CongraspError
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
+from common.objects.pool import object_scale
 from common.objects.spec import SURFACE_POINTS, GraspObject
 from common.parallel import parallel_map
 from common.task.types import Array
@@ -80,16 +89,22 @@ def build_taskset(
     Args:
       hand: the hand.
       task: geometry of the approach.
-      objects: N objects.
+      objects: N objects, in the hand's size already (`common.objects.pool.sized`).
       seed: of everything random.
       given: of each object the headings to take instead of sampled ones, if there are any.
 
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
-    seeds = [(seed, n) for n in range(len(objects))]
+    count, scale = len(objects), object_scale(hand, task)
+    seeds = [(seed, n) for n in range(count)]
     rows = parallel_map(
-        headings_of, itertools.repeat(task, len(objects)), objects, seeds, given or [None] * len(objects)
+        headings_of,
+        itertools.repeat(task, count),
+        objects,
+        seeds,
+        given or [None] * count,
+        itertools.repeat(scale, count),
     )
     rests = max(len(row["rest"]) for row in rows)
     for row in rows:
@@ -164,7 +179,7 @@ def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Pose
 
 
 def headings_of(
-    task: TaskConfig, obj: GraspObject, seed: tuple[int, int], given: Headings | None = None
+    task: TaskConfig, obj: GraspObject, seed: tuple[int, int], given: Headings | None = None, scale: float = 1.0
 ) -> dict[str, np.ndarray]:
     """What NumPy finds out about one object; resting poses without a reachable heading are left out.
 
@@ -173,12 +188,17 @@ def headings_of(
       obj: the object.
       seed: of its headings.
       given: `HEADINGS` headings to take instead of sampled ones.
+      scale: of the object; the rules' lengths follow it, so that a larger hand gets the headings of the smaller object.
 
     Raises:
       CongraspError: it has no heading that the hand can reach in any resting pose.
     """
     rng = np.random.default_rng(seed)
-    whole, plus = (given or sample_headings(obj, rng, count=HEADINGS, use_affordance=use) for use in (False, True))
+    inward, width = scale * INWARD, scale * MAX_WIDTH
+    whole, plus = (
+        given or sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width)
+        for use in (False, True)
+    )
     assert whole is not None, "only O+ may be out of reach"
     sets = [whole, plus or whole]
     reachable = np.array([[_reachable(task, headings, rest) for rest in obj.rest_poses] for headings in sets])
@@ -189,7 +209,7 @@ def headings_of(
     if len(usable) == 0:
         raise CongraspError(
             f"The object '{obj.name}' cannot be approached in any of its resting poses.",
-            "Scale it so that some part is narrower than 12 cm, or leave it out.",
+            f"Scale it so that some part is narrower than {100 * scale * MAX_WIDTH:.0f} cm, or leave it out.",
         )
     reachable, rest = reachable[:, usable], obj.rest_poses[usable]
     index = np.array([[_repeated(row) for row in variant] for variant in reachable])

@@ -87,7 +87,9 @@ class TaskConfig:
     """The task: hand, timing, observation, control, reward and constraint sampling."""
 
     hand: str = "human"
-    """Name of the hand."""
+    """Name of the hand, or a hand file (`congrasp hands list` and `import`)."""
+    object_scale: float = 0.0
+    """Factor on the objects' lengths, at the same density; 0 takes the hand's own (1.4 for Allegro, 1.1 for Sharpa)."""
     control_dt: float = 0.01
     """Seconds between two actions."""
     substeps: int = 4

@@ -12,6 +12,7 @@ from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands.spec import Hand
 from common.objects import store
+from common.objects.pool import object_scale, sized
 from common.objects.spec import GraspObject
 from common.wire.codec import Message, decode, encode
 
@@ -49,8 +50,19 @@ def make_sets(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
-    taskset = TaskSet(*(np.asarray(field) for field in build_taskset(hand, task, objects, seed)))
-    return [set_of(hand, TaskSet(*(field[n] for field in taskset)), obj, seed) for n, obj in enumerate(objects)]
+    fitting = sized(hand, task, objects)
+    taskset = TaskSet(*(np.asarray(field) for field in build_taskset(hand, task, fitting, seed)))
+    scale = object_scale(hand, task)
+    return [
+        set_of(
+            hand,
+            TaskSet(*(field[n] for field in taskset)),
+            fitting[n],
+            seed,
+            {"object_scale": scale, "object_digest": store.digest(obj)},
+        )
+        for n, obj in enumerate(objects)
+    ]
 
 
 def set_of(hand: Hand, row: TaskSet, obj: GraspObject, seed: int, about: dict[str, Any] | None = None) -> Message:
@@ -98,11 +110,12 @@ def set_of(hand: Hand, row: TaskSet, obj: GraspObject, seed: int, about: dict[st
         "hand": hand.name,
         "object": obj.name,
         "object_digest": store.digest(obj),
+        "object_scale": 1.0,
         "seed": seed,
         "variants": list(VARIANTS),
         "finger_joints": [joint.name for joint in hand.joints],
         "quaternions": "(w, x, y, z)",
-        "object_frame": "origin at the centre of mass, orientation of the object file",
+        "object_frame": "origin at the centre of mass, orientation of the object file, lengths times object_scale",
         "arrays": _MEANING,
         **(about or {}),
     }

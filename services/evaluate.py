@@ -21,6 +21,7 @@ from common.config import PhysicsName, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.spec import Hand
+from common.objects.pool import sized
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, mean_action
 from common.task.features import Features
@@ -78,7 +79,7 @@ class Evaluator:
 
         Args:
           bundle: the policy.
-          objects: what it grasps.
+          objects: what it grasps; they are brought to the size of its hand (`common.objects.pool.sized`).
           physics: engine; not `auto`.
           batch: worlds that run side by side; 0 chooses by the engine.
           threads: threads of the `native` engine.
@@ -90,7 +91,7 @@ class Evaluator:
         """
         base = task or bundle.task
         hold = hold_steps or base.hold_steps
-        self.bundle, self.objects = bundle, objects
+        self.bundle = bundle
         self.task = dataclasses.replace(
             base,
             hold_steps=min(base.hold_steps, hold),
@@ -101,9 +102,10 @@ class Evaluator:
         )
         self._hold = hold
         self._hand = get_hand(bundle.spec.hand)
+        self.objects = sized(self._hand, self.task, objects)
         self._physics, self._threads, self._seed = physics, threads, seed
         self._batch = batch or _BATCH[physics]
-        self._taskset = taskset or build_taskset(self._hand, self.task, objects, seed)
+        self._taskset = taskset or build_taskset(self._hand, self.task, self.objects, seed)
         self._referred = taskset is not None
 
     def samples(
@@ -141,10 +143,10 @@ class Evaluator:
         with self._worker(mixture(self.task, [constraint]), episodes) as worker:
             yield self._gather(worker, [constraint], episodes, progress)[constraint]
             for number, objects in enumerate(pools, 1):
-                self.objects = objects
-                self._taskset = build_taskset(self._hand, self.task, objects, self._seed + number)
+                self.objects = sized(self._hand, self.task, objects)
+                self._taskset = build_taskset(self._hand, self.task, self.objects, self._seed + number)
                 self._referred = False
-                worker.replace_objects(objects, self._taskset)
+                worker.replace_objects(self.objects, self._taskset)
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
 
@@ -229,7 +231,7 @@ class Evaluator:
     def row(self, constraint: str, sample: Sample, group: str = "") -> Row:
         """A row of episodes of this evaluator's protocol."""
         held = self._hold == two_seconds(self.task)
-        return summarise(constraint, self.bundle.spec.hand, sample, held_2s=held, group=group)
+        return summarise(constraint, self._hand.name, sample, held_2s=held, group=group)
 
     def draws(self, constraint: str, episodes: int, count: int) -> list[Row]:
         """`count` rows of `episodes` each from independent draws, to see how much chance there is in one."""

@@ -1,5 +1,7 @@
 """Named configurations to start from; every field can be overridden on the command line."""
 
+import dataclasses
+
 from common.config import (
     CurriculumConfig,
     NetworkConfig,
@@ -10,6 +12,7 @@ from common.config import (
     TaskConfig,
 )
 from common.errors import CongraspError
+from common.hands import get_hand
 from common.objects.procedural import PRIMITIVE_FAMILIES
 
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
@@ -62,6 +65,24 @@ PRESETS = {
 }
 
 
+def _robot(hand: str, force_max: float) -> RunConfig:
+    """The human preset for another hand; the heavier its objects, the harder it may press."""
+    human = PRESETS["human"]
+    ramp = human.curriculum
+    return dataclasses.replace(
+        human,
+        name=hand,
+        task=dataclasses.replace(
+            human.task, hand=hand, reward=dataclasses.replace(human.task.reward, force_max=force_max)
+        ),
+        curriculum=dataclasses.replace(ramp, reward=dataclasses.replace(ramp.reward, force_max=force_max)),
+    )
+
+
+# At 1.4 times the size an object weighs 2.7 times as much, at 1.1 times 1.3 times.
+PRESETS |= {"allegro": _robot("allegro", 8.0), "sharpa": _robot("sharpa", 6.0)}
+
+
 def easier(config: RunConfig) -> list[str]:
     """What makes a run easier than the full task, in words; empty if nothing does."""
     task, full = config.task, PRESETS["human"]
@@ -89,3 +110,9 @@ def get_preset(name: str) -> RunConfig:
     if name not in PRESETS:
         raise CongraspError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(PRESETS)}.")
     return PRESETS[name]
+
+
+def with_hand(config: RunConfig, hand: str | None) -> RunConfig:
+    """The configuration with another hand, or its own; a hand's file becomes part of it, for actors elsewhere."""
+    found = get_hand(hand or config.task.hand)
+    return dataclasses.replace(config, task=dataclasses.replace(config.task, hand=found.reference))

@@ -4,11 +4,18 @@ import functools
 from collections.abc import Callable
 
 from common.errors import CongraspError
+from common.hands.allegro import ALLEGRO
 from common.hands.human import HUMAN
 from common.hands.mano import own_mano_hand
+from common.hands.sharpa import SHARPA
 from common.hands.spec import Hand
 
-HANDS: dict[str, Callable[[], Hand]] = {"human": lambda: HUMAN, "mano": own_mano_hand}
+HANDS: dict[str, Callable[[], Hand]] = {
+    "human": lambda: HUMAN,
+    "allegro": lambda: ALLEGRO,
+    "sharpa": lambda: SHARPA,
+    "mano": own_mano_hand,
+}
 """Makers of the hands; `mano` needs the user's own file."""
 
 

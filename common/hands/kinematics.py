@@ -117,13 +117,19 @@ def hand_center(hand: Hand, points: Array) -> Array:
     return 0.5 * (tips[..., 0, :] + jnp.mean(tips[..., 1:, :], -2))
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _points(hand: Hand, q: Array) -> Array:
+    """(P, 3) `keypoints` of finger angles (F,), in one program rather than a hundred."""
+    return keypoints(hand, link_transforms(hand, q))
+
+
 @functools.cache
 def grasp_frame(hand: Hand) -> GraspFrame:
     """The grasp frame of the open hand; v is the direction from the wrist to the centre, made orthogonal to w."""
     with jax.ensure_compile_time_eval():
-        points = np.asarray(keypoints(hand, link_transforms(hand, jnp.array(hand.q_open))))
-        center = np.asarray(hand_center(hand, jnp.array(points)))
+        points = np.asarray(_points(hand, jnp.array(hand.q_open)))
     tips = points[len(hand.links) :]
+    center = 0.5 * (tips[0] + tips[1:].mean(0))
     across = tips[1:].mean(0) - tips[0]
     opening = float(np.linalg.norm(across))
     cross = across / opening

@@ -13,7 +13,7 @@ import numpy as np
 
 from common.errors import CongraspError
 from common.hands.human import FINGER_GAINS, WRIST
-from common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain
+from common.hands.spec import Capsule, Hand, Joint, Link, chain, vector
 from common.pickles import read_pickle
 
 VARIABLE = "CONGRASP_MANO"
@@ -128,10 +128,10 @@ def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
         radii = _RADII[finger]
         # Skin ends at the fingertip, a capsule's axis one radius before it.
         end = ends[i] - radii[2] * _unit(ends[i] - anchors[i, 2])
-        points = [_vector(point) for point in (*anchors[i], end)]
+        points = [vector(point) for point in (*anchors[i], end)]
         limits = _THUMB_LIMITS if finger == "thumb" else _LIMITS
         moved = [
-            Joint(f"{finger}_{name}", _vector(axis), points[bone], *np.radians(limits[name]).tolist(), **FINGER_GAINS)
+            Joint(f"{finger}_{name}", vector(axis), points[bone], *np.radians(limits[name]).tolist(), **FINGER_GAINS)
             for name, bone, axis in zip(limits, (0, 0, 1, 2), (*axes[i, 0, 1:], *axes[i, 1:, 2]), strict=True)
         ]
         names = ("metacarpal", "proximal", "distal") if finger == "thumb" else ("proximal", "middle", "distal")
@@ -139,7 +139,7 @@ def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
         groups = [(moved[0], moved[1]), (moved[2],), (moved[3],)]
         links += chain([f"{finger}_{name}" for name in names], groups, points, radii, _MASSES[finger], weights)
         if finger != "thumb":
-            palm.append(Capsule(_vector(0.2 * anchors[i, 0]), points[0], 0.0100))
+            palm.append(Capsule(vector(0.2 * anchors[i, 0]), points[0], 0.0100))
     return Hand(
         name="mano",
         links=(Link("palm", "", (), tuple(palm), 0.250, 1.0), *links),
@@ -179,8 +179,3 @@ def _each(**angles: float) -> dict[str, float]:
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def _vector(array: np.ndarray) -> Vector:
-    x, y, z = array.tolist()
-    return x, y, z

@@ -14,6 +14,12 @@ import numpy as np
 Vector = tuple[float, float, float]
 
 
+def vector(array: np.ndarray) -> Vector:
+    """An array (3,) as data."""
+    x, y, z = array.tolist()
+    return x, y, z
+
+
 @dataclasses.dataclass(frozen=True)
 class Joint:
     """A hinge. `axis` and `anchor` in the wrist frame at zero; gains in N.m/rad, N.m.s/rad and N.m."""
@@ -86,6 +92,13 @@ class Hand:
     wrist: WristGains
     object_scale: float = 1.0
     """Factor on object sizes in the paper's comparison of hands."""
+    text: str = ""
+    """The hand's file, for hands that are not part of the package."""
+
+    @property
+    def reference(self) -> str:
+        """What `common.hands.get_hand` finds this hand by on any machine: its name, or all of its file."""
+        return self.text or self.name
 
     @functools.cached_property
     def joints(self) -> tuple[Joint, ...]:

@@ -1,9 +1,11 @@
 """The objects of one actor or of one evaluation, from a run's configuration."""
 
 import pathlib
+from collections.abc import Sequence
 
-from common.config import ObjectsConfig
+from common.config import ObjectsConfig, TaskConfig
 from common.errors import CongraspError
+from common.hands.spec import Hand
 from common.objects import procedural
 from common.objects.spec import GraspObject
 from common.objects.store import Catalogue
@@ -33,6 +35,16 @@ def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:
     if config.count < 1:
         raise CongraspError(f"A pool of {config.count} objects is empty.", "Set --objects.count to at least 1.")
     return procedural.generate_many(config.count, first_seed(config, shift), config.families)
+
+
+def object_scale(hand: Hand, task: TaskConfig) -> float:
+    """Factor on the lengths of this task's objects: the task's, or else the hand's own."""
+    return task.object_scale or hand.object_scale
+
+
+def sized(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> list[GraspObject]:
+    """Objects in the size in which this hand grasps them."""
+    return [obj.scaled(object_scale(hand, task)) for obj in objects]
 
 
 def first_seed(config: ObjectsConfig, shift: int) -> int:

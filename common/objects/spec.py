@@ -74,3 +74,31 @@ class GraspObject:
     def non_graspable_points(self) -> np.ndarray:
         """(512,) whether each surface point belongs to O-."""
         return ~self.graspable[self.labels]
+
+    def scaled(self, factor: float) -> "GraspObject":
+        """The object of the same density with every length times `factor`."""
+        if factor == 1.0:
+            return self
+
+        def longer(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+            x, y, z = (factor * length for length in vector)
+            return x, y, z
+
+        pieces = tuple(
+            dataclasses.replace(
+                piece,
+                size=longer(piece.size),
+                pos=longer(piece.pos),
+                vertices=None if piece.vertices is None else factor * piece.vertices,
+            )
+            for piece in self.pieces
+        )
+        return dataclasses.replace(
+            self,
+            pieces=pieces,
+            mass=factor**3 * self.mass,
+            inertia=factor**5 * self.inertia,
+            points=factor * self.points,
+            rest_poses=self.rest_poses * np.array([factor] * 3 + [1.0] * 4),
+            visual_vertices=factor * self.visual_vertices,
+        )

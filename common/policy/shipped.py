@@ -10,7 +10,7 @@ _FOLDER = pathlib.Path(__file__).with_name("data")
 
 def shipped(hand: str) -> pathlib.Path | None:
     """The file of the policy that comes with the package for this hand; None if none does."""
-    path = _FOLDER / f"{hand}.safetensors"
+    path = _FOLDER / f"{get_hand(hand).name}.safetensors"
     return path if path.exists() else None
 
 
@@ -20,10 +20,10 @@ def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path
     Raises:
       CongraspError: neither is there, or there is no such hand.
     """
-    path = given or shipped(get_hand(hand).name)
+    path = given or shipped(hand)
     if path is None:
         raise CongraspError(
-            f"No policy was named, and none comes with this installation for the hand '{hand}'.",
+            f"No policy was named, and none comes with this installation for the hand '{get_hand(hand).name}'.",
             "Give --policy FILE: every run of 'congrasp train' has a policy.safetensors.",
         )
     return path

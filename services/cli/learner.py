@@ -10,7 +10,7 @@ import tyro
 from common.config import RunConfig, run_config_from_json, to_json
 from services.cli.train import preset_of
 from services.cli.watch import Watch, Watched
-from services.presets import get_preset
+from services.presets import get_preset, with_hand
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +25,8 @@ class Learner:
     """Where the run is kept."""
     preset: str = "quickstart"
     """Named configuration to start from."""
+    hand: str | None = None
+    """The hand, by its name or its file; by default the preset's."""
     listen: str = "tcp/127.0.0.1:7447"
     """Endpoint for the actors, which takes four ports from this one on. Other machines need tls/0.0.0.0:PORT."""
     certs: pathlib.Path | None = None
@@ -79,7 +81,8 @@ class Learner:
         from services.train import train_in_process
 
         resume = self.resume and (self.run_dir / "checkpoints" / "latest").exists()
-        config = open_run(self.run_dir) if self.resume and self.rank == 0 else self.config
+        own = with_hand(self.config, self.hand)
+        config = open_run(self.run_dir) if self.resume and self.rank == 0 else own
         listen = shifted(self.listen, self.rank * len(FLOWS))
         credentials = listening(listen, self.certs, "learner", insecure=self.insecure)
         with on_signal() as stop, ZenohTransport(listen=[listen], credentials=credentials) as transport:

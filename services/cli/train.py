@@ -9,19 +9,22 @@ from typing import Annotated
 import tyro
 
 from common.config import RunConfig
-from services.presets import get_preset
+from services.presets import get_preset, with_hand
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
     """Trains a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
 
-    Starts from a preset (`--preset quickstart` or `human`); every field of the run can be set on the command line.
+    Starts from a preset (`--preset quickstart`, `human`, `allegro` or `sharpa`); every field of the run can be set on
+    the command line.
     """
 
     config: Annotated[RunConfig, tyro.conf.arg(name="")]
     preset: str = "quickstart"
     """Named configuration to start from."""
+    hand: str | None = None
+    """The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by default the preset's."""
     run_dir: pathlib.Path | None = None
     """Where the run is kept; runs/NAME-DATE by default."""
     actors: int | None = None
@@ -49,9 +52,10 @@ class Train:
         """Runs the command."""
         from services.quickstart import run_training
 
-        run_dir = self.run_dir or pathlib.Path("runs") / f"{self.config.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+        config = with_hand(self.config, self.hand)
+        run_dir = self.run_dir or pathlib.Path("runs") / f"{config.name}-{time.strftime('%Y%m%d-%H%M%S')}"
         return run_training(
-            self.config,
+            config,
             run_dir,
             actors=self.actors,
             resume=self.resume,

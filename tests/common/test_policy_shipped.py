@@ -23,7 +23,7 @@ def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monke
         policy_file(None, "paw")
     (tmp_path / "human.safetensors").touch()
     assert policy_file(None) == shipped("human") == tmp_path / "human.safetensors"
-    assert shipped("claw") is None
+    assert shipped("allegro") is None
 
 
 def test_what_is_shipped_is_installed_and_can_be_loaded():

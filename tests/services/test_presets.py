@@ -7,7 +7,7 @@ import pytest
 from common.config import run_config_from_json, to_json
 from common.errors import CongraspError
 from common.hands import get_hand
-from services.presets import PRESETS, easier, get_preset
+from services.presets import PRESETS, easier, get_preset, with_hand
 
 
 def test_an_unknown_preset_lists_those_that_exist():
@@ -24,6 +24,18 @@ def test_a_preset_travels_and_its_batch_can_be_cut(name):
     assert transitions >= config.ppo.minibatches
     # Rollouts hold whole episodes, or success could not be counted from the first of them on.
     assert config.rollout_steps >= config.task.approach_steps + config.task.hold_steps
+
+
+def test_other_hands_are_trained_by_the_recipe_of_the_human_hand():
+    human = get_preset("human")
+    for name, scale in (("allegro", 1.4), ("sharpa", 1.1)):
+        config = get_preset(name)
+        assert get_hand(config.task.hand).object_scale == scale and easier(config) == []
+        assert config.ppo == human.ppo and config.curriculum.ramp == human.curriculum.ramp
+        assert config.task.reward.force_max == config.curriculum.reward.force_max > human.task.reward.force_max
+    assert with_hand(human, "allegro").task == dataclasses.replace(human.task, hand="allegro")
+    with pytest.raises(CongraspError, match="no hand 'paw'"):
+        with_hand(human, "paw")
 
 
 def test_what_was_made_easier_is_said_and_nothing_else():

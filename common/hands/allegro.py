@@ -1,0 +1,119 @@
+"""The right Allegro hand V3: four fingers of four joints each.
+
+Geometry, limits and masses are those of the maker's published models (BSD-2, SimLab 2016). Wrist frame: origin at the
+palm's mounting end, fingers towards +z, closing side +x, index finger on the side of +y. Collision capsules stand for
+the makers' boxes, 20 x 27 mm across a phalanx.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from common.hands.spec import Capsule, Hand, Joint, Link, Vector, WristGains, chain, vector
+
+_GAINS = {"kp": 3.0, "kv": 0.1, "torque_limit": 0.7, "armature": 1e-3}
+"""Of a proportional-derivative controller as it is common for this hand; the motors' greatest torque is 0.7 N.m."""
+_LEAN = np.radians(5.0)
+"""Index and ring finger lean outwards by this."""
+_RADIUS, _TIP_RADIUS = 0.0115, 0.0120
+_KNUCKLE = np.array([0.0, 0.0, 0.095])
+"""Base of the middle finger, where the makers' models have the palm's origin."""
+_LIMITS = ((-0.47, 0.47), (-0.196, 1.61), (-0.174, 1.709), (-0.227, 1.618))
+_THUMB_LIMITS = ((0.263, 1.396), (-0.105, 1.163), (-0.189, 1.644), (-0.162, 1.719))
+_LENGTHS = (0.0164, 0.0540, 0.0384, 0.0267)
+"""From joint to joint, and from the last one to the fingertip's centre, m."""
+_NAMES = ("base", "proximal", "medial", "distal")
+
+
+def _finger(name: str, base: np.ndarray, lean: float) -> tuple[Link, ...]:
+    """A finger whose base is at `base` from the knuckle, turned outwards by `lean` about the palm's normal."""
+    along = np.array([0.0, np.sin(lean), np.cos(lean)])
+    flexion = np.array([0.0, np.cos(lean), -np.sin(lean)])
+    points = [vector(_KNUCKLE + base + reach * along) for reach in np.cumsum([0.0, *_LENGTHS])]
+    axes = (along, flexion, flexion, flexion)
+    return _links(name, points, axes, _LIMITS, (0.0119, 0.0650, 0.0355, 0.0264), (0.5, 1.0, 1.0, 3.0))
+
+
+def _links(
+    name: str,
+    points: list[Vector],
+    axes: tuple[np.ndarray, ...],
+    limits: tuple[tuple[float, float], ...],
+    masses: tuple[float, ...],
+    weights: tuple[float, ...],
+) -> tuple[Link, ...]:
+    joints = [
+        (Joint(f"{name}_{i}", vector(axis), point, *limit, **_GAINS),)
+        for i, (axis, point, limit) in enumerate(zip(axes, points, limits, strict=False))
+    ]
+    return chain([f"{name}_{x}" for x in _NAMES], joints, points, [_RADIUS] * 3 + [_TIP_RADIUS], masses, weights)
+
+
+def _thumb() -> tuple[Link, ...]:
+    """The thumb: at zero it points away from the index finger's side, and its first joint turns it into opposition."""
+    up = np.array([0.0, np.sin(_LEAN), np.cos(_LEAN)])
+    out = np.array([0.0, np.cos(_LEAN), -np.sin(_LEAN)])
+    forward = np.array([1.0, 0.0, 0.0])
+    root = _KNUCKLE + np.array([-0.0182, 0.019333, -0.045987])
+    first = root - 0.027 * up + 0.005 * forward + 0.0399 * out
+    points = [root, *(first + reach * out for reach in (0.0, 0.0177, 0.0691, 0.1114))]
+    axes = (-up, out, forward, forward)
+    block, *rest = _links(
+        "thumb",
+        [vector(point) for point in points],
+        axes,
+        _THUMB_LIMITS,
+        (0.0176, 0.0119, 0.0380, 0.0556),
+        (1.0, 1.0, 2.0, 6.0),
+    )
+    # The first link is a block beside its joint's axis.
+    middle = root - 0.0179 * up + 0.009 * forward + 0.0145 * out
+    housing = Capsule(vector(middle - 0.008 * out), vector(middle + 0.008 * out), 0.0150)
+    return (dataclasses.replace(block, capsules=(housing,)), *rest)
+
+
+_PALM = Link(
+    "palm",
+    "",
+    (),
+    tuple(Capsule((-0.0093, y, 0.0204), (-0.0093, y, 0.0746), 0.0204) for y in (-0.0361, -0.0120, 0.0120, 0.0361)),
+    0.4154,
+    1.0,
+)
+
+ALLEGRO = Hand(
+    name="allegro",
+    links=(
+        _PALM,
+        *_thumb(),
+        *_finger("index", np.array([0.0, 0.0435, -0.001542]), _LEAN),
+        *_finger("middle", np.array([0.0, 0.0, 0.0007]), 0.0),
+        *_finger("ring", np.array([0.0, -0.0435, -0.001542]), -_LEAN),
+    ),
+    thumb="thumb_distal",
+    open_pose={
+        "thumb_0": 1.30,
+        "thumb_1": 0.20,
+        "thumb_2": 0.20,
+        "thumb_3": 0.20,
+        **{f"{finger}_{i}": x for finger in ("index", "middle", "ring") for i, x in ((1, 0.30), (2, 0.30), (3, 0.25))},
+    },
+    closed_pose={
+        "thumb_0": 1.35,
+        "thumb_1": 0.50,
+        "thumb_2": 0.80,
+        "thumb_3": 1.00,
+        **{f"{finger}_{i}": x for finger in ("index", "middle", "ring") for i, x in ((1, 1.30), (2, 1.20), (3, 1.00))},
+    },
+    wrist=WristGains(
+        slide_kp=2000.0,
+        slide_kv=100.0,
+        slide_limit=300.0,
+        slide_armature=0.2,
+        hinge_kp=100.0,
+        hinge_kv=6.0,
+        hinge_limit=40.0,
+        hinge_armature=0.02,
+    ),
+    object_scale=1.4,
+)

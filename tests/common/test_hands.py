@@ -1,0 +1,220 @@
+"""Allegro and Sharpa against the makers' figures, and what every hand must be able to do."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from actors.physics.engine import World
+from actors.physics.native import NativePhysics
+from common.config import TaskConfig
+from common.errors import CongraspError
+from common.hands import HANDS, get_hand
+from common.hands.kinematics import grasp_frame, link_poses
+from common.hands.mano import VARIABLE
+from common.hands.mjcf import add_hand
+from common.hands.spec import link_origin
+from common.logs import poses
+from common.objects import procedural
+from common.objects.pool import sized
+from tests.mano_file import mano_pickle
+
+ROBOTS = ("allegro", "sharpa")
+# Fingertips at zero, m, in the frame of the makers' models, thumb first.
+TIPS = {
+    "allegro": [(-0.0132, 0.1677, -0.0861), (0.0, 0.0553, 0.1334), (0.0, 0.0, 0.1362), (0.0, -0.0553, 0.1334)],
+    "sharpa": [
+        (0.0154, 0.1233, 0.1102),
+        (0.0010, 0.0303, 0.2004),
+        (0.0000, 0.0100, 0.2034),
+        (0.0015, -0.0103, 0.1974),
+        (0.0030, -0.0311, 0.1914),
+    ],
+}
+ORIGIN = {"allegro": (0.0, 0.0, 0.095), "sharpa": (0.0, 0.0, 0.0)}  # of the makers' frame in the wrist frame
+
+
+@pytest.fixture(params=["human", "mano", *ROBOTS])
+def hand(request, tmp_path_factory, monkeypatch):
+    file = tmp_path_factory.getbasetemp() / "hands.pkl"
+    if not file.exists():
+        file.write_bytes(mano_pickle())
+    monkeypatch.setenv(VARIABLE, str(file))
+    get_hand.cache_clear()
+    yield get_hand(request.param)
+    get_hand.cache_clear()
+
+
+def _tips(hand, q):
+    """Fingertips (tips, 3) in the wrist frame by MuJoCo, thumb first."""
+    position, quaternion = poses.link_poses(hand, q)
+    carriers = list(hand.tip_links)
+    reach = np.array([np.subtract(hand.links[i].tip, link_origin(hand.links[i])) for i in carriers])
+    return position[carriers] + Rotation.from_quat(quaternion[carriers], scalar_first=True).apply(reach)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_fingertips_at_zero_are_where_the_makers_have_them(name):
+    hand = get_hand(name)
+    tips = _tips(hand, np.zeros(len(hand.joints))) - np.array(ORIGIN[name])
+    if name == "sharpa":  # its fingertip is skin, a capsule's radius beyond the end of the axis
+        distal = np.array([hand.links[i].capsules[0].end for i in hand.tip_links]) - np.array(
+            [hand.links[i].capsules[0].start for i in hand.tip_links]
+        )
+        radii = np.array([hand.links[i].capsules[0].radius for i in hand.tip_links])
+        tips = tips + radii[:, None] * distal / np.linalg.norm(distal, axis=-1, keepdims=True)
+    np.testing.assert_allclose(tips, TIPS[name], atol=1e-4)
+
+
+def test_joint_limits_torques_and_masses_are_the_makers():
+    allegro, sharpa = get_hand("allegro"), get_hand("sharpa")
+    assert (len(allegro.joints), len(sharpa.joints)) == (16, 22)
+    assert sum(link.mass for link in allegro.links) == pytest.approx(0.955, abs=1e-3)
+    assert sum(link.mass for link in sharpa.links) == pytest.approx(1.246, abs=1e-3)
+    joints = {joint.name: joint for hand in (allegro, sharpa) for joint in hand.joints}
+    expected = {
+        "thumb_0": (0.263, 1.396, 0.7),
+        "thumb_1": (-0.105, 1.163, 0.7),
+        "middle_0": (-0.47, 0.47, 0.7),
+        "ring_3": (-0.227, 1.618, 0.7),
+        "thumb_cmc_fe": (-0.1745, 1.9199, 3.3),
+        "thumb_mcp_aa": (-0.3491, 0.3491, 1.864),
+        "thumb_ip": (0.0, 1.7453, 0.638),
+        "pinky_cmc": (0.0, 0.2618, 0.5285),
+        "ring_dip": (0.0, 1.3963, 0.189),
+    }
+    for name, figures in expected.items():
+        assert (joints[name].lower, joints[name].upper, joints[name].torque_limit) == figures, name
+    assert (allegro.object_scale, sharpa.object_scale, get_hand("human").object_scale) == (1.4, 1.1, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "joint", "tip", "anchor", "axis"),
+    [  # where the makers' models have joints at zero
+        ("allegro", "thumb_0", 0, (-0.0182, 0.0193, -0.0460), (0.0, -0.087, -0.996)),
+        ("allegro", "thumb_1", 0, (-0.0132, 0.0567, -0.0764), (0.0, 0.996, -0.087)),
+        ("allegro", "thumb_3", 0, (-0.0132, 0.1256, -0.0824), (1.0, 0.0, 0.0)),
+        ("allegro", "index_1", 1, (0.0, 0.0449, 0.0148), (0.0, 0.996, -0.087)),
+        ("allegro", "index_3", 1, (0.0, 0.0530, 0.1068), (0.0, 0.996, -0.087)),
+        ("allegro", "ring_0", 3, (0.0, -0.0435, -0.0015), (0.0, -0.087, 0.996)),
+        ("sharpa", "thumb_cmc_fe", 0, (0.0100, 0.0260, 0.0214), (0.0, 0.0, -1.0)),
+        ("sharpa", "thumb_cmc_aa", 0, (0.0050, 0.0260, 0.0214), (1.0, 0.0, 0.0)),
+        ("sharpa", "thumb_mcp_fe", 0, (0.0154, 0.0762, 0.0631), (0.866, 0.354, -0.354)),
+        ("sharpa", "thumb_mcp_aa", 0, (0.0154, 0.0762, 0.0631), (0.5, -0.612, 0.612)),
+        ("sharpa", "thumb_ip", 0, (0.0154, 0.1038, 0.0907), (0.866, 0.354, -0.354)),
+        ("sharpa", "pinky_cmc", 4, (0.01136, -0.0263, 0.0869), (0.0, 0.0, 1.0)),
+        ("sharpa", "index_pip", 1, (0.0010, 0.0303, 0.1429), (0.0, 1.0, 0.0)),
+    ],
+)
+def test_joints_are_where_the_makers_have_them(name, joint, tip, anchor, axis):
+    hand = get_hand(name)
+    found = next(x for x in hand.joints if x.name == joint)
+    np.testing.assert_allclose(np.subtract(found.anchor, ORIGIN[name]), anchor, atol=1e-4)
+    np.testing.assert_allclose(found.axis, axis, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_product_of_exponentials_agrees_with_mujoco(name):
+    hand = get_hand(name)
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    add_hand(spec, hand)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    compiled = jax.jit(link_poses, static_argnums=0)
+    for q in np.random.default_rng(0).uniform(hand.lower, hand.upper, (4, len(hand.joints))):
+        position, quaternion = compiled(hand, jnp.array(q, jnp.float32))
+        data.qpos[6:] = q
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(position, data.xpos[2:], atol=1e-6)
+        np.testing.assert_allclose(np.abs(np.sum(quaternion * data.xquat[2:], -1)), 1.0, atol=1e-5)
+
+
+def test_poses_keep_within_limits_and_name_joints(hand):
+    names = {joint.name for joint in hand.joints}
+    assert len(names) == len(hand.joints)
+    assert {*hand.open_pose, *hand.closed_pose} <= names
+    for q in (hand.q_open, hand.q_closed):
+        assert np.all(hand.lower <= q) and np.all(q <= hand.upper)
+
+
+def test_opening_and_palm_side(hand):
+    """The heading leads out of the palm, which the closing fingers face."""
+    frame = grasp_frame(hand)
+    assert 0.08 < frame.opening / hand.object_scale < 0.16
+    opened, half = (_tips(hand, q) for q in (hand.q_open, (hand.q_open + hand.q_closed) / 2))
+    gap = [np.linalg.norm(tips[1:].mean(0) - tips[0]) for tips in (opened, half)]
+    assert gap[1] < 0.7 * gap[0]  # thumb and fingers come together
+    np.testing.assert_allclose(gap[0], frame.opening, rtol=1e-5)
+    np.testing.assert_allclose(frame.center, 0.5 * (opened[0] + opened[1:].mean(0)), atol=1e-6)
+    knuckles = np.mean([link_origin(link) for link in hand.links if link.name.endswith("_proximal")], 0)
+    assert frame.heading @ (frame.center - knuckles) > 0.03
+
+
+def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
+    """Frame, limits, gains and torques: fingers that close around a cylinder in the hand's middle carry 400 g."""
+    found = next(obj for i in range(99) if 0.02 < (obj := procedural.generate(i, "cylinder")).pieces[0].size[0] < 0.03)
+    task = TaskConfig(hand=hand.name)
+    (cylinder,) = sized(hand, task, [found])
+    frame = grasp_frame(hand)
+    tips = _tips(hand, hand.q_open + 0.5 * (hand.q_closed - hand.q_open))
+    center = 0.5 * (tips[0] + tips[1:].mean(0)) - 0.01 * frame.heading
+    along = np.cross(frame.heading, frame.cross)
+    axes = np.stack([frame.heading, frame.cross, along], -1)
+    down = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]) @ axes.T)
+    quaternion = (down * Rotation.from_matrix(axes)).as_quat(scalar_first=True)
+    world = World(
+        object_index=np.zeros(1, int),
+        mass_scale=np.full(1, 0.4 / cylinder.mass),
+        friction=np.ones(1),
+        base_position=np.array([[0.0, 0.0, 1.0]]),
+        base_quaternion=down.as_quat(scalar_first=True)[None],
+        q=hand.q_open[None],
+        object_position=np.array([[0.0, 0.0, 1.0]]) + down.apply(center),
+        object_quaternion=quaternion[None],
+        stationary=np.ones(1, bool),
+    )
+    physics = NativePhysics(hand, task, [cylinder], 1)
+    state = physics.start(world)
+    target = np.zeros((1, 6 + len(hand.joints)))
+    touched = np.zeros(len(hand.links), bool)
+    speeds = []
+    for step in range(220):
+        firm = hand.q_open + min(1.2, step / 30) * (hand.q_closed - hand.q_open)
+        target[:, 6:] = np.clip(firm, hand.lower, hand.upper)
+        if step == 60:
+            physics.cells[0].data.eq_active[physics._where.weld] = False
+        state, seen = physics.step(state, target, np.zeros(1, bool))
+        touched |= seen.contact_found[0].any(-1)
+        if step >= 180:
+            speeds.append(np.linalg.norm(seen.object_velocity))
+    physics.close()
+    fingers = {hand.links[i].name.partition("_")[0] for i in np.flatnonzero(touched)}
+    assert "thumb" in fingers and len(fingers - {"palm"}) >= 3, fingers
+    moved = np.asarray(seen.object_position[0]) - world.object_position[0]
+    assert moved[2] > -0.02 and np.linalg.norm(moved) < 0.10, "the object fell"  # fingers may pull it into the palm
+    assert max(speeds) < 0.05, "the object shakes"
+
+
+def test_scaled_objects_keep_their_density():
+    obj = procedural.generate(3, "mug")
+    larger = obj.scaled(1.4)
+    assert larger.mass == pytest.approx(1.4**3 * obj.mass)
+    np.testing.assert_allclose(larger.inertia, 1.4**5 * obj.inertia)
+    for name in ("points", "visual_vertices"):
+        np.testing.assert_allclose(getattr(larger, name), 1.4 * getattr(obj, name))
+    np.testing.assert_allclose(larger.rest_poses[:, :3], 1.4 * obj.rest_poses[:, :3])
+    np.testing.assert_array_equal(larger.rest_poses[:, 3:], obj.rest_poses[:, 3:])
+    for a, b in zip(larger.pieces, obj.pieces, strict=True):
+        np.testing.assert_allclose([*a.size, *a.pos], 1.4 * np.array([*b.size, *b.pos]))
+    hand = get_hand("allegro")
+    assert sized(hand, TaskConfig(), [obj])[0].mass == larger.mass
+    assert sized(hand, TaskConfig(object_scale=1.0), [obj])[0] is obj
+
+
+def test_a_hand_that_does_not_exist_is_one_line_with_those_that_do():
+    with pytest.raises(CongraspError, match=r"no hand 'claw'.*allegro, human, mano, sharpa"):
+        get_hand("claw")
+    assert set(HANDS) == {"human", "allegro", "sharpa", "mano"}
