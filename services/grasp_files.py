@@ -14,12 +14,17 @@ from common.logs.scene import episode_entries
 from common.logs.writer import LogWriter
 from common.wire.codec import Message
 from services.grasp import Grasp
-from services.render import episode_sheet, save_episode_video
+from services.render import best_camera, episode_sheet, render_episode_frames, save_episode_video
 from services.sheets import save_png
 
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
+THUMBNAIL = "thumbnail.png"
+"""Its last moment."""
 OBJECT = "object.png"
 """Pictures of the object before and after its import."""
+
+
+_SMALL = (320, 240)
 
 
 def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: bool, about: dict[str, Any]) -> None:
@@ -38,10 +43,14 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
     (folder / RESULT).unlink(missing_ok=True)
     save_motion(folder / MOTION, found.motion)
     save_recording(folder / RECORDING, found.episode)
+    episode = found.episode
+    last = len(episode.arrays["table"]) - 1
+    camera = best_camera(episode, range(0, last + 1, last // 4)) if pictures or video else None
     if pictures:
-        save_png(folder / PICTURE, episode_sheet(found.episode))
+        save_png(folder / PICTURE, episode_sheet(episode, camera=camera, quick=True))
+        save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera, quick=True)))
     if video:
-        save_episode_video(folder / VIDEO, found.episode)
+        save_episode_video(folder / VIDEO, episode, camera=camera)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 
 

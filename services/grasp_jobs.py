@@ -19,12 +19,11 @@ from common.objects.sources import Source, find_sources
 from common.objects.spec import GraspObject
 from services.asked import read_asked
 from services.grasp import Grasper, Progress
-from services.grasp_files import OBJECT, VIDEO, finished, key_of, save_grasp
+from services.grasp_files import OBJECT, THUMBNAIL, VIDEO, finished, key_of, save_grasp
 from services.import_sheet import import_sheet, mesh_of_file
-from services.render import thumbnail
 from services.sheets import contact_sheet, save_png
 
-SHEET, SUMMARY, _THUMBNAIL = "summary.png", "summary.json", "thumbnail.png"
+SHEET, SUMMARY = "summary.png", "summary.json"
 _COLUMNS = 6
 
 
@@ -141,7 +140,6 @@ def run_job(job: Job, grasper: Grasper, settings: Settings, progress: Progress) 
             "notes": list(obj.notes),
             "rules": list(found.words),
         }
-        save_png(folder / _THUMBNAIL, thumbnail(found.episode))
         save_grasp(folder, found, video=settings.video, pictures=settings.pictures, about=about)
         return Result(job.name, {**found.facts(), **about})
     except CongraspError as error:
@@ -160,9 +158,9 @@ def save_summary(out: pathlib.Path, results: Sequence[Result]) -> None:
     rows = [{"name": r.name, "error": r.error} if r.error else {"name": r.name, **r.facts} for r in results]
     summary = {"objects": len(rows), "succeeded": held, "results": rows}
     write_atomically(out / SUMMARY, json.dumps(summary, indent=2).encode())
-    drawn = [result for result in results if (out / result.name / _THUMBNAIL).exists() and not result.error]
+    drawn = [result for result in results if (out / result.name / THUMBNAIL).exists() and not result.error]
     if drawn:
-        images = [np.asarray(Image.open(out / result.name / _THUMBNAIL).convert("RGB")) for result in drawn]
+        images = [np.asarray(Image.open(out / result.name / THUMBNAIL).convert("RGB")) for result in drawn]
         labels = [
             f"{r.name}: {'held' if r.facts['success'] else 'NOT HELD'}, {r.facts['tries_held']} tries" for r in drawn
         ]

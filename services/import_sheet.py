@@ -11,9 +11,9 @@ from common.objects.shapes import tessellate
 from common.objects.sizes import length, size_in_words
 from common.objects.sources import Source, read_mesh
 from common.objects.spec import GraspObject
+from services.raster import Raster
 from services.raycast import Shape
 from services.render import OBJECT, SKIN, fit, posed_hand, shape_points, upright
-from services.shade import render_scene
 from services.sheets import contact_sheet
 
 _SIZE = (460, 360)
@@ -54,10 +54,11 @@ def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh) -> np.nd
         f"the object: {size_in_words(tuple(np.ptp(obj.visual_vertices, axis=0)))}, {1000 * obj.mass:.0f} g",
         f"its {len(obj.pieces)} convex pieces, which physics uses",
     ]
+    raster = Raster()
     images = []
     for shapes in scenes:
         points = np.concatenate([shape_points(shape) for shape in shapes])
-        images.append(render_scene(shapes, fit(points, np.array(_VIEW), _SIZE[0] / _SIZE[1]), _SIZE))
+        images.append(raster.draw(shapes, fit(points, np.array(_VIEW), _SIZE[0] / _SIZE[1]), _SIZE))
     return contact_sheet(images, labels, columns=3, title="  |  ".join([obj.name, *obj.notes]))
 
 

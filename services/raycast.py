@@ -165,11 +165,11 @@ class Scene:
             if i in self._smooth:
                 normal[here] = turn.apply(self._smooth[i](local, turn.inv().apply(normal[here])))
             if i in self._paint:
-                colour[here] = _painted(self._paint[i], np.asarray(shape.paint_colours), local)
+                colour[here] = painted(self._paint[i], np.asarray(shape.paint_colours), local)
         return colour, normal
 
 
-def _painted(tree: cKDTree, colours: np.ndarray, point: np.ndarray) -> np.ndarray:
+def painted(tree: cKDTree, colours: np.ndarray, point: np.ndarray) -> np.ndarray:
     """(n, 3) colours of the nearest paint points, with a soft border."""
     distance, near = tree.query(point, k=min(4, len(colours)))
     distance, near = distance.reshape(len(point), -1), near.reshape(len(point), -1)

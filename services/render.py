@@ -2,8 +2,10 @@
 
 import collections
 import itertools
+import os
 import pathlib
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from common.logs.poses import link_poses
 from common.logs.reader import read_episodes
 from common.task.types import MASKS
 from common.wire.codec import Message
+from services.raster import Raster
 from services.raycast import Camera, Shape, between
 from services.shade import render_scene, visible
 from services.sheets import contact_sheet, save_video
@@ -34,6 +37,7 @@ _FIELD_OF_VIEW, _ELEVATION = 26.0, 24.0  # degrees
 _ARROW_SEARCH, _ARROW_GAP = 0.012, 0.004  # radius in which the approach looks for the object, space before it, m
 _SPACE = 1.06  # free space at the picture's edges
 _LINK_SPACE = 0.03  # how far a link reaches around its origin, m
+_FRAME_SECONDS = 0.04  # between two frames of a video
 _FALL = 0.1  # how far the camera follows a falling object, m
 
 
@@ -216,7 +220,12 @@ def _extent(episode: Message, step: int) -> np.ndarray:
 
 
 def render_episode_frames(
-    episode: Message, steps: Iterable[int], size: tuple[int, int] = (640, 480), camera: Camera | None = None
+    episode: Message,
+    steps: Iterable[int],
+    size: tuple[int, int] = (640, 480),
+    camera: Camera | None = None,
+    *,
+    quick: bool = False,
 ) -> Iterator[np.ndarray]:
     """Pictures (height, width, 3) uint8 of control steps of an episode, all from one camera.
 
@@ -225,26 +234,34 @@ def render_episode_frames(
       steps: control steps, from 0.
       size: width and height in pixels.
       camera: from where; the best of a circle around the scene otherwise.
+      quick: plainer light, many times faster.
     """
     steps = list(steps)
-    camera = camera or best_camera(episode, steps, size[0] / size[1])
-    for step in steps:
-        yield render_scene(episode_shapes(episode, step), camera, size)
+    seen_from = camera or best_camera(episode, steps, size[0] / size[1])
+    if not quick:
+        for step in steps:
+            yield render_scene(episode_shapes(episode, step), seen_from, size)
+        return
+    raster = Raster()
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        yield from pool.map(lambda step: raster.draw(episode_shapes(episode, step), seen_from, size), steps)
 
 
-def episode_sheet(episode: Message, *, moments: int = 8, size: tuple[int, int] = (440, 330)) -> np.ndarray:
+def episode_sheet(
+    episode: Message,
+    *,
+    moments: int = 8,
+    size: tuple[int, int] = (440, 330),
+    camera: Camera | None = None,
+    quick: bool = False,
+) -> np.ndarray:
     """An episode in a few moments (its first and last step, and the table's removal, among them), with its metrics."""
     steps = key_steps(np.asarray(episode.arrays["table"], bool), moments)
     dt = float(episode.meta["control_dt"])
     table = np.asarray(episode.arrays["table"], bool)
     labels = [f"{dt * step:.2f} s" + ("" if table[step] else "   table away") for step in steps]
-    images = list(render_episode_frames(episode, steps, size))
+    images = list(render_episode_frames(episode, steps, size, camera, quick=quick))
     return contact_sheet(images, labels, columns=min(4, len(steps)), title=episode_title(episode))
-
-
-def thumbnail(episode: Message, size: tuple[int, int] = (300, 225)) -> np.ndarray:
-    """The last moment of an episode."""
-    return next(render_episode_frames(episode, [len(episode.arrays["table"]) - 1], size))
 
 
 def episode_strip(
@@ -344,8 +361,12 @@ def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Me
     return last[0 if index < 0 else -1]
 
 
-def save_episode_video(path: pathlib.Path, episode: Message, size: tuple[int, int] = (640, 480)) -> None:
-    """Every second control step of an episode as MP4, at half its speed."""
-    steps = range(0, len(episode.arrays["table"]), 2)
-    frame_rate = 0.25 / float(episode.meta["control_dt"])
-    save_video(path, render_episode_frames(episode, steps, size), size, frame_rate)
+def save_episode_video(
+    path: pathlib.Path, episode: Message, size: tuple[int, int] = (640, 480), camera: Camera | None = None
+) -> None:
+    """An episode as MP4: at half its speed while the table stands, then in real time."""
+    table = np.asarray(episode.arrays["table"], bool)
+    step = max(1, round(_FRAME_SECONDS / 2 / float(episode.meta["control_dt"])))
+    removal = int(table.sum())
+    steps = [*range(0, removal, step), *range(removal, len(table), 2 * step)]
+    save_video(path, render_episode_frames(episode, steps, size, camera, quick=True), size, 1 / _FRAME_SECONDS)
