@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+import warnings
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -71,7 +72,9 @@ def save_video(path: pathlib.Path, frames: Iterable[np.ndarray], size: tuple[int
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         writer = imageio_ffmpeg.write_frames(str(path), size, fps=frame_rate, quality=8, macro_block_size=2)
-        writer.send(None)
+        with warnings.catch_warnings():  # JAX warns of forks; this one is another program at once
+            warnings.simplefilter("ignore", RuntimeWarning)
+            writer.send(None)
         for frame in frames:
             writer.send(np.ascontiguousarray(frame))
         writer.close()

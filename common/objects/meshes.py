@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial import QhullError, cKDTree
 
 from common.errors import CongraspError
-from common.objects import decompose, shapes, store
+from common.objects import decompose, repair, shapes, store
 from common.objects.procedural import MASS_RANGE
 from common.objects.resting import rest_poses
 from common.objects.sizes import Unit, metres_per_unit
@@ -111,9 +111,11 @@ def _cache_key(source: Source, options: ImportOptions) -> str:
 
 
 def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) -> GraspObject:
-    visuals = [read_mesh(file.path) for file in source.visuals] or [
+    visuals = [read_mesh(file.path, notes) for file in source.visuals] or [
         shapes.triangulate(_corners(file)) for file in source.pieces
     ]
+    if not (source.pieces or source.parts):
+        visuals = [repair.closed(repair.largest_body(mesh, notes), notes) for mesh in visuals]
     sides = tuple(_joined(visuals).extents.tolist())
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
     meshes = [_scaled(mesh, factor) for mesh in visuals]
@@ -121,7 +123,10 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
     closed = all(mesh.is_volume for mesh in meshes)
     if not closed:
         stand_in = "convex pieces" if source.pieces else "convex hull"
-        notes.append(f"its mesh is not a closed surface: mass and inertia are those of its {stand_in}")
+        notes.append(
+            f"its surface is open, so that nobody knows what is inside: mass and inertia are those of its {stand_in} "
+            "(--mass sets the mass)"
+        )
     hulls, owners = _pieces(source, meshes, factor, closed, options, notes)
     solids = hulls if source.pieces else [np.asarray(whole.vertices)]
     mass, center, inertia = _weigh(whole if closed else None, solids, options)

@@ -9,10 +9,10 @@ import numpy as np
 import trimesh
 
 from common.errors import CongraspError
+from common.objects import repair
+from common.objects.kinds import CONVERT, SUFFIXES, kind_of
 
-SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 _GRASPABLE_WORDS = ("handle", "grip", "neck", "stem", "shaft", "body")
-_CONVERT = "Convert it to STL, OBJ, PLY or GLB."
 # GraspXL marks the absence of a non-graspable part by a cube of 1 cm here (m).
 _NO_PART = 0.346408
 
@@ -74,43 +74,39 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
     if not meshes:
         found = [source for folder in sorted(path.iterdir()) if folder.is_dir() for source in _nested(folder)]
         if not found:
-            raise CongraspError(f"The folder {path} holds no STL, OBJ, PLY or GLB file.", _CONVERT)
+            raise CongraspError(f"The folder {path} holds no STL, OBJ, PLY or GLB file.", CONVERT)
         return found
     return _in_folder(path, meshes)
 
 
-def read_mesh(path: pathlib.Path) -> trimesh.Trimesh:
+def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Trimesh:
     """Reads one mesh, in the file's own unit, with merged vertices and without degenerate triangles.
+
+    Args:
+      path: the file; its content counts, not its name.
+      notes: what was mended is added to it.
 
     Raises:
       CongraspError: not a mesh, empty, or not finite.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise CongraspError(f"{path} is not an STL, OBJ, PLY or GLB file.", _CONVERT)
+    said = [] if notes is None else notes
+    suffix = kind_of(path)
+    kind = suffix[1:].upper()
+    if suffix != path.suffix.lower():
+        said.append(f"its content is {kind}, whatever its name says, and was read as that")
     try:
-        with path.open("rb") as file:
-            start = file.read(4)
-    except OSError as error:
-        raise CongraspError(
-            f"{path} cannot be read: {error.strerror}.", "Check the path and its permissions."
-        ) from None
-    if not start:
-        raise CongraspError(f"{path} is empty (0 bytes).", "Export or download it again.")
-    if start == b"PK\x03\x04":
-        raise CongraspError(f"{path} is a zip archive.", "Unpack it and import the mesh inside.")
-    kind = path.suffix[1:].upper()
-    try:
-        mesh = trimesh.load_scene(path, process=False).to_mesh()
+        mesh = trimesh.load_scene(path, file_type=suffix[1:], process=False).to_mesh()
     except Exception as error:  # the readers raise whatever they stumble over
         reason = (str(error) or type(error).__name__).splitlines()[0].rstrip(" .!")
         raise CongraspError(f"{path} cannot be read as {kind}: {reason}.", "Export it again, or convert it.") from None
     if len(mesh.faces) == 0:
         points = f"only {len(mesh.vertices)} points" if len(mesh.vertices) else "nothing that can be read as a mesh"
         raise CongraspError(f"{path} has no triangles: it holds {points}.", f"Export it as a triangle mesh ({kind}).")
-    if not np.isfinite(mesh.vertices).all():
+    finite = repair.without_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), said)
+    if finite is None:
         bad = int((~np.isfinite(mesh.vertices)).any(-1).sum())
         raise CongraspError(f"{path} has {bad} vertices that are not finite numbers.", "Repair or export it again.")
-    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    mesh = trimesh.Trimesh(*repair.reduced(*finite, said), process=False)
     mesh.merge_vertices()
     mesh.update_faces(mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()

@@ -38,7 +38,7 @@ def episode(
       index: Which of the recorded episodes, from 0; -1 is the last.
       success: Count only episodes that succeeded.
       moments: Pictures on the sheet.
-      video: Also write the whole episode as an MP4, at half its speed.
+      video: Also write the whole episode as an MP4, at half its speed while the table stands.
     """
     from services.render import episode_sheet, pick_episode, save_episode_video
     from services.sheets import save_png

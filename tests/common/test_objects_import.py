@@ -152,7 +152,7 @@ def test_an_open_mesh_counts_its_hull_and_says_so(tmp_path, options):
     mesh.export(tmp_path / "open.stl")
     quick = dataclasses.replace(options, time_limit=0.01)
     obj, notes = import_source(find_sources(tmp_path / "open.stl")[0], quick)
-    assert any("not a closed surface" in note and "convex hull" in note for note in notes)
+    assert any("surface is open" in note and "convex hull" in note for note in notes)
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-4)
 
 

@@ -1,0 +1,172 @@
+"""Mends what can be mended of a mesh, and says so in a line that needs no expert."""
+
+import numpy as np
+import trimesh
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+MAX_FACES = 20_000
+"""Triangles beyond which a mesh is reduced before anything else is done with it."""
+_REDUCED = 200_000  # of those that come in millions, before their triangles are looked at one by one
+_FEW = 0.05  # share of a mesh that may be missing without changing what it is
+_APART = 0.02  # of the mesh's size: bodies whose boxes are nearer than this belong together
+
+
+def without_gaps(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
+    """A mesh (V, 3), (F, 3) without vertices that are not finite numbers; None if too much of it would be missing."""
+    good = np.isfinite(vertices).all(-1)
+    if good.all():
+        return vertices, faces
+    whole = good[faces].all(-1)
+    if whole.mean() < 1 - _FEW:
+        return None
+    bad = int((~good).sum())
+    notes.append(f"{bad} of its points {'is' if bad == 1 else 'are'} not a number and {_was(bad)} left out")
+    return np.where(good[:, None], vertices, 0.0), faces[whole]
+
+
+def reduced(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh with far too many triangles, with fewer of them; its vertices are merged on the way."""
+    if len(faces) <= _REDUCED:
+        return vertices, faces
+    before = len(faces)
+    # Equal coordinates have equal bits, which sort much faster than rows of numbers.
+    bits = (np.ascontiguousarray(vertices, np.float32) + 0.0).view(np.uint32).astype(np.uint64)
+    keys = (bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)) ^ (bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F))
+    keys ^= (bits[:, 2] * np.uint64(0x165667B19E3779F9)) >> np.uint64(7)
+    _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
+    vertices, faces = vertices[first], merged.reshape(-1)[faces]
+    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    mesh = trimesh.Trimesh(vertices, faces[proper], process=False)
+    small = mesh.simplify_quadric_decimation(face_count=MAX_FACES)
+    notes.append(f"its {before:,} triangles were reduced to {len(small.faces):,}: a hand does not feel the rest")
+    return np.asarray(small.vertices), np.asarray(small.faces)
+
+
+def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+    """The largest of several bodies that lie apart from one another; parts that lie close together are one body."""
+    count, labels = _components(np.asarray(mesh.faces), len(mesh.vertices))
+    if count == 1:
+        return mesh
+    order = np.argsort(labels, kind="stable")
+    starts = np.flatnonzero(np.r_[True, np.diff(labels[order]) > 0])
+    vertices = np.asarray(mesh.vertices)
+    low = np.minimum.reduceat(vertices[order], starts) - _APART / 2 * mesh.scale
+    high = np.maximum.reduceat(vertices[order], starts) + _APART / 2 * mesh.scale
+    body = np.arange(count)
+    sizes = np.linalg.norm(high - low, axis=-1)
+    for i in np.argsort(-sizes):  # from the largest on, whatever touches what it has gathered joins it
+        touching = (low[i] <= high).all(-1) & (low <= high[i]).all(-1)
+        body[np.isin(body, body[touching])] = body[i]
+    if len(np.unique(body)) == 1:
+        return mesh
+    chosen = body[np.argmax(sizes)]
+    kept = (body == chosen)[labels][np.asarray(mesh.faces)[:, 0]]
+    share = float(mesh.area_faces[kept].sum() / mesh.area)
+    others = len(np.unique(body)) - 1
+    notes.append(
+        f"it holds {others + 1} separate bodies; the largest was taken ({share:.0%} of the surface): "
+        "to use another one, save it as a file of its own"
+    )
+    used, faces = np.unique(np.asarray(mesh.faces)[kept], return_inverse=True)
+    return trimesh.Trimesh(vertices[used], faces.reshape(-1, 3), process=False)
+
+
+def _components(faces: np.ndarray, count: int) -> tuple[int, np.ndarray]:
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (count, count))
+    number, labels = connected_components(graph, directed=False)
+    return int(number), labels
+
+
+def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+    """The mesh with small holes closed and its triangles facing outwards, where that can be done."""
+    holes = _loops(mesh)
+    if holes:
+        filled = _filled(mesh, holes)
+        added = filled.area - mesh.area
+        if filled.is_watertight and added < _FEW * mesh.area:
+            notes.append(f"{len(holes)} hole{'s' if len(holes) > 1 else ''} in its surface {_was(len(holes))} closed")
+            mesh = filled
+    if mesh.is_watertight and not mesh.is_winding_consistent:
+        outwards = _wound_alike(mesh)
+        if outwards.is_winding_consistent:
+            notes.append("some of its triangles faced inwards and were turned")
+            mesh = outwards
+    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0:
+        mesh = mesh.copy()
+        mesh.invert()
+        notes.append("it was inside out and was turned")
+    return mesh
+
+
+def _loops(mesh: trimesh.Trimesh) -> list[np.ndarray]:
+    """Vertices around every hole, in the order of the triangles' edges; none where the rim has an end."""
+    edges = np.asarray(mesh.edges)
+    size = len(mesh.vertices)
+    forward, backward = edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]
+    after: dict[int, list[int]] = {}
+    for start, end in edges[~np.isin(forward, backward)].tolist():
+        after.setdefault(start, []).append(end)
+    loops = []
+    while after:
+        path = [next(iter(after))]
+        while path:
+            ends = after.get(path[-1])
+            if not ends:
+                return []
+            end = ends.pop()
+            if not ends:
+                del after[path[-1]]
+            if end in path:  # holes that meet in one vertex are holes of their own
+                first = path.index(end)
+                loops.append(np.array(path[first:]))
+                del path[first:]
+                if not path:
+                    break
+            path.append(end)
+    return loops
+
+
+def _filled(mesh: trimesh.Trimesh, holes: list[np.ndarray]) -> trimesh.Trimesh:
+    """Every hole closed by a fan around its middle."""
+    middles = [mesh.vertices[loop].mean(0) for loop in holes]
+    fans = [
+        np.stack([np.roll(loop, -1), loop, np.full(len(loop), len(mesh.vertices) + i)], -1)
+        for i, loop in enumerate(holes)
+    ]
+    vertices, faces = np.concatenate([mesh.vertices, middles]), np.concatenate([mesh.faces, *fans])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _wound_alike(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Triangles turned so that neighbours run along their common edge in opposite directions."""
+    pairs = np.asarray(mesh.face_adjacency)
+    faces = np.asarray(mesh.faces).copy()
+    common = np.asarray(mesh.face_adjacency_edges)
+
+    def along(side: int) -> np.ndarray:
+        """(n,) whether triangles run along the common edge from its first to its second vertex."""
+        own = faces[pairs[:, side]]
+        place = (own == common[:, :1]).argmax(1)
+        return own[np.arange(len(own)), (place + 1) % 3] == common[:, 1]
+
+    differ = along(0) == along(1)
+    # Two copies of every triangle, as it is and turned: neighbours that run alike join the other's opposite copy.
+    count = len(faces)
+    first = np.concatenate([pairs[:, 0], pairs[:, 0] + count])
+    second = np.concatenate([pairs[:, 1] + count * differ, pairs[:, 1] + count * ~differ])
+    graph = coo_matrix((np.ones(len(first), bool), (first, second)), (2 * count, 2 * count))
+    _, labels = connected_components(graph, directed=False)
+    # Of the two copies of a body one label is taken for all its triangles, the one that most of them have as they are.
+    lower = np.minimum(labels[:count], labels[count:])
+    turned = labels[:count] != lower
+    total = np.bincount(lower, minlength=labels.max() + 1)
+    flip = np.bincount(lower, weights=turned, minlength=labels.max() + 1) > total / 2
+    turned = turned ^ flip[lower]
+    faces[turned] = faces[turned][:, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+def _was(count: int) -> str:
+    return "was" if count == 1 else "were"
