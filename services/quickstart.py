@@ -7,13 +7,13 @@ import pathlib
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
 import numpy as np
 from rich.console import Console
 
-from common.config import ObjectsConfig, RunConfig
+from common.config import Board, ObjectsConfig, RunConfig
 from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.policy import bundle as bundles
@@ -50,6 +50,7 @@ def run_training(
     resume: bool,
     evaluation: int,
     initial: pathlib.Path | None = None,
+    boards: Sequence[Board] = ("tensorboard",),
     metrics_port: int = 0,
     listen: str | None = None,
     certs: pathlib.Path | None = None,
@@ -104,6 +105,7 @@ def run_training(
                     physics=physics,
                     stop=stop,
                     resume=resume,
+                    boards=boards,
                     metrics_port=metrics_port,
                     on_update=lambda values: progress.show(
                         {"values": values, "actors": 1, "version": int(values["version"])}
@@ -119,6 +121,7 @@ def run_training(
                         stop=stop,
                         ranks=ranks,
                         gpus=gpus,
+                        boards=boards,
                         metrics_port=metrics_port,
                         endpoint=listen,
                         certs=certs,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 
 from actors.physics import resolve_physics
-from common.config import PhysicsName, RunConfig
+from common.config import Board, PhysicsName, RunConfig
 from common.errors import CongraspError, TransportError
 from common.journal import AUDIT
 from common.transport.base import Transport
@@ -86,6 +86,7 @@ def train(
     insecure: bool = False,
     report: Report = lambda status: None,
     notify: Callable[[str], None] = lambda text: None,
+    boards: Sequence[Board] = (),
     metrics_port: int = 0,
 ) -> None:
     """Runs a prepared run directory to its end with one learner and `actors` actor processes, or several of both.
@@ -107,6 +108,7 @@ def train(
       insecure: listen beyond loopback without certificates.
       report: shows progress.
       notify: told in words when something is restarted.
+      boards: where rank 0's figures are shown, too.
       metrics_port: port of rank 0's Prometheus endpoint on the loopback interface; 0 for none.
 
     Raises:
@@ -129,7 +131,7 @@ def train(
             arguments += ["--rank", str(rank), "--ranks", str(ranks), "--coordinator", coordinator]
             arguments += [] if actors else ["--inside"]
         if rank == 0:
-            arguments += ["--metrics-port", str(metrics_port)]
+            arguments += ["--metrics-port", str(metrics_port), "--boards", *boards]
         learners.append(Child(name, arguments, logs / f"{name}.log", environment))
         where = shifted(connect, rank * len(FLOWS))
         for number in range(rank * actors, (rank + 1) * actors):
@@ -290,6 +292,7 @@ def train_in_process(
     wire: Transport | None = None,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
     on_event: Callable[[str, str], None] = lambda level, text: None,
+    boards: Sequence[Board] = (),
     metrics_port: int = 0,
 ) -> None:
     """The same learner and one actor in this process, over the in-memory transport.
@@ -302,13 +305,13 @@ def train_in_process(
       physics: engine of the actor.
       stop: ends training.
       wire: a transport that listens, where others may ask how things stand, and send rollouts, too.
+      boards: where the figures are shown, too.
       metrics_port: port of a Prometheus endpoint on the loopback interface; 0 for none.
     """
     from actors.process import run_actor
-    from common.logs.recorder import Recorder
     from learner.process import run_learner
     from learner.ranks import ROUND_SECONDS
-    from learner.run_directory import LOGS
+    from services.boards import recorded
     from services.metrics import LearnerMetrics, exposed
     from services.status import ask
 
@@ -337,7 +340,7 @@ def train_in_process(
 
     actor = threading.Thread(target=act, name="actor", daemon=True)
     with MemoryTransport(broker) as memory:
-        recorder = Recorder(memory, config.name, run_dir / LOGS) if rank == 0 else None
+        recorder = recorded(memory, config, run_dir, boards) if rank == 0 else None
         metrics = LearnerMetrics(functools.partial(ask, memory, config.name))
 
         def updated(values: dict[str, float]) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from common.config import RunConfig, run_config_from_json, to_json
+from common.config import Board, RunConfig, run_config_from_json, to_json
 from services.cli.train import preset_of
 from services.cli.watch import Watch, Watched
 from services.presets import get_preset, with_hand
@@ -48,6 +48,9 @@ class Learner:
     """Where the ranks find rank 0: its host and a port, which and the next of which must be free there."""
     inside: bool = False
     """An actor lives in this process, too, so that its rollouts never leave the device."""
+    boards: tuple[Board, ...] = ("tensorboard",)
+    """Where the learner's figures are shown, too: tensorboard (files in the run's folder), wandb-offline (files there,
+    for `wandb sync`), wandb (needs an account); with no name none."""
     watch: Watched = dataclasses.field(default_factory=Watch)
     """How it is watched."""
 
@@ -66,14 +69,14 @@ class Learner:
     def _learn(self) -> int:
         import functools
 
-        from common.logs.recorder import Recorder
         from common.policy import bundle as bundles
         from common.transport.keys import FLOWS
         from common.transport.zenoh_transport import ZenohTransport, shifted
         from learner.process import run_learner
         from learner.ranks import Ranks
-        from learner.run_directory import LOGS, create_run, open_run
+        from learner.run_directory import create_run, open_run
         from services.access import listening
+        from services.boards import recorded
         from services.logs import say
         from services.metrics import LearnerMetrics
         from services.shutdown import on_signal
@@ -106,6 +109,7 @@ class Learner:
                         resume=resume,
                         ranks=ranks,
                         wire=transport,
+                        boards=self.boards,
                         on_update=updated,
                         on_event=say,
                     )
@@ -117,7 +121,7 @@ class Learner:
                         stop_event=stop,
                         resume=resume,
                         ranks=ranks,
-                        recorder=Recorder(transport, config.name, self.run_dir / LOGS) if self.rank == 0 else None,
+                        recorder=recorded(transport, config, self.run_dir, self.boards) if self.rank == 0 else None,
                         on_update=updated,
                         on_event=say,
                     )

@@ -47,6 +47,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXTRAS = {
     **dict.fromkeys(("foxglove", "imageio_ffmpeg", "matplotlib"), "viz"),
     **dict.fromkeys(("bvhio", "mcap_ros2", "onnx", "onnxruntime", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
+    "wandb": "wandb",
     "warp": "cuda",
 }
 

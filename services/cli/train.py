@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from common.config import RunConfig
+from common.config import Board, RunConfig
 from services.presets import get_preset, with_hand
 
 
@@ -45,6 +45,9 @@ class Train:
     """Listen beyond loopback without certificates."""
     evaluation: int = 64
     """Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out."""
+    boards: tuple[Board, ...] = ("tensorboard",)
+    """Where the learner's figures are shown, too: tensorboard (files in the run's folder), wandb-offline (files there,
+    for `wandb sync`), wandb (needs an account); with no name none."""
     metrics_port: int = 0
     """Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none."""
 
@@ -62,6 +65,7 @@ class Train:
             initial=self.initial,
             evaluation=self.evaluation,
             ranks=self.ranks,
+            boards=self.boards,
             metrics_port=self.metrics_port,
             listen=self.listen,
             certs=self.certs,
