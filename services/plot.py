@@ -14,8 +14,8 @@ from common.logs.reader import read_metrics
 
 Series = Mapping[str, tuple[np.ndarray, np.ndarray]]
 _COLUMNS = 4
-_INK, _QUIET, _GRID = "#262b35", "#6b7280", "#e3e6ea"
-_COLOURS = ("#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a", "#c2478f", "#6b7280")
+INK, QUIET, _GRID = "#262b35", "#6b7280", "#e3e6ea"
+COLOURS = ("#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a", "#c2478f", "#6b7280")
 _LEGEND = 8
 """Lines of one panel that a legend still names."""
 _UNITS = {
@@ -58,15 +58,16 @@ LEARNING = (
 """Panels of the first figure; those without data are left out."""
 
 
-def plot_run(path: pathlib.Path, out: pathlib.Path) -> list[pathlib.Path]:
+def plot_run(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str] = ("png", "pdf")) -> list[pathlib.Path]:
     """Draws a run.
 
     Args:
       path: a run's folder, or one MCAP file.
       out: folder for the figures.
+      formats: of the files: png, pdf.
 
     Returns:
-      The PNG files written.
+      The files written, each figure in each format.
 
     Raises:
       CongraspError: there are no metrics, matplotlib is absent, or a file cannot be written.
@@ -76,10 +77,47 @@ def plot_run(path: pathlib.Path, out: pathlib.Path) -> list[pathlib.Path]:
         raise CongraspError(f"The recordings in {path} hold no metrics.", "Was the learner recorded?")
     written = []
     for name, (title, panels) in figures(series).items():
-        file = out / f"{name}.png"
-        write_atomically(file, draw(title, panels, series))
-        written.append(file)
+        written += save(draw(title, panels, series), out / name, formats)
     return written
+
+
+def save(figure: Any, stem: pathlib.Path, formats: Sequence[str]) -> list[pathlib.Path]:
+    """Writes a figure as `<stem>.<format>` for each format; returns the files."""
+    files = []
+    for kind in formats:
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=kind, dpi=130)
+        figure.set_layout_engine("none")  # the layout is found; to find it again would take as long
+        files.append(stem.with_name(f"{stem.name}.{kind}"))
+        write_atomically(files[-1], buffer.getvalue())
+    return files
+
+
+def new_figure(width: float, height: float, title: str) -> Any:
+    """An empty figure of so many inches.
+
+    Raises:
+      CongraspError: matplotlib is absent.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise CongraspError("Figures need the package 'matplotlib'.", "Run: pip install 'congrasp[viz]'") from None
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    figure.suptitle(title, x=0.01, ha="left", color=INK, fontsize=15, fontweight="bold")
+    return figure
+
+
+def style(axes: Any, title: str, x: str, y: str) -> None:
+    """Title and labels of one plot, and its quiet frame."""
+    axes.set_title(title, loc="left", color=INK, fontsize=10)
+    axes.set_ylabel(y, color=QUIET, fontsize=8)
+    axes.set_xlabel(x, color=QUIET, fontsize=8)
+    axes.tick_params(colors=QUIET, labelsize=8, length=0)
+    axes.grid(color=_GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    for side in axes.spines.values():
+        side.set_visible(False)
 
 
 def figures(series: Series) -> dict[str, tuple[str, list[Panel]]]:
@@ -100,39 +138,25 @@ def figures(series: Series) -> dict[str, tuple[str, list[Panel]]]:
     return {name: group for name, group in groups.items() if group[1]}
 
 
-def draw(title: str, panels: Sequence[Panel], series: Series) -> bytes:
-    """One figure of small multiples as PNG; a line is named after its process, and its metric where there are two."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise CongraspError("Figures need the package 'matplotlib'.", "Run: pip install 'congrasp[viz]'") from None
+def draw(title: str, panels: Sequence[Panel], series: Series) -> Any:
+    """One figure of small multiples; a line is named after its process, and its metric where there are two."""
     columns = min(_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(3.6 * columns, 0.6 + 2.5 * rows), layout="constrained", facecolor="white")
-    figure.suptitle(title, x=0.01, ha="left", color=_INK, fontsize=15, fontweight="bold")
+    figure = new_figure(3.6 * columns, 0.6 + 2.5 * rows, title)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     for axes, panel in zip(grid.flat, panels, strict=False):
         lines = [name for name in series if _metric(name) in panel.metrics]
         for i, name in enumerate(lines):
-            _curve(axes, *series[name], _COLOURS[i % len(_COLOURS)], _label(name, panel))
-        axes.set_title(panel.title, loc="left", color=_INK, fontsize=10)
-        axes.set_ylabel(panel.unit, color=_QUIET, fontsize=8)
-        axes.set_xlabel("update", color=_QUIET, fontsize=8)
-        axes.tick_params(colors=_QUIET, labelsize=8, length=0)
+            _curve(axes, *series[name], COLOURS[i % len(COLOURS)], _label(name, panel))
+        style(axes, panel.title, "update", panel.unit)
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4), useOffset=False)
-        axes.yaxis.get_offset_text().set(fontsize=7, color=_QUIET)
-        axes.grid(color=_GRID, linewidth=0.8)
-        axes.set_axisbelow(True)
+        axes.yaxis.get_offset_text().set(fontsize=7, color=QUIET)
         axes.margins(x=0.02)
-        for side in axes.spines.values():
-            side.set_visible(False)
         if 1 < len(lines) <= _LEGEND:
-            axes.legend(fontsize=7, frameon=False, labelcolor=_QUIET)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
-    return buffer.getvalue()
+            axes.legend(fontsize=7, frameon=False, labelcolor=QUIET)
+    return figure
 
 
 def smooth(values: np.ndarray, window: int) -> np.ndarray:

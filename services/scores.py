@@ -27,6 +27,7 @@ ERRORS = {
 _UNITS = {"rad": "rad", "m": "m", "ratio": ""}
 PROBED_EPISODES = 2000
 """Forces are read from this many episodes of a row at most."""
+_HUNDREDTHS = np.linspace(0, 1, 101)
 _SIZES = ("small", "medium", "large")
 
 
@@ -133,6 +134,8 @@ class Row:
     diverged: float
     """Rate of episodes in which the physics failed."""
     paper: PaperRow | None
+    quantiles: dict[str, list[float]] = dataclasses.field(default_factory=dict)
+    """Of each error in successful episodes: least, every further hundredth, and greatest; 101 numbers."""
 
     def to_json(self) -> dict[str, Any]:
         """The row as it is written to `--json`."""
@@ -185,10 +188,13 @@ def summarise(constraint: str, hand: str, sample: Sample, *, held_2s: bool, grou
     success, held = values["success"] > 0, values["held"] > 0
     low, high = wilson(int(success.sum()), len(success))
     held_low, held_high = wilson(int(held.sum()), len(held)) if held_2s else (None, None)
+    quantiles: dict[str, list[float]] = {}
     errors: dict[str, float | None] = {name: None for names in ERRORS.values() for name in names.values()}
     for part in constraint.split("+"):
         for source, name in ERRORS[part].items():
             errors[name] = float(values[source][success].mean()) if success.any() else None
+            if success.any():
+                quantiles[name] = np.quantile(values[source][success], _HUNDREDTHS).round(6).tolist()
     return Row(
         constraint=constraint,
         hand=hand,
@@ -208,6 +214,7 @@ def summarise(constraint: str, hand: str, sample: Sample, *, held_2s: bool, grou
         links_at_removal=float(values["links_at_removal"].mean()),
         diverged=float((values["bad"] > 0).mean()),
         paper=PAPER.get(hand, {}).get(f"{constraint}, {group.split(' ')[0]}" if group else constraint),
+        quantiles=quantiles,
     )
 
 

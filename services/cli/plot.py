@@ -1,22 +1,30 @@
 """`congrasp plot`."""
 
 import pathlib
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 
-def plot(path: Annotated[pathlib.Path, tyro.conf.Positional], out: pathlib.Path | None = None) -> int:
-    """Draw a run's learning curves, reward terms and other metrics to PNG.
+def plot(
+    path: Annotated[pathlib.Path, tyro.conf.Positional],
+    out: pathlib.Path | None = None,
+    formats: tuple[Literal["png", "pdf"], ...] = ("png", "pdf"),
+) -> int:
+    """Draw a run's learning curves, reward terms and other metrics, or an evaluation's table, rates and errors.
 
     Args:
-      path: A run's folder, or one MCAP file. A run that still goes on is drawn up to its last half second.
-      out: Folder for the figures; 'plots' beside the recordings otherwise.
+      path: A run's folder, or one MCAP file; a run that still goes on is drawn up to its last half second. Or the JSON
+        file of 'congrasp evaluate --json'.
+      out: Folder for the figures; 'plots' beside the recordings or the JSON file otherwise.
+      formats: Of the files.
     """
     from services.plot import plot_run
+    from services.plot_evaluation import plot_evaluation
 
     folder = out or (path if path.is_dir() else path.parent) / "plots"
-    for file in plot_run(path, folder):
+    draw = plot_evaluation if path.suffix == ".json" else plot_run
+    for file in draw(path, folder, formats):
         print(file)
     return 0
 

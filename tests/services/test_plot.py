@@ -54,7 +54,9 @@ def test_a_run_becomes_png_files(tmp_path: pathlib.Path, capsys: pytest.CaptureF
     record(tmp_path / "run" / "logs")
     assert plot(tmp_path / "run") == 0
     files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
-    assert [file.name for file in files] == ["learning.png", "reward_terms.png", "episodes.png", "details.png"]
+    figures = ("learning", "reward_terms", "episodes", "details")
+    assert [file.name for file in files] == [f"{name}.{kind}" for name in figures for kind in ("png", "pdf")]
+    assert all(file.read_bytes().startswith(b"%PDF-") for file in files if file.suffix == ".pdf")
     assert all(file.parent == tmp_path / "run" / "plots" for file in files)
     learning = np.asarray(Image.open(files[0]).convert("RGB")).astype(int)
     assert learning.shape[1] > 1200
@@ -64,21 +66,10 @@ def test_a_run_becomes_png_files(tmp_path: pathlib.Path, capsys: pytest.CaptureF
 
 
 def test_the_curve_is_the_metric() -> None:
-    from matplotlib.figure import Figure
-
-    lines = []
-    original = Figure.savefig
-
-    def keep(figure: Figure, *args: object, **options: object) -> None:
-        lines.extend([line.get_xydata() for axes in figure.axes for line in axes.get_lines()])
-        original(figure, *args, **options)
-
     steps, values = np.arange(10) * 3, np.arange(10.0) ** 2
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", keep)
-        png = draw("Title", [Panel("Kl", "nats", ("kl",))], {"learner/0/kl": (steps, values)})
-    assert png.startswith(b"\x89PNG")
-    np.testing.assert_array_equal(lines[0], np.stack([steps, values], -1))
+    figure = draw("Title", [Panel("Kl", "nats", ("kl",))], {"learner/0/kl": (steps, values)})
+    (line,) = [line for axes in figure.axes for line in axes.get_lines()]
+    np.testing.assert_array_equal(line.get_xydata(), np.stack([steps, values], -1))
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40), st.integers(1, 12))
