@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from common.hands import get_hand
 from common.hands.mjcf import WRIST_JOINTS
-from common.hands.spec import Capsule, Hand, link_origin
+from common.hands.spec import Capsule, Hand, Link, link_origin
 from common.logs.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
 from common.logs.poses import link_poses
 from common.task.types import MASKS
@@ -37,6 +37,8 @@ _AXES = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.7, 0.2, 1.0), (0.2, 0.3, 0.9, 1.0))
 _ARROW = 0.10  # length of the approach arrow, m
 _FORCE_LENGTH, _FORCE_MAX = 0.01, 0.10  # m per newton, and the longest arrow
 _FORCE_LEAST = 0.05  # N
+_SKIN_POINTS = 96  # on each capsule
+_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -60,6 +62,10 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
     yield Entry(opaque_channel(f"{topic}/raw", EPISODE_SCHEMA), start, encode(episode))
     yield _protobuf(f"{topic}/scene", start, _static_scene(hand, actor, arrays, episode.meta, start), latched=True)
     yield _protobuf(f"{topic}/surface", start, _surface(actor, arrays, start), latched=True)
+    for link in hand.links:
+        # Rerun draws point clouds and no scenes; a topic holds one frame's cloud.
+        cloud = _cloud(f"{actor}/{link.name}", _skin(link), np.multiply(_SKIN, 255), start)
+        yield _protobuf(f"{topic}/hand/{link.name}", start, cloud, latched=True)
     for i in range(len(arrays["object_position"])):
         now = start + i * step
         yield _protobuf(f"{topic}/tf", now, _transforms(hand, actor, arrays, i, slot, now))
@@ -151,12 +157,36 @@ def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mappin
 
 def _surface(actor: str, arrays: Mapping[str, np.ndarray], now: int) -> PointCloud:
     """The object's surface points: O+ green, O- red."""
-    points, minus = arrays["surface_points"], arrays["surface_minus"]
+    colours = np.where(arrays["surface_minus"][:, None], np.multiply(_MINUS, 255), np.multiply(_PLUS, 255))
+    return _cloud(f"{actor}/object", arrays["surface_points"], colours, now)
+
+
+def _skin(link: Link) -> np.ndarray:
+    """(n, 3) points spread evenly over the link's capsules, in its frame.
+
+    Equal steps along a capsule's whole length cut equal areas off it, caps included (Archimedes).
+    """
+    points = []
+    for capsule in link.capsules:
+        start, end = np.subtract([capsule.start, capsule.end], link_origin(link))
+        length = float(np.linalg.norm(end - start))
+        axis = (end - start) / length if length else np.array([0.0, 0.0, 1.0])
+        turn = Rotation.from_quat(_turn_onto([0.0, 0.0, 1.0], axis), scalar_first=True)
+        along = np.linspace(-1, 1, 2 * _SKIN_POINTS + 1)[1::2] * (length / 2 + capsule.radius)
+        around = _GOLDEN_ANGLE * np.arange(_SKIN_POINTS)
+        radius = np.sqrt(capsule.radius**2 - np.maximum(np.abs(along) - length / 2, 0.0) ** 2)
+        local = np.stack([radius * np.cos(around), radius * np.sin(around), along], -1)
+        points.append(turn.apply(local) + (start + end) / 2)
+    return np.concatenate(points) if points else np.zeros((0, 3))
+
+
+def _cloud(frame: str, points: np.ndarray, colours: np.ndarray, now: int) -> PointCloud:
+    """Points (N, 3) of a frame with colours (4,) or (N, 4) from 0 to 255."""
     packed = np.zeros(len(points), [("position", "<f4", 3), ("colour", "u1", 4)])
     packed["position"] = points
     # Foxglove's packed colours lie as red, green, blue, alpha in memory, one field of a byte each.
-    packed["colour"] = np.where(minus[:, None], np.multiply(_MINUS, 255), np.multiply(_PLUS, 255))
-    cloud = PointCloud(frame_id=f"{actor}/object", point_stride=packed.dtype.itemsize, data=packed.tobytes())
+    packed["colour"] = colours
+    cloud = PointCloud(frame_id=frame, point_stride=packed.dtype.itemsize, data=packed.tobytes())
     cloud.timestamp.FromNanoseconds(now)
     cloud.pose.orientation.w = 1.0
     kinds = [("x", 0), ("y", 4), ("z", 8), ("red", 12), ("green", 13), ("blue", 14), ("alpha", 15)]

@@ -69,4 +69,20 @@ def motion(
     return 0
 
 
-COMMANDS = {"policy": policy, "motion": motion}
+def layout(
+    path: Annotated[pathlib.Path, tyro.conf.Positional], out: pathlib.Path = pathlib.Path("congrasp-layout.json")
+) -> int:
+    """Write a layout for Foxglove: the actors' episodes in 3-D, learning curves, rewards, contacts and events.
+
+    Args:
+      path: The run's folder, or one MCAP file, that the layout is to fit.
+      out: The file to write; in Foxglove: Layout, Import from file.
+    """
+    from services.export.layout import export_layout
+
+    panels = export_layout(path, out)
+    print(f"{out}: {panels} panels")
+    return 0
+
+
+COMMANDS = {"policy": policy, "motion": motion, "layout": layout}

@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from common.hands import get_hand
 from common.logs.channels import Entry
 from common.logs.reader import is_complete, log_files, read_episodes, read_metrics, read_records, read_rollouts
 from common.logs.recorder import Recorder
@@ -75,6 +76,7 @@ def test_everything_a_run_publishes_is_in_the_file(transport: MemoryTransport, t
         "/version/learner/0",
         "/rollout/a0",
         *(f"/episode/a0/{part}" for part in ("raw", "scene", "surface", "tf", "contacts", "signals")),
+        *(f"/episode/a0/hand/{link.name}" for link in get_hand("human").links),
     }
     assert len(topics["/metrics/learner/0"]) == 3
     assert json.loads(topics["/version/learner/0"][0]) == {"version": 7, "hash": "ab"}

@@ -125,6 +125,25 @@ def test_surface_points_are_coloured_by_region(entries: list[Entry]) -> None:
     np.testing.assert_array_equal(red > green, arrays["surface_minus"])
 
 
+def test_points_of_every_link_lie_on_its_capsules_in_its_frame(entries: list[Entry]) -> None:
+    for link in HAND.links:
+        (entry,) = of(entries, f"hand/{link.name}")
+        cloud = PointCloud.FromString(entry.data)
+        assert cloud.frame_id == f"a0/{link.name}" and entry.channel.latched
+        raw = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
+        points = raw[:, :12].copy().view("<f4") + link_origin(link)
+        depth = []
+        for capsule in link.capsules:
+            start, along = np.array(capsule.start), np.subtract(capsule.end, capsule.start)
+            share = np.clip((points - start) @ along / (along @ along), 0, 1)
+            depth.append(np.linalg.norm(points - start - share[:, None] * along, axis=1) - capsule.radius)
+        each = np.split(np.arange(len(points)), len(link.capsules))
+        for distance, own in zip(depth, each, strict=True):
+            np.testing.assert_allclose(distance[own], 0, atol=1e-6)
+            ends = points[own].min(0), points[own].max(0)
+            assert np.linalg.norm(ends[1] - ends[0]) > 0.01
+
+
 def test_table_and_forces_are_drawn_while_they_last(entries: list[Entry]) -> None:
     updates = [SceneUpdate.FromString(entry.data) for entry in of(entries, "contacts")]
     has_table = [any(e.id == "table" for e in update.entities) for update in updates]
