@@ -7,7 +7,7 @@ import io
 import os
 import re
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from docutils import nodes
 from docutils.parsers.rst import Directive
@@ -98,7 +98,7 @@ def _short(value: typing.Any) -> str:
     return text if len(text) <= _DEFAULT else text[:_DEFAULT] + "…"
 
 
-def _section(title: str, content: list[nodes.Node]) -> nodes.section:
+def _section(title: str, content: Sequence[nodes.Node]) -> nodes.section:
     section = nodes.section(ids=[nodes.make_id(title)])
     section += nodes.title(text=title)
     section.extend(content)
@@ -111,7 +111,7 @@ def _literal(text: str) -> nodes.literal_block:
     return block
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> nodes.table:
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> nodes.table:
     group = nodes.tgroup(cols=len(head))
     group.extend(nodes.colspec(colwidth=1) for _ in head)
     body = nodes.tbody()

@@ -266,39 +266,56 @@ def write_json(rows: Sequence[Row], path: pathlib.Path, about: dict[str, Any]) -
     write_atomically(path, json.dumps({**about, "rows": [row.to_json() for row in rows]}, indent=2).encode())
 
 
+RATES = ("constraint", "episodes", "success", "held 2 s", "error", "paper")
+"""Columns of the table that compares with the paper; `rate_cells` fills them."""
+FORCES = ("constraint", "link, N", "sum, N", "torque, % of limit", "links", "diverged")
+"""Columns of the table of forces after the removal (mean, 95th percentile); `force_cells` fills them."""
+
+
+def rate_cells(row: Row) -> tuple[str, ...]:
+    """A row's cells under `RATES`."""
+    return (
+        _name(row),
+        str(row.episodes),
+        _rate(row.success, row.success_low, row.success_high),
+        _rate(row.held_2s, row.held_2s_low, row.held_2s_high),
+        _errors(row.errors),
+        f"{_percent(row.paper.success)}  {_errors(row.paper.errors)}".strip() if row.paper else "",
+    )
+
+
+def force_cells(row: Row) -> tuple[str, ...]:
+    """A row's cells under `FORCES`."""
+    return (
+        _name(row),
+        _pair(row.forces["link_force_mean"], row.forces["link_force_p95"], 1.0),
+        _pair(row.forces["force_sum_mean"], row.forces["force_sum_p95"], 1.0),
+        _pair(row.forces["torque_share_mean"], row.forces["torque_share_p95"], 100.0),
+        f"{row.links_at_removal:.1f}",
+        _percent(row.diverged),
+    )
+
+
 def tables_of(rows: Sequence[Row], title: str) -> list[Any]:
     """Rows as rich tables: rates and errors beside the paper's, then forces."""
     from rich.table import Table
 
-    rates = Table(title=title, title_justify="left")
-    forces = Table(title="Forces after the removal: mean, 95th percentile", title_justify="left")
-    for table, columns in (
-        (rates, ("constraint", "episodes", "success", "held 2 s", "error", "paper")),
-        (forces, ("constraint", "link, N", "sum, N", "torque, % of limit", "links", "diverged")),
+    tables = []
+    for heading, columns, cells in (
+        (title, RATES, rate_cells),
+        ("Forces after the removal: mean, 95th percentile", FORCES, force_cells),
     ):
+        table = Table(title=heading, title_justify="left")
         for column in columns:
             table.add_column(column, no_wrap=column in ("constraint", "success", "held 2 s"))
-    for row in rows:
-        name = f"{row.constraint}, {row.group}" if row.group else row.constraint
-        paper = f"{_percent(row.paper.success)}  {_errors(row.paper.errors)}" if row.paper else ""
-        rates.add_row(
-            name,
-            str(row.episodes),
-            _rate(row.success, row.success_low, row.success_high),
-            _rate(row.held_2s, row.held_2s_low, row.held_2s_high),
-            _errors(row.errors),
-            paper.strip(),
-        )
-        found = row.forces
-        forces.add_row(
-            name,
-            _pair(found["link_force_mean"], found["link_force_p95"], 1.0),
-            _pair(found["force_sum_mean"], found["force_sum_p95"], 1.0),
-            _pair(found["torque_share_mean"], found["torque_share_p95"], 100.0),
-            f"{row.links_at_removal:.1f}",
-            _percent(row.diverged),
-        )
-    return [rates, forces]
+        for row in rows:
+            table.add_row(*cells(row))
+        tables.append(table)
+    return tables
+
+
+def _name(row: Row) -> str:
+    return f"{row.constraint}, {row.group}" if row.group else row.constraint
 
 
 def _percent(rate: float) -> str:

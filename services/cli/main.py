@@ -30,6 +30,7 @@ COMMANDS = {
     "constraints": "make the constraint sets of objects, and look at them",
     "record": "record a run to MCAP, from this machine or another",
     "plot": "draw a run's learning curves and reward terms",
+    "report": "one HTML file about a policy: results, pictures, curves, model card",
     "export": "a policy as ONNX or StableHLO, a motion as GLB, USD, BVH, ROS 2 or LeRobot",
     "render": "draw the hand, or an episode of a run",
     "view": "the constraint studio and a window on a training, in the browser",
@@ -45,7 +46,7 @@ USAGE_ERROR = 2
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXTRAS = {
-    **dict.fromkeys(("foxglove", "imageio_ffmpeg", "matplotlib"), "viz"),
+    **dict.fromkeys(("foxglove", "imageio_ffmpeg", "jinja2", "matplotlib"), "viz"),
     **dict.fromkeys(("bvhio", "mcap_ros2", "onnx", "onnxruntime", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
     "wandb": "wandb",
     "warp": "cuda",
