@@ -145,33 +145,34 @@ class Grasper:
         """
         asked = asked or Asked()
         best: tuple[float, Outcome, int, int] | None = None
-        held = 0
+        held = tried = 0
         for round_ in range(self._rounds):
-            beginnings, rests = self._beginnings(obj, asked, np.random.default_rng((self._seed, round_)))
+            beginnings, rests, different = self._beginnings(obj, asked, np.random.default_rng((self._seed, round_)))
+            what = f"Trying others ({round_ + 1})" if round_ else "Trying"
             outcome = self._trials.run(
-                obj,
-                beginnings,
-                lambda step, round_=round_: progress(  # type: ignore[misc]
-                    "Trying" if round_ == 0 else f"Trying others ({round_ + 1})", step, self._trials.steps
-                ),
+                obj, beginnings, functools.partial(lambda what, step: progress(what, step, self._trials.steps), what)
             )
-            _check_aligned(outcome, asked)
-            costs = _costs(outcome, _active(asked)) + _UNLIKELY * rests
-            held += int(outcome.metrics["held"].sum())
+            _check_aligned(outcome)
+            costs = (_costs(outcome, _active(asked)) + _UNLIKELY * rests)[:different]
+            tried += different
+            held += int(outcome.metrics["held"][:different].sum())
             index = int(costs.argmin())
             if best is None or costs[index] < best[0]:
                 best = (float(costs[index]), outcome, index, int(rests[index]))
-            if held or len(np.unique(rests)) == len(rests):
+            if held or asked.pose or asked.trajectory:
                 break
         assert best is not None
-        return self._result(obj, asked, best[1], best[2], best[3], (round_ + 1) * self._tries, held)
+        _, outcome, index, rest = best
+        return self._result(obj, asked, outcome, index, rest, tried, held)
 
     def close(self) -> None:
         """Ends the physics' threads."""
         self._trials.close()
 
-    def _beginnings(self, obj: GraspObject, asked: Asked, rng: np.random.Generator) -> tuple[Beginnings, np.ndarray]:
-        """Tries under the constraints, and (B,) the resting pose of each."""
+    def _beginnings(
+        self, obj: GraspObject, asked: Asked, rng: np.random.Generator
+    ) -> tuple[Beginnings, np.ndarray, int]:
+        """Tries under the constraints, (B,) the resting pose of each, and how many of them are different."""
         batch, points = self._tries, self.task.surface_points
         labelled = obj if asked.minus is None else with_minus(obj, asked.minus)
         reference = _valid_rests(self.hand, obj, asked) if asked.pose or asked.trajectory else None
@@ -207,7 +208,8 @@ class Grasper:
         minus = labelled.non_graspable_points[:points]
         surface = Surface(all_of(obj.points[:points]), np.broadcast_to(minus, (batch, points)))
         rest = np.asarray(obj.rest_poses, np.float32)[rests]
-        return Beginnings(Request(goal, *flags), surface, rest), rests
+        different = batch if reference is None else min(batch, len(reference))
+        return Beginnings(Request(goal, *flags), surface, rest), rests, different
 
     def _result(
         self, obj: GraspObject, asked: Asked, outcome: Outcome, index: int, rest: int, tries: int, held: int
@@ -308,7 +310,7 @@ def _costs(outcome: Outcome, constraints: tuple[str, ...]) -> np.ndarray:
     return np.asarray(cost) + 1e3 * (values["success"] == 0) + 1e4 * (values["held"] == 0)
 
 
-def _check_aligned(outcome: Outcome, asked: Asked) -> None:
+def _check_aligned(outcome: Outcome) -> None:
     if not outcome.aligned.all():
         raise CongraspError(
             "The trajectory ends nearer to what must not be touched than to what may be grasped.",
@@ -355,7 +357,7 @@ def _no_room(obj: GraspObject, asked: Asked) -> tuple[str, str]:
     down = -_matrix(obj.rest_poses[0][3:])[2]
     return (
         "The hand would have to come through the table, however the object lies.",
-        f'In its likeliest pose straight down is --heading "{" ".join(f"{x:.2f}" for x in down + 0.0)}".',
+        f'In its likeliest pose straight down is --heading "{" ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)}".',
     )
 
 

@@ -6,6 +6,8 @@ import pathlib
 import time
 from typing import Any
 
+import numpy as np
+
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.logs.channels import JsonChannels
@@ -44,14 +46,22 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
     save_motion(folder / MOTION, found.motion)
     save_recording(folder / RECORDING, found.episode)
     episode = found.episode
-    last = len(episode.arrays["table"]) - 1
-    camera = best_camera(episode, range(0, last + 1, last // 4)) if pictures or video else None
+    steps = _moments(np.asarray(episode.arrays["table"], bool))
+    last = steps[-1]
+    camera = best_camera(episode, steps) if pictures or video else None
     if pictures:
-        save_png(folder / PICTURE, episode_sheet(episode, camera=camera, quick=True))
+        save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera, quick=True))
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera, quick=True)))
     if video:
         save_episode_video(folder / VIDEO, episode, camera=camera)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
+
+
+def _moments(table: np.ndarray) -> list[int]:
+    """Steps of a grasp worth seeing: six of the approach, one while it is held, and the last."""
+    removal, last = int(table.sum()), len(table) - 1
+    approach = np.linspace(0, min(removal, last), 6)
+    return sorted({round(step) for step in [*approach, (removal + last) / 2, last]})
 
 
 def save_recording(path: pathlib.Path, episode: Message) -> None:

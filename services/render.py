@@ -252,11 +252,21 @@ def episode_sheet(
     *,
     moments: int = 8,
     size: tuple[int, int] = (440, 330),
+    steps: Sequence[int] | None = None,
     camera: Camera | None = None,
     quick: bool = False,
 ) -> np.ndarray:
-    """An episode in a few moments (its first and last step, and the table's removal, among them), with its metrics."""
-    steps = key_steps(np.asarray(episode.arrays["table"], bool), moments)
+    """An episode in a few moments (its first and last step, and the table's removal, among them), with its metrics.
+
+    Args:
+      episode: the episode.
+      moments: number of pictures.
+      size: width and height of each, pixels.
+      steps: which moments; spread evenly otherwise.
+      camera: see `render_episode_frames`, as is `quick`.
+      quick: plainer light, many times faster.
+    """
+    steps = steps or key_steps(np.asarray(episode.arrays["table"], bool), moments)
     dt = float(episode.meta["control_dt"])
     table = np.asarray(episode.arrays["table"], bool)
     labels = [f"{dt * step:.2f} s" + ("" if table[step] else "   table away") for step in steps]
