@@ -43,7 +43,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     def add(index: int, indent: str) -> None:
         body = found[index]
         inner = indent + "    "
-        turns = (_tuple(q) for q in quaternions(body.rotation, scalar_first=True))
+        turns = map(_quaternion, quaternions(body.rotation, scalar_first=True))
         lines.extend([f'{indent}def Xform "{names[index]}"', f"{indent}{{"])
         lines.append(f"{inner}custom string {_NAME} = {json.dumps(body.name)}")
         if len(body.translation) > 1:
@@ -73,6 +73,11 @@ def _tuple(values: Iterable[float]) -> str:
     return f"({', '.join(map(_number, values))})"
 
 
+def _quaternion(values: Iterable[float]) -> str:
+    """In full, because readers take the angle from the first number's arc cosine."""
+    return f"({', '.join(f'{value:.17g}' for value in values)})"
+
+
 def _samples(values: Iterable[str]) -> str:
     return f"{{ {', '.join(f'{i}: {value}' for i, value in enumerate(values))} }}"
 
@@ -94,7 +99,7 @@ def _capsules(motion: GraspMotion, link: int) -> list[str]:
             f"    float3[] extent = [{_tuple([-radius, -radius, -half])}, {_tuple([radius, radius, half])}]",
             f"    color3f[] primvars:displayColor = [{_tuple(_COLOURS['hand'])}]",
             f"    double3 xformOp:translate = {_tuple((start + end) / 2)}",
-            f"    quatd xformOp:orient = {_tuple(turn.as_quat(scalar_first=True))}",
+            f"    quatd xformOp:orient = {_quaternion(turn.as_quat(scalar_first=True))}",
             '    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]',
             "}",
         ]

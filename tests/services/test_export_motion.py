@@ -17,7 +17,7 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from common.logs.channels import Entry
 from common.logs.entries import Converter
-from common.logs.motion import GraspMotion, motion_of_episode, save_motion
+from common.logs.motion import GraspMotion, hand_arrays, motion_of_episode, save_motion
 from common.logs.poses import link_poses
 from common.logs.writer import LogWriter
 from services.cli.main import main
@@ -56,6 +56,13 @@ def posed(motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np
 def human() -> GraspMotion:
     hand = get_hand("human")
     return posed(motion_of_episode(episode(T)), lambda q: link_poses(hand, q), 0)
+
+
+@pytest.fixture(scope="module")
+def robot(human: GraspMotion) -> GraspMotion:
+    hand = get_hand("sharpa")
+    arrays = dataclasses.replace(human, hand=hand.name, **hand_arrays(hand))
+    return posed(arrays, lambda q: link_poses(hand, q), 1)
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +110,9 @@ def export(motions: Sequence[GraspMotion], kind: str, folder: pathlib.Path) -> t
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_every_reader_finds_hand_and_object_where_they_were(
-    human: GraspMotion, odd_hand: GraspMotion, kind: str, tmp_path: pathlib.Path
+    human: GraspMotion, robot: GraspMotion, odd_hand: GraspMotion, kind: str, tmp_path: pathlib.Path
 ) -> None:
-    for name, which in (("human", human), ("odd", odd_hand)):
+    for name, which in (("human", human), ("robot", robot), ("odd", odd_hand)):
         path, error = export([which], kind, tmp_path / name)
         assert error < 0.01
         (track,) = MODULES[kind].read(path)
