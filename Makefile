@@ -1,4 +1,4 @@
-# quickstart: set up and train a small policy.  test, lint: check the code.  docs: build the site.  bench: print the benchmark tables.
+# quickstart: set up and train a small policy.  test, coverage, lint: check the code.  docs: build the site.  bench: print the benchmark tables.
 # Everything runs in .venv, which the first target makes; another interpreter: make quickstart PYTHON=python3.12
 
 supported := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
@@ -11,7 +11,7 @@ CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/congrasp
 # Compiled programs are kept between runs; another folder: JAX_COMPILATION_CACHE_DIR=...
 export JAX_COMPILATION_CACHE_DIR ?= $(CACHE)/jax
 
-.PHONY: quickstart test lint docs bench install clean
+.PHONY: quickstart test coverage lint docs bench install clean
 .DEFAULT_GOAL := quickstart
 
 quickstart: install
@@ -19,7 +19,10 @@ quickstart: install
 
 test: install
 	@tests/install_browser.sh $(VENV)/bin/python
-	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 2 --dist loadfile -m "not gpu" --cov --cov-report=term $(ARGS)
+	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 2 --dist loadfile -m "not gpu" $(ARGS)
+
+coverage:
+	$(MAKE) test ARGS="--cov --cov-report=term $(ARGS)"
 
 lint: install
 	$(VENV)/bin/ruff check .
