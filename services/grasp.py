@@ -20,6 +20,7 @@ from actors.episode import episode_message
 from actors.rollout import Trace, goal_of_world
 from actors.trials import Beginnings, Outcome, Trials
 from common import rotations
+from common.constraints.contradictions import Wishes, contradictions
 from common.constraints.headings import above, clear_table, feasible, sample_headings
 from common.constraints.priority import Request, explain
 from common.errors import CongraspError
@@ -241,6 +242,9 @@ class Grasper:
             trajectory=asked.trajectory is not None,
             redirected=bool(outcome.redirected[index]),
         )
+        pose = (asked.pose.q, asked.pose.position, asked.pose.quaternion) if asked.pose else None
+        wishes = Wishes(asked.direction, asked.position, asked.minus, pose, asked.trajectory)
+        words += [found.words for found in contradictions(self.hand, obj.points, wishes)]
         return Grasp(episode, motion_of_episode(episode), tries, held, rest, tuple(words))
 
 

@@ -70,43 +70,41 @@ def two_parts(
     return relabelled(obj, np.where(plus, 0, 1), words, (True, False), name)
 
 
-def in_half_space(obj: GraspObject, normal: np.ndarray, offset: float) -> np.ndarray:
+def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> np.ndarray:
     """(512,) bool: surface points x with normal . x >= offset (m), in the object frame."""
     length = float(np.linalg.norm(normal))
     if not np.isfinite(length) or length < 1e-9:
-        raise CongraspError(f"The normal {np.asarray(normal).tolist()} has no direction.", "Give three numbers.")
+        raise CongraspError(f"The direction {tuple(normal)} has no length.", "Give three numbers.")
     return obj.points @ (np.asarray(normal, float) / length) >= offset
 
 
-def on_part_mesh(obj: GraspObject, path: pathlib.Path, factor: float = 1.0) -> np.ndarray:
+def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
     """(512,) bool: surface points that lie on the mesh of a part.
 
     Args:
       obj: an imported object.
       path: the part, in the frame and unit of the file that the object was imported from.
-      factor: metres per unit of the file.
 
     Raises:
       CongraspError: the mesh cannot be read, or lies elsewhere.
     """
     dense, _ = trimesh.sample.sample_surface(read_mesh(path), 8000, seed=0)
-    distance = cKDTree(np.asarray(dense) * factor + obj.origin).query(obj.points)[0]
+    distance = cKDTree(np.asarray(dense) * obj.file_scale + obj.origin).query(obj.points)[0]
     if distance.min() > _ON_PART:
         raise CongraspError(
             f"{path} lies {100 * distance.min():.1f} cm from the surface of '{obj.name}'.",
-            "The part must be in the frame and unit of the object's own file (--unit, --scale).",
+            "The part must be in the frame and unit of the object's own file.",
         )
     return distance <= _ON_PART
 
 
-def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int], factor: float = 1.0) -> np.ndarray:
+def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) -> np.ndarray:
     """(512,) bool: surface points whose nearest vertex in a coloured PLY file has a colour.
 
     Args:
       obj: an imported object.
       path: its mesh with coloured vertices, in the frame and unit of the file that it was imported from.
       colour: red, green and blue, 0 to 255.
-      factor: metres per unit of the file.
 
     Raises:
       CongraspError: the file has no coloured vertices, or none of this colour.
@@ -128,7 +126,7 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int], 
         seen = ", ".join("#{:02x}{:02x}{:02x}".format(*row) for row in _commonest(rgb))
         given = "#{:02x}{:02x}{:02x}".format(*colour)
         raise CongraspError(f"No vertex of {path} has the colour {given}.", f"Its colours are {seen}.")
-    return same[cKDTree(np.asarray(mesh.vertices) * factor + obj.origin).query(obj.points)[1]]
+    return same[cKDTree(np.asarray(mesh.vertices) * obj.file_scale + obj.origin).query(obj.points)[1]]
 
 
 def near_points(obj: GraspObject, points: np.ndarray, radius: float) -> np.ndarray:

@@ -21,6 +21,7 @@ from common.objects.procedural import FAMILIES, family_turns, generate
 from common.objects.sources import SUFFIXES, find_sources
 from common.objects.spec import GraspObject
 from common.objects.store import Catalogue
+from services.cli.objects_affordance import ObjectsAffordance
 
 _console = Console(highlight=False)
 
@@ -186,6 +187,7 @@ SUBCOMMANDS: dict[str, Callable[..., Any]] = {
     "import": ObjectsImport,
     "list": ObjectsList,
     "show": ObjectsShow,
+    "affordance": ObjectsAffordance,
 }
 
 

@@ -29,7 +29,7 @@ from services.importers.objects import load_object, scaled
 from services.importers.sequence import Dropped, Sequence
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
-_TOUCHED = 0.015
+_TOUCHED = 0.03
 """Metres around touched points that count as touched."""
 _VERTICES = 3
 """Contact points that make a part of an object one of O+ (paper)."""

@@ -107,16 +107,9 @@ def extract(
         raise Dropped(sequence.name, "wrong units", reason)
     skin = position[:, None, None] + np.einsum("tij,tfkj->tfki", rotation, sequence.joints)
     frame = _grasping_frame(sequence, surface, skin)
-    start = _farthest(sequence, position, far, frame)
-    if far[start] < NEAREST:
-        reason = f"the wrist comes from {100 * far[start]:.1f} cm only ({100 * NEAREST:.0f} cm are needed)"
-        raise Dropped(sequence.name, "starts too near", reason)
+    start, path, turns = approach(sequence.name, position, rotation, far, sequence.present, frame, waypoints)
     found = _fit(sequence, frame)
     _check_limits(sequence.name, found.q, beyond)
-    frames = np.flatnonzero(sequence.present[start : frame + 1]) + start
-    path, turns = _truncated(position[frames], rotation[frames], far[frames])
-    _check_complexity(sequence.name, path, turns)
-    path, turns = _resampled(path, turns, waypoints)
     return Demonstration(
         name=sequence.name,
         frame=frame,
@@ -127,6 +120,42 @@ def extract(
         quaternion=turns,
         contact=surface.within(*_skin_balls(skin[frame], CONTACT)),
     )
+
+
+def approach(
+    name: str,
+    position: np.ndarray,
+    rotation: np.ndarray,
+    far: np.ndarray,
+    present: np.ndarray,
+    frame: int,
+    waypoints: int,
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """The wrist trajectory that leads to a grasp.
+
+    Args:
+      name: of the motion.
+      position: (T, 3) of the wrist, m, object frame.
+      rotation: (T, 3, 3) of the wrist.
+      far: (T,) wrist-object distance, m.
+      present: (T,) bool, which frames are known.
+      frame: the grasping frame.
+      waypoints: K.
+
+    Returns:
+      The frame of the farthest distance, and waypoints (K, 3), (K, 4) from far to near.
+
+    Raises:
+      Dropped: the wrist starts too near, or its path is too complex.
+    """
+    start = _farthest(position, far, present, frame)
+    if far[start] < NEAREST:
+        reason = f"the wrist comes from {100 * far[start]:.1f} cm only ({100 * NEAREST:.0f} cm are needed)"
+        raise Dropped(name, "starts too near", reason)
+    frames = np.flatnonzero(present[start : frame + 1]) + start
+    path, turns = _truncated(position[frames], rotation[frames], far[frames])
+    _check_complexity(name, path, turns)
+    return start, *_resampled(path, turns, waypoints)
 
 
 def in_object_frame(sequence: Sequence, obj: GraspObject) -> tuple[np.ndarray, np.ndarray]:
@@ -173,11 +202,11 @@ def _skin_balls(joints: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarr
     return points.reshape(-1, 3), np.broadcast_to(radii + margin, points.shape[:-1]).ravel()
 
 
-def _farthest(sequence: Sequence, position: np.ndarray, far: np.ndarray, frame: int) -> int:
+def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame: int) -> int:
     """The frame of the local maximum of the distance, backwards from the grasping frame along continuous motion."""
     best = last = frame
     for t in range(frame - 1, -1, -1):
-        if not sequence.present[t]:
+        if not present[t]:
             continue
         step = np.linalg.norm(position[last] - position[t])
         if last - t > GAP + 1 or step > JUMP * (last - t) or far[t] < far[best] - DIP:

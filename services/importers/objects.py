@@ -95,4 +95,5 @@ def scaled(obj: GraspObject, factor: float) -> GraspObject:
         rest_poses=rest,
         visual_vertices=obj.visual_vertices * np.float32(factor),
         origin=larger(obj.origin),
+        file_scale=factor * obj.file_scale,
     )

@@ -1,0 +1,77 @@
+"""Completes a wrist's path with finger motions: a whole-body motion moves the hand, congrasp makes it grasp.
+
+    python examples/wrist_completion.py examples/reach.bvh --mesh mug:7 --object-at -0.03 0 0.05 --out completed
+
+The motion is a CSV, NPZ or BVH file in a world with the object in it; of a BVH skeleton one joint is the wrist. The
+path is cut as captured ones are (from at most 20 cm) and ends where the wrist is nearest to the object.
+"""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+import tyro
+from scipy.spatial.transform import Rotation
+
+from common.logs.motion import save_motion
+from services.cli.objects import find_object
+from services.grasp import grasp
+from services.importers.extract import Surface, approach
+from services.render import episode_sheet
+from services.sheets import save_png
+from services.wrist_paths import read_wrist_path
+
+
+@dataclasses.dataclass
+class Arguments:
+    """What is completed."""
+
+    motion: tyro.conf.Positional[pathlib.Path]
+    """The motion: CSV, NPZ or BVH."""
+    mesh: str = "mug:7"
+    """The object: a mesh, an object file, or FAMILY:SEED."""
+    object_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the origin of its file lies in the motion's world, m, z up."""
+    object_turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """How it is turned there, quaternion w x y z."""
+    joint: str = "RightHand"
+    """Joint of a BVH skeleton that is the wrist."""
+    fingers: str = "-y"
+    """Axis of that joint along which the fingers point."""
+    back: str = "+z"
+    """Axis of that joint towards the back of the hand."""
+    hand: str = "human"
+    """Hand whose shipped policy is taken."""
+    policy: pathlib.Path | None = None
+    """A policy file instead."""
+    out: pathlib.Path = pathlib.Path("completed")
+    """Folder for the results."""
+
+
+def main(arguments: Arguments) -> None:
+    """Cuts the path, grasps, and writes motion and picture."""
+    obj = find_object(arguments.mesh)
+    path = read_wrist_path(arguments.motion, joint=arguments.joint, fingers=arguments.fingers, back=arguments.back)
+    turn = Rotation.from_quat(arguments.object_turn, scalar_first=True).inv()
+    in_file = turn.apply(path.position - arguments.object_at)
+    rotation = turn * path.rotation
+    far = Surface(obj).distance(in_file + obj.origin)
+    frame = int(far.argmin())
+    seen = np.ones(len(far), bool)
+    start, waypoints, turns = approach(arguments.motion.stem, in_file, rotation.as_matrix(), far, seen, frame, 15)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    table = arguments.out / "wrist.csv"  # in the coordinates of the object's file, as congrasp grasp takes it
+    np.savetxt(table, np.concatenate([waypoints, turns], 1), delimiter=",", header="x, y, z, qw, qx, qy, qz")
+    done = grasp(obj, trajectory=str(table), hand=arguments.hand, policy=arguments.policy)
+    save_motion(arguments.out / "grasp.npz", done.motion)
+    save_png(arguments.out / "grasp.png", episode_sheet(done.episode))
+    error = done.motion.metrics
+    print(
+        f"frames {start} to {frame} of {len(far)}: {obj.name} is {'held' if done.success else 'not held'} "
+        f"({done.held} of {done.tries} tries); the wrist is off by {100 * error['trajectory_m']:.1f} cm and "
+        f"{error['trajectory_rad']:.2f} rad. Everything is in {arguments.out}."
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))

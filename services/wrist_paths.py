@@ -1,0 +1,170 @@
+"""Paths of a wrist in other people's motions: CSV, NPZ, and a joint of a BVH skeleton.
+
+What comes out is in metres, in a world whose z axis points up, for the `human` hand's wrist frame: fingers towards -y,
+the thumb's side +x, the back of the hand +z.
+"""
+
+import pathlib
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+
+_UP = {"y": Rotation.from_euler("X", 90, degrees=True), "z": Rotation.identity()}
+_AXES = {
+    f"{sign}{axis}": s * row for axis, row in zip("xyz", np.eye(3), strict=True) for sign, s in (("+", 1), ("-", -1))
+}
+
+
+class WristPath(NamedTuple):
+    """T moments of a wrist."""
+
+    position: np.ndarray
+    """(T, 3) m."""
+    rotation: Rotation
+    """T orientations of the wrist frame."""
+    seconds: float
+    """Between two moments."""
+
+
+def read_wrist_path(
+    path: pathlib.Path,
+    *,
+    joint: str = "RightHand",
+    unit: float = 0.01,
+    up: str = "y",
+    fingers: str = "-y",
+    back: str = "+z",
+) -> WristPath:
+    """A wrist's path.
+
+    Args:
+      path: `.csv`, a line a moment: x, y, z (m) and a quaternion w, x, y, z; `.npz` with `position` (T, 3) and
+        `quaternion` (T, 4), or a grasp motion; or `.bvh`.
+      joint: of a BVH file: the joint that is the wrist.
+      unit: of a BVH file: metres per unit.
+      up: of a BVH file: its vertical axis, y or z.
+      fingers: the axis of the wrist's own frame along which its fingers point, such as +x.
+      back: the axis towards the back of the hand.
+
+    Raises:
+      CongraspError: the file cannot be read, or has no such joint.
+    """
+    readers = {".csv": _csv, ".npz": _npz}
+    kind = path.suffix.lower()
+    if not path.is_file():
+        raise CongraspError(f"There is no file {path}.", "Name a CSV, NPZ or BVH file.")
+    if kind == ".bvh":
+        if up not in _UP:
+            raise CongraspError(f"The vertical axis is '{up}'.", "It is y or z.")
+        position, rotation, seconds = read_bvh(path, joint)
+        position, rotation = _UP[up].apply(position * unit), _UP[up] * rotation
+    elif kind in readers:
+        position, quaternion, seconds = readers[kind](path)
+        rotation = Rotation.from_quat(quaternion, scalar_first=True)
+    else:
+        raise CongraspError(f"{path} is neither CSV, NPZ nor BVH.", "Convert it to one of them.")
+    for name in (fingers, back):
+        if name not in _AXES:
+            raise CongraspError(f"'{name}' is no axis.", f"Choose one of: {', '.join(_AXES)}.")
+    if _AXES[fingers] @ _AXES[back]:
+        raise CongraspError(f"Fingers along {fingers} and the back of the hand along {back} do not fit.")
+    y, z = -_AXES[fingers], _AXES[back]
+    own = Rotation.from_matrix(np.stack([np.cross(y, z), y, z], -1))
+    return WristPath(position, rotation * own, seconds)
+
+
+def read_bvh(path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, float]:
+    """A joint's positions (T, 3) and orientations in a BVH file's own unit and axes, and seconds between frames.
+
+    Raises:
+      CongraspError: the file is damaged, or has no such joint; the line names those that it has.
+    """
+    try:
+        head, _, tail = path.read_text().partition("MOTION")
+        chain, width, names = _chain(head, joint)
+        if chain is None:
+            raise CongraspError(f"{path} has no joint '{joint}'.", f"Its joints are: {', '.join(names)}.")
+        _, count, *_, seconds, rest = tail.split(maxsplit=5)
+        rows = np.array(rest.split(), float).reshape(int(count), width)
+    except (OSError, UnicodeDecodeError, ValueError, IndexError, KeyError) as error:
+        raise CongraspError(f"{path} cannot be read as BVH: {error}.", "Export it again.") from None
+    position, rotation = np.zeros((len(rows), 3)), Rotation.identity(len(rows))
+    for offset, channels, first in chain:
+        values = rows[:, first : first + len(channels)]
+        moved = np.tile(offset, (len(rows), 1))
+        turn = Rotation.identity(len(rows))
+        for channel, column in zip(channels, values.T, strict=True):
+            axis = channel[0].upper()
+            if channel.endswith("position"):
+                # A position takes the place of the offset, as most programs read it.
+                moved[:, "XYZ".index(axis)] = column
+            else:
+                turn = turn * Rotation.from_euler(axis, column[:, None], degrees=True)
+        position = position + rotation.apply(moved)
+        rotation = rotation * turn
+    return position, rotation, float(seconds)
+
+
+_Link = tuple[np.ndarray, list[str], int]
+
+
+def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
+    """Offset (3,), channels and first column of each joint down to the named one; number of columns; all joints."""
+    words = iter(text.split())
+    stack: list[_Link] = []
+    found: list[_Link] | None = None
+    names: list[str] = []
+    column, name = 0, ""
+    for word in words:
+        if word in ("ROOT", "JOINT"):
+            name = next(words)
+            names.append(name)
+        elif word == "End":
+            name = next(words)
+        elif word == "{":
+            stack.append((np.zeros(3), [], column))
+        elif word == "OFFSET":
+            stack[-1] = (np.array([float(next(words)) for _ in range(3)]), *stack[-1][1:])
+        elif word == "CHANNELS":
+            channels = [next(words) for _ in range(int(next(words)))]
+            stack[-1] = (stack[-1][0], channels, column)
+            column += len(channels)
+            if name == joint:
+                found = list(stack)
+        elif word == "}":
+            stack.pop()
+    return found, column, names
+
+
+def _csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
+    try:
+        rows = np.genfromtxt(path, delimiter=",", comments="#", ndmin=2)
+    except ValueError as error:
+        raise CongraspError(f"{path} cannot be read as CSV: {str(error).splitlines()[0]}.") from None
+    rows = rows[~np.isnan(rows).all(-1)]  # a line of names
+    return _checked(path, rows[:, :3], rows[:, 3:])
+
+
+def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            keys = ("wrist_position", "wrist_quaternion") if "wrist_position" in data else ("position", "quaternion")
+            position, quaternion = (data[key] for key in keys)
+    except (KeyError, ValueError, OSError) as error:
+        raise CongraspError(f"{path} cannot be read: {error}.", "It needs 'position' and 'quaternion'.") from None
+    return _checked(path, position, quaternion)
+
+
+def _checked(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    if position.ndim != 2 or position.shape[1] != 3 or quaternion.shape != (len(position), 4):
+        raise CongraspError(
+            f"{path} has positions {position.shape} and quaternions {quaternion.shape}.",
+            "A moment is x, y, z and a quaternion w, x, y, z.",
+        )
+    both = np.concatenate([position, quaternion], 1)
+    if not np.isfinite(both).all() or np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > 0.05:
+        raise CongraspError(f"{path} holds numbers that are not finite, or quaternions that are not of length one.")
+    return position, quaternion, 0.01
