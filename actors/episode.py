@@ -68,7 +68,7 @@ def episode_message(
     }
     return Message(
         {name: _plain(np.asarray(value)) for name, value in arrays.items()},
-        {"hand": hand.name, "object": obj.name, "control_dt": task.control_dt, **meta},
+        {"hand": hand.reference, "object": obj.name, "control_dt": task.control_dt, **meta},
     )
 
 

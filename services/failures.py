@@ -59,6 +59,7 @@ def failure_sheet(
         pictures, words = episode_strip(episode, _MOMENTS, _SIZE, episode.meta["object"], f": {what}")
         images += pictures
         labels += words
-    title = f"{policy.spec.hand} hand, version {policy.version}, {constraint}: {len(episodes)} episodes, failures first"
+    who = f"{policy.spec.hand_name} hand, version {policy.version}"
+    title = f"{who}, {constraint}: {len(episodes)} episodes, failures first"
     save_png(path, contact_sheet(images, labels, columns=_MOMENTS, title=title))
     return causes

@@ -71,7 +71,7 @@ def wait_until_ready(client: PolicyClient, seconds: float = 180.0) -> None:
             time.sleep(0.2)
 
 
-def example_episode(seed: int) -> dict[str, Any]:
+def example_episode(seed: int, hand: str = "human") -> dict[str, Any]:
     """The start of an episode with a procedural object and one of its headings: arguments of `reset` and of `act`."""
     import jax
 
@@ -80,13 +80,16 @@ def example_episode(seed: int) -> dict[str, Any]:
     from common.config import TaskConfig
     from common.hands import get_hand
     from common.objects import procedural
+    from common.objects.pool import sized
 
-    task = TaskConfig(p_affordance=0.0, p_pose=0.0, p_trajectory=0.0)
-    hand, obj = get_hand(task.hand), procedural.generate(seed)
-    env = environment.start(hand, task, build_taskset(hand, task, [obj], seed), jax.random.key(seed), 1)
+    task = TaskConfig(hand=hand, p_affordance=0.0, p_pose=0.0, p_trajectory=0.0)
+    found = get_hand(hand)
+    (obj,) = sized(found, task, [procedural.generate(seed)])
+    env = environment.start(found, task, build_taskset(found, task, [obj], seed), jax.random.key(seed), 1)
     world = {name: np.asarray(value)[0] for name, value in env.world._asdict().items()}
     pose = world["object_position"], world["object_quaternion"]
     return {
+        "hand": found.name,
         "object": obj.name,
         "reset": {
             "q": world["q"],
@@ -116,7 +119,7 @@ def measure(
 
     def ask(_: int) -> tuple[list[float], int, int]:
         times, failed, overloaded = [], 0, 0
-        with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
+        with PolicyClient(connect, name, hand=episode["hand"], timeout=timeout, certs=certs) as client:
             client.reset(**episode["reset"])
             client.act(episode["state"])
             for _ in range(share):

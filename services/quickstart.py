@@ -137,7 +137,7 @@ def run_training(
         if evaluation:
             after = _evaluate(policy, config, evaluation, "after training")
             _compare(before, after)
-            _live_query(run_dir)
+            _live_query(run_dir, config.task.hand)
             _picture(policy, config, run_dir)
             if words and (best := shipped(config.task.hand)):
                 _shipped_picture(best, run_dir)
@@ -273,12 +273,12 @@ def _compare(before: list[Row], after: list[Row]) -> None:
         )
 
 
-def _live_query(run_dir: pathlib.Path) -> None:
+def _live_query(run_dir: pathlib.Path, hand: str) -> None:
     """Serves the policy from a process of its own, and asks it for one action."""
     console.print("\n[bold]One live query[/] of a policy server in a process of its own:")
     with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
-        episode = example_episode(HELD_OUT_SEED)
-        with PolicyClient(endpoint, wait=60.0, timeout=5.0) as client:
+        episode = example_episode(HELD_OUT_SEED, hand)
+        with PolicyClient(endpoint, hand=episode["hand"], wait=60.0, timeout=5.0) as client:
             wait_until_ready(client)
             console.print(one_answer(client, episode), markup=False, soft_wrap=True)
 

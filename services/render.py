@@ -310,7 +310,7 @@ def episode_title(episode: Message) -> str:
     shown = [
         f"{name.replace('_', ' ')} {metrics[name]:.3g}" for name in ("return", "links_at_removal") if name in metrics
     ]
-    parts = [f"{meta['hand']} hand, {meta['object']}", " + ".join(["heading", *names]), result, *shown]
+    parts = [f"{get_hand(meta['hand']).name} hand, {meta['object']}", " + ".join(["heading", *names]), result, *shown]
     return "   |   ".join([*parts, f"policy version {meta['version']}"])
 
 

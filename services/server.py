@@ -97,7 +97,7 @@ class PolicyServer:
             "ready": True,
             "version": held.bundle.version,
             "hash": held.hash,
-            "hand": held.bundle.spec.hand,
+            "hand": held.bundle.spec.hand_name,
             "surface_points": held.bundle.task.surface_points,
             "trajectory_points": held.bundle.task.trajectory_points,
             "queue": len(self._batcher),

@@ -44,6 +44,6 @@ def showcase(policy: PolicyBundle, path: pathlib.Path, progress: Callable[[str],
         pictures, words = episode_strip(episode, _MOMENTS, _SIZE, begins, f", {result}")
         images += pictures
         labels += words
-    title = f"{policy.spec.hand} hand, policy version {policy.version}: one grasp under each constraint"
+    title = f"{policy.spec.hand_name} hand, policy version {policy.version}: one grasp under each constraint"
     save_png(path, contact_sheet(images, labels, columns=_MOMENTS, title=title))
     return successes

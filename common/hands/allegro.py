@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from common.hands.spec import Capsule, Hand, Joint, Link, Vector, WristGains, chain, vector
+from common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain, vector, wrist_gains
 
 _GAINS = {"kp": 3.0, "kv": 0.1, "torque_limit": 0.7, "armature": 1e-3}
 """Of a proportional-derivative controller as it is common for this hand; the motors' greatest torque is 0.7 N.m."""
@@ -105,15 +105,6 @@ ALLEGRO = Hand(
         "thumb_3": 1.00,
         **{f"{finger}_{i}": x for finger in ("index", "middle", "ring") for i, x in ((1, 1.30), (2, 1.20), (3, 1.00))},
     },
-    wrist=WristGains(
-        slide_kp=2000.0,
-        slide_kv=100.0,
-        slide_limit=300.0,
-        slide_armature=0.2,
-        hinge_kp=100.0,
-        hinge_kv=6.0,
-        hinge_limit=40.0,
-        hinge_armature=0.02,
-    ),
+    wrist=wrist_gains(0.955),
     object_scale=1.4,
 )

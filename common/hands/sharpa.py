@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.hands.spec import Capsule, Hand, Joint, Link, Vector, WristGains, chain, vector
+from common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain, vector, wrist_gains
 
 
 class _Drive(NamedTuple):
@@ -152,15 +152,6 @@ SHARPA = Hand(
         "thumb_ip": 1.00,
         **{f"{finger}_{name}": x for finger in _FLEXED for name, x in (("mcp_fe", 1.35), ("pip", 1.30), ("dip", 0.90))},
     },
-    wrist=WristGains(
-        slide_kp=2000.0,
-        slide_kv=100.0,
-        slide_limit=300.0,
-        slide_armature=0.2,
-        hinge_kp=100.0,
-        hinge_kv=6.0,
-        hinge_limit=40.0,
-        hinge_armature=0.02,
-    ),
+    wrist=wrist_gains(1.246),
     object_scale=1.1,
 )

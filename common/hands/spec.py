@@ -193,3 +193,31 @@ def chain(
         Link(name, above, moved, (Capsule(start, end, radius),), mass, weight, end if name == names[-1] else None)
         for name, above, moved, (start, end), radius, mass, weight in rows
     )
+
+
+def chain_of(hand: Hand, name: str) -> tuple[str, ...]:
+    """Names of the links from the palm (without it) to this one."""
+    parents = {link.name: link.parent for link in hand.links}
+    above: list[str] = []
+    while parents[name]:
+        above.insert(0, name)
+        name = parents[name]
+    return tuple(above)
+
+
+def wrist_gains(mass: float) -> WristGains:
+    """Gains of the virtual wrist of a hand of this mass (kg): those of a human hand of 350 g, in proportion.
+
+    The wrist follows its targets with a time constant of 0.05 s whatever the hand weighs.
+    """
+    heavier = (mass + 0.2) / 0.55
+    return WristGains(
+        slide_kp=1000.0 * heavier,
+        slide_kv=50.0 * heavier,
+        slide_limit=150.0 * heavier,
+        slide_armature=0.2,
+        hinge_kp=50.0 * heavier,
+        hinge_kv=3.0 * heavier,
+        hinge_limit=20.0 * heavier,
+        hinge_armature=0.01 * heavier,
+    )

@@ -37,13 +37,18 @@ class PolicySpec:
     """What a policy's arrays mean: whose observation goes in, whose action comes out, and the networks between."""
 
     hand: str
-    """Name of the hand."""
+    """The hand's reference: its name, or all of its file if it is none of the package."""
     layout: Layout
     """Names and sizes of the observation's blocks."""
     action_size: int
     """A."""
     network: NetworkConfig
     """Sizes of the networks."""
+
+    @property
+    def hand_name(self) -> str:
+        """The hand's name."""
+        return get_hand(self.hand).name if self.hand.startswith("{") else self.hand
 
     @functools.cached_property
     def schema(self) -> str:
@@ -56,8 +61,8 @@ class PolicySpec:
         """Raises `CongraspError` unless `spec`, which is that of `source`, is this one."""
         if spec.schema != self.schema:
             raise CongraspError(
-                f"The policy {source} is for hand '{spec.hand}' (schema {spec.schema}), but hand '{self.hand}' "
-                f"(schema {self.schema}) is needed.",
+                f"The policy {source} is for hand '{spec.hand_name}' (schema {spec.schema}), but hand "
+                f"'{self.hand_name}' (schema {self.schema}) is needed.",
                 "Choose a policy of this hand, task and network, or change them.",
             )
 
@@ -65,7 +70,7 @@ class PolicySpec:
 def policy_spec(task: TaskConfig, sizes: NetworkConfig) -> PolicySpec:
     """The spec of a task's policy."""
     hand = get_hand(task.hand)
-    return PolicySpec(hand.name, task_observation.layout(hand, task), len(hand.joints) + 6, sizes)
+    return PolicySpec(hand.reference, task_observation.layout(hand, task), len(hand.joints) + 6, sizes)
 
 
 class Acting(NamedTuple):

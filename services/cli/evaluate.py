@@ -123,7 +123,7 @@ def evaluate(
     if pictures is not None and noisy:
         from services.noise_sheet import draw_noise
 
-        title = f"{loaded.spec.hand} hand, version {loaded.version}: {episodes} episodes a level"
+        title = f"{loaded.spec.hand_name} hand, version {loaded.version}: {episodes} episodes a level"
         draw_noise(evaluator, noisy, pictures, title)
         console.print(f"Curves and examples of noisy references are drawn in {pictures}.", soft_wrap=True)
     if pictures is not None and names:

@@ -27,6 +27,7 @@ COMMANDS = {
     "evaluate": "measure a policy by the paper's protocol",
     "query": "ask a policy server for one action, or measure its latency",
     "objects": "generate, import, list and show objects",
+    "hands": "list and draw hands, and bring one of your own",
     "constraints": "make the constraint sets of objects, and look at them",
     "record": "record a run to MCAP, from this machine or another",
     "plot": "draw a run's learning curves and reward terms",

@@ -46,7 +46,8 @@ def query(
             print(json_module.dumps(client.health()))
         return 0
     with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
-        episode = example_episode(object_seed)
+        episode = example_episode(object_seed, str(client.health()["hand"]))
+    with PolicyClient(connect, name, hand=episode["hand"], timeout=timeout, certs=certs) as client:
         if repeat == 1 and not json:
             print(one_answer(client, episode))
             return 0

@@ -1,0 +1,117 @@
+"""A hand as one JSON file, with everything that `Hand` says: what `congrasp hands import` writes, and a user may edit.
+
+Names of fields, units and frames are those of `common.hands.spec`. A file's text goes wherever its hand goes: into the
+configuration of a run, into policies and into recorded episodes.
+"""
+
+import dataclasses
+import functools
+import json
+import pathlib
+
+import dacite
+import numpy as np
+
+from common.errors import CongraspError
+from common.hands.spec import Hand, chain_of
+
+FORMAT = 1
+_REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-hand.md."
+_TAKEN = {"hand_base", "table", "anchor", "object", "hold", "world"}
+_WRIST = {"wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz"}
+
+
+def hand_text(hand: Hand) -> str:
+    """The hand's file."""
+    fields = dataclasses.asdict(hand)
+    del fields["text"]
+    return json.dumps({"format": FORMAT, **fields}, indent=1)
+
+
+def hand_from_text(text: str, source: str = "the hand file") -> Hand:
+    """The hand that a file describes; the same text is the same object.
+
+    Args:
+      text: the file's content.
+      source: how errors call it.
+
+    Raises:
+      CongraspError: it is not JSON, a field is missing or has the wrong type, or the hand cannot be as it says.
+    """
+    try:
+        fields = json.loads(text)
+        found = fields.pop("format", None)
+    except (ValueError, AttributeError):
+        raise CongraspError(f"{source} is not JSON.", _REMEDY) from None
+    if found != FORMAT:
+        raise CongraspError(f"{source} has the format {found}, not {FORMAT}.", _REMEDY)
+    # Without spaces: the text is sent with every episode.
+    hand, wrong = _described(json.dumps({"format": FORMAT, **fields}, separators=(",", ":")))
+    if hand is None or wrong:
+        raise CongraspError(f"{source}: {wrong}.", _REMEDY)
+    return hand
+
+
+@functools.cache
+def _described(text: str) -> tuple[Hand | None, str]:
+    """The hand of a file's text, or what is wrong with it."""
+    fields = json.loads(text)
+    del fields["format"]
+    try:
+        hand = dacite.from_dict(Hand, {**fields, "text": text}, dacite.Config(strict=True, cast=[tuple, float]))
+    except (dacite.DaciteError, TypeError, ValueError) as error:
+        return None, f"no hand, {error}"
+    return hand, next(iter(faults(hand)), "")
+
+
+def read_hand(path: pathlib.Path) -> Hand:
+    """The hand of a file; see `hand_from_text`."""
+    try:
+        return hand_from_text(path.read_text(), str(path))
+    except OSError as error:
+        raise CongraspError(f"The hand file {path} cannot be read: {error.strerror}.", _REMEDY) from None
+    except UnicodeDecodeError:
+        raise CongraspError(f"{path} is not JSON.", _REMEDY) from None
+
+
+def faults(hand: Hand) -> list[str]:
+    """What is wrong with a hand, in words."""
+    found: list[str] = []
+    names = [link.name for link in hand.links]
+    joints = [joint.name for joint in hand.joints]
+    if not hand.name.isidentifier():
+        found.append(f"the name '{hand.name}' is more than letters, digits and underscores")
+    for name in sorted({name for name in names + joints if (names + joints).count(name) > 1 or not name}):
+        found.append(f"the name '{name}' is there more than once, or empty")
+    found += [f"the name '{name}' is taken" for name in sorted((_TAKEN & {*names}) | (_WRIST & {*joints}))]
+    if not hand.links or hand.links[0].joints or hand.links[0].parent:
+        return [*found, "the first link must be the palm, without a parent and without joints"]
+    for i, link in enumerate(hand.links):
+        if i and link.parent not in names[:i]:
+            found.append(f"the parent '{link.parent}' of '{link.name}' does not come before it")
+        if i and not link.joints:
+            found.append(f"the link '{link.name}' has no joint: make it part of its parent")
+        if not link.capsules or any(capsule.radius <= 0 for capsule in link.capsules):
+            found.append(f"the link '{link.name}' needs capsules, of radii above zero")
+        if not link.mass > 0 or link.contact_weight < 0:
+            found.append(f"the link '{link.name}' needs a mass above zero and a contact weight of at least zero")
+    for joint in hand.joints:
+        if not joint.lower < joint.upper:
+            found.append(f"the limits {joint.lower:g} and {joint.upper:g} of '{joint.name}' are in the wrong order")
+        if abs(float(np.linalg.norm(joint.axis)) - 1) > 1e-3:
+            found.append(f"the axis of '{joint.name}' is not a unit vector")
+        if min(joint.kp, joint.torque_limit) <= 0 or min(joint.kv, joint.damping, joint.armature) < 0:
+            found.append(f"gains and torque limit of '{joint.name}' must be above zero")
+    for pose, q in (("open", hand.open_pose), ("closed", hand.closed_pose)):
+        found += [f"the {pose} pose names '{name}', which is no joint" for name in sorted({*q} - {*joints})]
+        for joint in hand.joints:
+            if not joint.lower - 1e-6 <= q.get(joint.name, 0.0) <= joint.upper + 1e-6:
+                found.append(f"'{joint.name}' is outside of its limits in the {pose} pose")
+    tips = [link.name for link in hand.links if link.tip is not None]
+    if hand.thumb not in tips or len(tips) < 2:
+        found.append("the thumb must be a link with a tip, and at least one other link needs one")
+    elif not found and len({chain_of(hand, tip)[0] for tip in tips}) < len(tips):
+        found.append("two fingertips are on the same finger")
+    if not hand.object_scale > 0:
+        found.append("the object scale must be above zero")
+    return found
