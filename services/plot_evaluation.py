@@ -15,7 +15,7 @@ _TITLES = {
     "heading_rad": ("Heading, direction", "rad"),
     "heading_m": ("Heading, position", "m"),
     "pose_rad": ("Pose, joints", "rad"),
-    "pose_m": ("Pose, links", "m"),
+    "pose_m": ("Pose, wrist", "m"),
     "traj_rad": ("Trajectory, direction", "rad"),
     "traj_m": ("Trajectory, position", "m"),
     "affordance_ratio": ("Affordance, wrong contacts", "share"),

@@ -6,6 +6,8 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 
+import numpy as np
+
 from common.errors import CongraspError
 from common.logs.motion import GraspMotion, load_motion, motion_of_episode
 from services.export.frames import TOLERANCE_MM, error_mm
@@ -21,6 +23,17 @@ FORMATS = {
 """Name and suffix of each format; `services.export.<name>` writes and reads it. Those without a suffix are folders."""
 SEVERAL = ("lerobot",)
 """Formats that hold more than one motion."""
+_NUMBERS = (
+    "time",
+    "joint_position",
+    "wrist_quaternion",
+    "link_position",
+    "link_quaternion",
+    "object_position",
+    "object_quaternion",
+    "object_vertices",
+)
+_UNIT = 1e-3
 
 
 def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:
@@ -50,6 +63,8 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
         raise CongraspError(f"A {kind} file holds one motion, and {len(motions)} were named.", "Name one at a time.")
     if path.is_dir():
         raise CongraspError(f"The folder {path} is there already.", "Remove it or name another with --out.")
+    for motion in motions:
+        _check(motion)
     module = importlib.import_module(f"services.export.{kind}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,3 +88,13 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
     finally:
         shutil.rmtree(workplace, ignore_errors=True)
     return worst
+
+
+def _check(motion: GraspMotion) -> None:
+    remedy = "Make it anew with 'congrasp grasp'."
+    for name in _NUMBERS:
+        values = np.asarray(getattr(motion, name))
+        if not np.isfinite(values).all():
+            raise CongraspError(f"The motion's {name} has values that are not finite numbers.", remedy)
+        if name.endswith("quaternion") and np.abs(np.linalg.norm(values, axis=-1) - 1).max() > _UNIT:
+            raise CongraspError(f"The motion's {name} has quaternions that are not of length one.", remedy)

@@ -145,6 +145,27 @@ def test_a_file_that_is_off_is_not_kept(
     assert not list((tmp_path / "out").iterdir())
 
 
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_single_moment_is_a_motion(human: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
+    cut = {
+        name: getattr(human, name)[:1]
+        for name in vars(human)
+        if name.startswith(("link_pos", "link_q", "wrist_", "object_pos", "object_q", "joint_pos", "joint_t", "time"))
+    }
+    assert export([dataclasses.replace(human, **cut)], kind, tmp_path)[1] < 0.01
+
+
+def test_numbers_that_are_no_poses_are_refused_in_words(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    for name, value, words in (
+        ("link_position", np.nan, "link_position has values that are not finite"),
+        ("object_quaternion", 0.0, "object_quaternion has quaternions that are not of length one"),
+    ):
+        wrong = dataclasses.replace(human, **{name: np.full_like(getattr(human, name), value)})
+        with pytest.raises(CongraspError, match=words):
+            export([wrong], "glb", tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_glb_is_y_up_for_others_and_names_its_units(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     path, _ = export([human], "glb", tmp_path)
     file: Any = pygltflib.GLTF2().load(str(path))
