@@ -6,6 +6,7 @@ newest version that was ever published, so that versions rise over a crash, too)
 finite, `failure/`.
 """
 
+import dataclasses
 import pathlib
 
 from common.config import RunConfig, run_config_from_json, to_json
@@ -19,6 +20,8 @@ INITIAL_FILE = "initial.safetensors"
 CONFIG_FILE = "config.json"
 VERSION_FILE = "version"
 LOGS = "logs"
+CHANGEABLE = ("updates", "checkpoint_every", "collapse_patience", "physics", "ppo")
+"""Fields of the configuration that a run may go on with other values of; actors that are there do not use them."""
 
 
 def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle | None = None) -> None:
@@ -53,3 +56,24 @@ def open_run(run_dir: pathlib.Path) -> RunConfig:
             f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Name one made by 'congrasp train'."
         ) from None
     return run_config_from_json(text)
+
+
+def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
+    """Keeps the configuration with which a run goes on.
+
+    Args:
+      run_dir: the run's directory.
+      config: that of `open_run`, with what is to be different from now on.
+
+    Raises:
+      CongraspError: something differs that must not, or this is no run directory.
+    """
+    before = open_run(run_dir)
+    for field in dataclasses.fields(config):
+        if field.name not in CHANGEABLE and getattr(config, field.name) != getattr(before, field.name):
+            raise CongraspError(
+                f"A run goes on with the '{field.name}' that it began with.",
+                f"Begin another run with --initial {run_dir / POLICY_FILE}.",
+            )
+    if config != before:
+        write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())

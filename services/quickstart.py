@@ -21,7 +21,7 @@ from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.shipped import shipped
 from common.transport.zenoh_transport import DEFAULT_ENDPOINT
 from learner import update as updates
-from learner.run_directory import LOGS, POLICY_FILE, create_run, open_run
+from learner.run_directory import LOGS, POLICY_FILE, continue_run, create_run
 from services.access import check_training
 from services.client import PolicyClient
 from services.evaluate import Evaluator
@@ -75,7 +75,7 @@ def run_training(
     if actors is None:
         actors = 0 if physics == "warp" else 2
     if resume:
-        config = open_run(run_dir)
+        continue_run(run_dir, config)
         if not (run_dir / "checkpoints" / "latest").exists():
             raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start it anew in another --run-dir.")
     else:

@@ -8,16 +8,17 @@ from typing import Annotated
 import tyro
 
 from common.config import Board, RunConfig, run_config_from_json, to_json
-from services.cli.train import preset_of
+from services.cli.train import begun
 from services.cli.watch import Watch, Watched
-from services.presets import get_preset, with_hand
+from services.presets import with_hand
 
 
 @dataclasses.dataclass(frozen=True)
 class Learner:
     """The learner alone; actors on this machine or on others connect to it with `congrasp actor --connect`.
 
-    A new run takes its configuration from the preset and the command line; a directory that holds a run keeps its own.
+    A new run takes its configuration from the preset and the command line; a directory that holds a run keeps its own,
+    but for --updates, --ppo.… and others that the learner alone uses.
     """
 
     config: Annotated[RunConfig, tyro.conf.arg(name="")]
@@ -74,7 +75,7 @@ class Learner:
         from common.transport.zenoh_transport import ZenohTransport, shifted
         from learner.process import run_learner
         from learner.ranks import Ranks
-        from learner.run_directory import create_run, open_run
+        from learner.run_directory import continue_run, create_run
         from services.access import listening
         from services.boards import recorded
         from services.logs import say
@@ -84,12 +85,13 @@ class Learner:
         from services.train import train_in_process
 
         resume = self.resume and (self.run_dir / "checkpoints" / "latest").exists()
-        own = with_hand(self.config, self.hand)
-        config = open_run(self.run_dir) if self.resume and self.rank == 0 else own
+        config = with_hand(self.config, self.hand)
         listen = shifted(self.listen, self.rank * len(FLOWS))
         credentials = listening(listen, self.certs, "learner", insecure=self.insecure)
         with on_signal() as stop, ZenohTransport(listen=[listen], credentials=credentials) as transport:
-            if not self.resume and self.rank == 0:
+            if self.rank == 0 and self.resume:
+                continue_run(self.run_dir, config)
+            elif self.rank == 0:
                 create_run(self.run_dir, config, None if self.initial is None else bundles.load(self.initial))
             ranks = Ranks.join(self.rank, self.ranks, self.coordinator)
             config = run_config_from_json(ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
@@ -130,9 +132,8 @@ class Learner:
 
 def parse(arguments: list[str]) -> Callable[[], int]:
     """The call that these arguments ask for."""
-    name = preset_of(arguments)
-    missing = tyro.MISSING
-    default = Learner(config=get_preset(name), run_dir=missing, preset=name)
+    preset, config = begun(arguments)
+    default = Learner(config=config, run_dir=tyro.MISSING, preset=preset)
     learner = tyro.cli(Learner, prog="congrasp learner", args=arguments, default=default)
     if learner.or_resume and (learner.run_dir / "config.json").exists():
         learner = dataclasses.replace(learner, resume=True)

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from common.config import Board, RunConfig
+from learner.run_directory import CONFIG_FILE, open_run
 from services.presets import get_preset, with_hand
 
 
@@ -36,7 +37,8 @@ class Train:
     initial: pathlib.Path | None = None
     """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
     resume: bool = False
-    """Go on from the latest checkpoint in --run-dir."""
+    """Go on from the latest checkpoint in --run-dir, with the run's own configuration; what the learner alone uses, such
+    as --updates and --ppo.…, may be changed."""
     listen: str | None = None
     """Endpoint where actors of other machines may join, such as tls/0.0.0.0:7447; on this machine alone by default."""
     certs: pathlib.Path | None = None
@@ -73,18 +75,26 @@ class Train:
         )
 
 
-def preset_of(arguments: list[str]) -> str:
-    """The value of `--preset` in a command line, which decides on the defaults of everything else."""
-    for i, word in enumerate(arguments):
-        if word == "--preset" and i + 1 < len(arguments):
-            return arguments[i + 1]
-        if word.startswith("--preset="):
-            return word.split("=", 1)[1]
-    return "quickstart"
+def begun(arguments: list[str]) -> tuple[str, RunConfig]:
+    """The preset that a command line names, and the configuration that all its other options start from.
+
+    With --resume that is the run's own.
+    """
+    preset = _value("--preset", arguments) or "quickstart"
+    run_dir = _value("--run-dir", arguments)
+    if {"--resume", "--or-resume"} & set(arguments) and run_dir and (pathlib.Path(run_dir) / CONFIG_FILE).exists():
+        return preset, open_run(pathlib.Path(run_dir))
+    return preset, get_preset(preset)
+
+
+def _value(option: str, arguments: list[str]) -> str:
+    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        if word.partition("=")[0] == option:
+            return word.partition("=")[2] or following
+    return ""
 
 
 def parse(arguments: list[str]) -> Callable[[], int]:
     """The call that these arguments ask for."""
-    name = preset_of(arguments)
-    default = Train(config=get_preset(name), preset=name)
-    return tyro.cli(Train, prog="congrasp train", args=arguments, default=default).run
+    preset, config = begun(arguments)
+    return tyro.cli(Train, prog="congrasp train", args=arguments, default=Train(config=config, preset=preset)).run
