@@ -37,8 +37,8 @@ class Train:
     initial: pathlib.Path | None = None
     """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
     resume: bool = False
-    """Go on from the latest checkpoint in --run-dir, with the run's own configuration; what the learner alone uses, such
-    as --updates and --ppo.…, may be changed."""
+    """Go on from the latest checkpoint in --run-dir, with the run's own configuration; what the learner alone uses,
+    such as --updates and --ppo.…, may be changed."""
     listen: str | None = None
     """Endpoint where actors of other machines may join, such as tls/0.0.0.0:7447; on this machine alone by default."""
     certs: pathlib.Path | None = None
