@@ -108,6 +108,8 @@ class TaskConfig:
     """Hand centre from the live fingertips; false is the paper's ablation with a centre fixed in the wrist frame."""
     hand_table_collision: bool = False
     """Whether the hand collides with the table."""
+    hand_self_collision: bool = False
+    """Whether the hand's links collide with one another (slower; the shipped policy learnt without)."""
     back_off: float = 0.15
     """Metres from the aligned wrist to its start, against the heading direction."""
     surface_points: int = 256

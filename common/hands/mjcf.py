@@ -1,5 +1,7 @@
 """A hand as MuJoCo bodies: virtual wrist, links with capsules, and position actuators."""
 
+import functools
+
 import mujoco
 import numpy as np
 
@@ -10,12 +12,14 @@ HAND_CONTYPE = 1
 WRIST_JOINTS = ("wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz")
 
 
-def add_hand(spec: mujoco.MjSpec, hand: Hand) -> mujoco.MjsBody:
+def add_hand(spec: mujoco.MjSpec, hand: Hand, *, self_collision: bool = False) -> mujoco.MjsBody:
     """Adds the hand under a fixed body `hand_base` and returns that body.
 
     The base carries three slides (x, y, z) and three hinges (intrinsic x-y-z) of the first link; their origin is the
     initial wrist pose, so that all six start at zero. Actuators are in the order of (u, q). Gravity on the hand is
     compensated, because the wrist is a virtual mount.
+
+    With `self_collision` links collide with one another, without friction, except neighbours and `overlapping` pairs.
     """
     base = spec.worldbody.add_body(name="hand_base")
     bodies: dict[str, mujoco.MjsBody] = {}
@@ -41,8 +45,38 @@ def add_hand(spec: mujoco.MjSpec, hand: Hand) -> mujoco.MjsBody:
                 armature=joint.armature,
             )
             _add_position_actuator(spec, joint.name, joint.kp, joint.kv, joint.torque_limit)
-        _add_capsules(body, link, origin)
+        _add_capsules(body, link, origin, self_collision)
+    if self_collision:
+        for first, second in overlapping(hand):
+            spec.add_exclude(bodyname1=first, bodyname2=second)
     return base
+
+
+@functools.cache
+def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
+    """Pairs of links whose capsules overlap while the hand is open or at zero, so that contact means nothing there.
+
+    Capsules stand for housings that nest in one another at the knuckles. What touches only in a fist is not here.
+    """
+    spec = mujoco.MjSpec()
+    bodies: dict[str, mujoco.MjsBody] = {}
+    for link in hand.links:
+        parent = bodies[link.parent] if link.parent else spec.worldbody
+        bodies[link.name] = body = parent.add_body(name=link.name)
+        if not link.parent:
+            body.add_freejoint()
+        for joint in link.joints:
+            body.add_joint(name=joint.name, axis=joint.axis, pos=joint.anchor)
+        _add_capsules(body, link, np.zeros(3), True)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    found: set[tuple[int, int]] = set()
+    for q in (hand.q_open, np.clip(0.0, hand.lower, hand.upper)):
+        data.qpos[7:] = q
+        mujoco.mj_forward(model, data)
+        touching = data.contact.geom[data.contact.dist < 0]
+        found |= {tuple(pair) for pair in np.sort(model.geom_bodyid[touching], axis=-1).tolist()}
+    return tuple((model.body(a).name, model.body(b).name) for a, b in sorted(found))
 
 
 def _add_wrist(spec: mujoco.MjSpec, body: mujoco.MjsBody, hand: Hand) -> None:
@@ -75,7 +109,7 @@ def _add_position_actuator(spec: mujoco.MjSpec, joint: str, kp: float, kv: float
     actuator.set_to_position(kp, kv=kv)
 
 
-def _add_capsules(body: mujoco.MjsBody, link: Link, origin: np.ndarray) -> None:
+def _add_capsules(body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_collision: bool) -> None:
     lengths = [np.linalg.norm(np.subtract(c.end, c.start)) + 4 / 3 * c.radius for c in link.capsules]
     shares = np.array([length * c.radius**2 for length, c in zip(lengths, link.capsules, strict=True)])
     for i, (capsule, share) in enumerate(zip(link.capsules, shares / shares.sum(), strict=True)):
@@ -86,6 +120,7 @@ def _add_capsules(body: mujoco.MjsBody, link: Link, origin: np.ndarray) -> None:
             size=(capsule.radius, 0.0, 0.0),
             mass=link.mass * share,
             contype=HAND_CONTYPE,
-            conaffinity=0,
+            conaffinity=HAND_CONTYPE if self_collision else 0,
+            condim=1,  # between links; against the object the greater of two decides, which is the object's
             friction=(0.1, 0.005, 0.0001),  # MuJoCo takes the greater of two: the object's friction decides
         )

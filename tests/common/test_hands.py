@@ -14,7 +14,7 @@ from common.errors import CongraspError
 from common.hands import HANDS, get_hand
 from common.hands.kinematics import grasp_frame, link_poses
 from common.hands.mano import VARIABLE
-from common.hands.mjcf import add_hand
+from common.hands.mjcf import add_hand, overlapping
 from common.hands.spec import link_origin
 from common.logs import poses
 from common.objects import procedural
@@ -218,3 +218,26 @@ def test_a_hand_that_does_not_exist_is_one_line_with_those_that_do():
     with pytest.raises(CongraspError, match=r"no hand 'claw'.*allegro, human, mano, sharpa"):
         get_hand("claw")
     assert set(HANDS) == {"human", "allegro", "sharpa", "mano"}
+
+
+def test_links_that_nest_do_not_collide_and_all_others_do(hand):
+    """With self-collision an open hand touches nothing of its own, and a fist comes to rest on itself."""
+    assert get_hand("allegro") is not hand or overlapping(hand) == (("palm", "thumb_proximal"),)  # as the makers say
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = 0.0025
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    add_hand(spec, hand, self_collision=True)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[6:] = hand.q_open
+    mujoco.mj_forward(model, data)
+    assert not (data.contact.dist < 0).any()
+    touched, deepest = False, 0.0
+    for step in range(400):
+        data.ctrl[6:] = hand.q_open + min(1.0, step / 200) * (hand.q_closed - hand.q_open)
+        mujoco.mj_step(model, data)
+        touched |= data.ncon > 0
+        deepest = min(deepest, data.contact.dist.min(initial=0.0))
+    assert touched and -0.005 < deepest < 0
+    assert np.abs(data.qvel).max() < 0.05
