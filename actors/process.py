@@ -5,6 +5,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -120,16 +121,19 @@ class _Actor:
         """Rollouts until `stop` is set or the run ends."""
         try:
             self._warm_up(stop)
+            asked = time.monotonic()
             while not stop.is_set():
                 ticket = self._link.acquire_ticket(_TICKET_SECONDS)
                 if ticket is None:
                     continue
+                granted = time.monotonic()
                 if not self._refresh():
                     self._link.give_back(ticket)
                     stop.wait(_TICKET_SECONDS)
                     continue
                 assert self._bundle is not None
-                self._rollout(self._bundle, ticket)
+                self._rollout(self._bundle, ticket, _Since(asked, granted))
+                asked = time.monotonic()
         finally:
             self._physics.close()
 
@@ -161,7 +165,7 @@ class _Actor:
             self._bundle = bundle
         return self._bundle is not None
 
-    def _rollout(self, bundle: PolicyBundle, ticket: Ticket) -> None:
+    def _rollout(self, bundle: PolicyBundle, ticket: Ticket, since: "_Since") -> None:
         config, env = self._config, self._worker.env
         began = time.monotonic()
         self._configure(bundle.version)
@@ -174,10 +178,13 @@ class _Actor:
         if config.task.own_references:
             self._worker.renew_references()
         meta = {"version": bundle.version, "schema": self._spec.schema, "steps": steps}
+        collected = time.monotonic()
         self._link.upload(Message(arrays, meta), ticket)
-        seconds = time.monotonic() - began
+        ended = time.monotonic()
         values = {
-            "steps_per_second": steps / seconds,
+            "steps_per_second": steps / (ended - began),
+            "share/waiting": (since.granted - since.asked) / (ended - since.asked),
+            "share/transport": (began - since.granted + ended - collected) / (ended - since.asked),
             "rollouts": self._rollouts + 1.0,
             "episodes_left_out": float(left_out),
             **physics_usage(np.asarray(rollout.usage)),
@@ -225,6 +232,15 @@ class _Actor:
         # JSON has no NaN: one such number would cost the whole message.
         message = Message(message.arrays, finite(message.meta))
         self._transport.publish(self._link.keys.log(kind, "actor", self._link.actor), message)
+
+
+class _Since(NamedTuple):
+    """Moments of one rollout, on the monotonic clock."""
+
+    asked: float
+    """The actor began to ask for a ticket."""
+    granted: float
+    """It had one, and goes on to take the newest weights."""
 
 
 def physics_usage(usage: np.ndarray) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import statistics
 import tempfile
 import threading
 import time
@@ -11,6 +12,7 @@ from rich.console import Console
 
 from common.errors import CongraspError
 from common.logs.recorder import Recorder
+from common.transport.keys import Keys
 from common.transport.zenoh_transport import ZenohTransport
 from learner.process import run_learner
 from learner.run_directory import create_run
@@ -21,7 +23,7 @@ _PATIENCE = 300.0
 
 
 def bench_recording(actors: int, seconds: float, turns: int) -> None:
-    """Prints control steps a second with and without a recorder, and the processor time of the recorder's thread.
+    """Prints control steps a second with and without a recorder, the recorder's processor time, and transport's share.
 
     The run is quickstart's, with the logs that it publishes by default.
     """
@@ -33,6 +35,7 @@ def bench_recording(actors: int, seconds: float, turns: int) -> None:
     with tempfile.TemporaryDirectory() as folder, ZenohTransport(listen=[endpoint := _endpoint()]) as transport:
         run_dir = pathlib.Path(folder, "run")
         create_run(run_dir, config)
+        said = transport.subscribe(Keys(config.name).actor_metrics, depth=10**6)
         learner = threading.Thread(
             target=run_learner,
             args=(run_dir, config, transport),
@@ -48,6 +51,8 @@ def bench_recording(actors: int, seconds: float, turns: int) -> None:
             for child in children:
                 child.start()
             _wait_for(marks, 5)
+            while said.receive(0.0):
+                pass  # of actors that were alone, or began
             for turn in range(2 * turns):
                 recording = turn % 2 == 1
                 recorder = Recorder(transport, config.name, run_dir / "logs", name=f"bench{turn}")
@@ -64,6 +69,7 @@ def bench_recording(actors: int, seconds: float, turns: int) -> None:
                 paces[recording].append((after - before) / (end - start))
                 recorder.close()
                 size += sum(file.stat().st_size for file in recorder.files)
+            shares = [message.meta["values"] for _, message in iter(lambda: said.receive(0.0), None)]
         finally:
             stop.set()
             end_all(children)
@@ -75,6 +81,14 @@ def bench_recording(actors: int, seconds: float, turns: int) -> None:
     console.print(
         f"The recorder's thread took {100 * busy / recorded / cores:.2f} % of the processors' time and wrote "
         f"{size / 1e6:.1f} MB in {recorded:.0f} s."
+    )
+
+    transported, waited = (
+        100 * statistics.mean(v[f"share/{name}"] for v in shares) for name in ("transport", "waiting")
+    )
+    console.print(
+        f"The actors spent {transported:.2f} % of their time on weights and uploads, and waited {waited:.2f} % of it "
+        f"for permission to go on ({len(shares)} rollouts)."
     )
 
 

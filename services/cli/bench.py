@@ -155,7 +155,7 @@ def faults(actors: int = 3, repeats: int = 3) -> int:
 
 
 def recording(actors: int = 2, seconds: float = 20.0, turns: int = 3) -> int:
-    """Throughput of a small run with and without a recorder, in turns.
+    """Throughput of a small run with and without a recorder, in turns, and what of its time goes into transport.
 
     Args:
       actors: Actor processes.
