@@ -154,12 +154,12 @@ class Grasper:
                 obj, beginnings, functools.partial(lambda what, step: progress(what, step, self._trials.steps), what)
             )
             _check_aligned(outcome)
-            costs = (_costs(outcome, _active(asked)) + _UNLIKELY * rests)[:different]
+            cost = (costs(outcome, _active(asked)) + _UNLIKELY * rests)[:different]
             tried += different
             held += int(outcome.metrics["held"][:different].sum())
-            index = int(costs.argmin())
-            if best is None or costs[index] < best[0]:
-                best = (float(costs[index]), outcome, index, int(rests[index]))
+            index = int(cost.argmin())
+            if best is None or cost[index] < best[0]:
+                best = (float(cost[index]), outcome, index, int(rests[index]))
             if held or asked.pose or asked.trajectory:
                 break
         assert best is not None
@@ -305,7 +305,7 @@ def _errors_of(constraints: tuple[str, ...]) -> list[str]:
     return [*names, "moved_at_removal", "force_link_max"]
 
 
-def _costs(outcome: Outcome, constraints: tuple[str, ...]) -> np.ndarray:
+def costs(outcome: Outcome, constraints: tuple[str, ...]) -> np.ndarray:
     """(B,) what is worse about each try: first whether it held, then whether it did for a while, then all the rest."""
     place = outcome.trace.object_position
     removal = int(np.asarray(outcome.trace.table[:, 0]).sum()) - 1

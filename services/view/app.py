@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import pathlib
-import secrets
 import threading
 from collections.abc import Callable, Iterator
 
@@ -15,7 +14,6 @@ from common.objects.pool import HELD_OUT_SEED
 from common.objects.sources import find_sources
 from common.objects.spec import GraspObject
 from common.policy.shipped import policy_file, shipped
-from common.transport.keys import Keys, process_name
 from common.transport.security import check_exposure
 from common.transport.zenoh_transport import ZenohTransport
 from services.access import credentials
@@ -59,30 +57,44 @@ def open_view(
         window = TrainingWindow(run) if connect or recordings else None
         if recordings is not None and window is not None:
             _read(window, recordings)
-        if connect:
-            transport = stack.enter_context(
+        if connect and window is not None:
+            watching = stack.enter_context(
                 ZenohTransport(connect=[connect], credentials=credentials(certs, "observer"))
             )
-            transport.declare_alive(Keys(run).alive("viewer", process_name("viewer"), secrets.token_hex(4)))
-            assert window is not None
-            stack.callback(Follower(transport, window).close)
-            following = follow_run(transport, run)
-            hands: dict[str, Callable[[], PolicyGrasping]] = {
-                "of the run": functools.partial(PolicyGrasping, following, f"the run '{run}'")
-            }
+            stack.callback(Follower(watching, window).close)
+            hands = _of_run(connect, run, certs, watching, stack)
         elif policy is not None:
             hands = {"of the policy": functools.partial(PolicyGrasping, follow_file(policy), policy.name)}
         else:
-            hands = {
-                name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "shipped policy")
-                for name in HANDS
-                if shipped(name) is not None
-            }
+            hands = _shipped()
         session = Session(hands, catalogue(objects), take_mesh, window, Recordings(recordings) if recordings else None)
         stack.callback(session.close)
         server = PageServer(session.gets, session.posts, host, port)
         stack.callback(server.close)
         yield server.url
+
+
+def _of_run(
+    connect: str, run: str, certs: pathlib.Path | None, watching: ZenohTransport, stack: contextlib.ExitStack
+) -> dict[str, Callable[[], PolicyGrasping]]:
+    """The policy of a run; who may only watch it gets those that come with the package."""
+    pulling = watching
+    if certs is not None:
+        try:
+            mine = credentials(certs, "server")
+        except CongraspError as error:
+            say("warning", f"{error} Until then the studio grasps with the policies that come with congrasp.")
+            return _shipped()
+        pulling = stack.enter_context(ZenohTransport(connect=[connect], credentials=mine))
+    return {"of the run": functools.partial(PolicyGrasping, follow_run(pulling, run), f"the run '{run}'")}
+
+
+def _shipped() -> dict[str, Callable[[], PolicyGrasping]]:
+    return {
+        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "shipped policy")
+        for name in HANDS
+        if shipped(name) is not None
+    }
 
 
 def catalogue(objects: pathlib.Path | None) -> Catalogue:

@@ -15,6 +15,7 @@ from common.errors import CongraspError, TransportError
 from common.hands import get_hand
 from common.task.types import Goal, Surface
 from common.wire.codec import Message
+from services.grasp import costs
 from services.server import Source
 from services.view.jobs import Progress
 from services.view.state import OPTIONAL, Asked
@@ -24,10 +25,12 @@ TRIES = 8
 HOLD_SECONDS = 2.0
 _ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
 """How far the others are from what was drawn: m, rad, rad (one standard deviation)."""
+_OTHER = 2.0
+"""What it costs not to be the one that was drawn, beside the costs of `services.grasp`."""
 
 
 class PolicyGrasping:
-    """A policy of a file or of a run that is being trained; it keeps to the newest weights."""
+    """A policy of a file or of a run that is being trained; every grasp is one of its newest weights."""
 
     def __init__(self, source: Source, name: str, *, threads: int = 0):
         """Loads the policy; compiles nothing yet.
@@ -82,7 +85,7 @@ class PolicyGrasping:
         steps = self._trials.steps
         outcome = self._trials.run(asked.obj, beginnings, lambda step: progress("grasping", step / steps))
         self._compiled = True
-        index = _best(outcome)
+        index = _best(outcome, asked.constraints)
         metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
         points = self.task.surface_points
         return episode_message(
@@ -127,17 +130,16 @@ def _beginnings(asked: Asked, points: int) -> tuple[Beginnings, np.ndarray]:
     return Beginnings(Request(goal, *flags), same, rest), np.linalg.norm(shift, axis=-1)
 
 
-def _best(outcome: Outcome) -> int:
-    """The one that was drawn if it holds, else the first that does, else the first that does for a moment."""
-    score = 2 * (outcome.metrics["held"] > 0) + (outcome.metrics["success"] > 0)
-    return int(np.argmax(score))
+def _best(outcome: Outcome, constraints: tuple[str, ...]) -> int:
+    """The one that was drawn, unless another is clearly better: it holds, or keeps to the constraints."""
+    return int(np.argmin(costs(outcome, ("heading", *constraints)) + _OTHER * (np.arange(TRIES) > 0)))
 
 
 def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
-    held = int((outcome.metrics["held"] > 0).sum())
-    if index:
-        beside = f"{1000 * aside[index]:.0f} mm beside it"
-        return f"What was drawn did not hold; this one, {beside}, is the best of {TRIES} near it."
-    if not held:
+    held = outcome.metrics["held"] > 0
+    if not held.any():
         return f"Neither what was drawn nor {TRIES - 1} others near it held. Try another arrow."
+    if index:
+        why = "did better" if held[0] else "held, which what was drawn did not"
+        return f"Of {TRIES - 1} others near what was drawn, this one {why}: {1000 * aside[index]:.0f} mm beside it."
     return ""

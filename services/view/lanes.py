@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand, link_origin
+from common.logs.poses import link_poses
 from common.task.types import MASKS
 from common.wire.codec import Message
 
@@ -52,14 +53,14 @@ def lanes(episode: Message) -> dict[str, Lane]:
     mask = dict(zip(MASKS, a["goal/mask"] > 0, strict=True))
     table = a["table"].astype(bool)
     touching = np.linalg.norm(a["contact_force"], axis=-1) > TOUCH
-    turn = Rotation.from_quat(a["object_quaternion"], scalar_first=True)
-    wrist = Rotation.from_quat(a["link_quaternion"][:, 0], scalar_first=True)
+    turn = _turn(a["object_quaternion"])
+    wrist = _turn(a["link_quaternion"][:, 0])
     links = touching.sum(-1)
     found = {"contact": Lane(links >= 2, ~table, "two links or more touch the object", {"links": links.astype(float)})}
     found["heading"] = _heading(hand, a, turn, wrist, table)
     if mask["affordance"]:
         wrong = touching & _nearest_is_minus(hand, a, turn)
-        lane = {"links that touch O-": wrong.sum(-1).astype(float)}
+        lane = {"links on O-": wrong.sum(-1).astype(float)}
         found["affordance"] = Lane(~wrong.any(-1), np.ones(len(table), bool), "no link touches what is painted", lane)
     if mask["pose_finger"]:
         found["pose"] = _pose(a, turn, wrist, table, whole=bool(mask["pose_wrist"]))
@@ -97,7 +98,7 @@ def _trajectory(a: Mapping[str, np.ndarray], turn: Rotation, wrist: Rotation, ta
     legs = itertools.pairwise(path)
     far = np.min([_to_segment(local, start[None], end[None])[0] for start, end in legs], axis=0)
     index = np.linalg.norm(local[:, None] - path[None], axis=-1).argmin(-1)
-    target = turn * Rotation.from_quat(a["goal/trajectory_quaternion"][index], scalar_first=True)
+    target = turn * _turn(a["goal/trajectory_quaternion"][index])
     angle = (target.inv() * wrist).magnitude()
     met = (angle <= TRAJECTORY[0]) & (far <= TRAJECTORY[1])
     words = f"wrist within {100 * TRAJECTORY[1]:.0f} cm and {np.degrees(TRAJECTORY[0]):.0f}° of the path"
@@ -108,7 +109,7 @@ def _center(hand: Hand, a: Mapping[str, np.ndarray]) -> np.ndarray:
     """(T, 3) the hand's centre: middle between the thumb's tip and the mean of the others."""
     tips = np.array(
         [
-            Rotation.from_quat(a["link_quaternion"][:, i], scalar_first=True).apply(
+            _turn(a["link_quaternion"][:, i]).apply(
                 np.subtract(hand.links[i].tip or (0.0, 0.0, 0.0), link_origin(hand.links[i]))
             )
             + a["link_position"][:, i]
@@ -124,7 +125,7 @@ def _nearest_is_minus(hand: Hand, a: Mapping[str, np.ndarray], turn: Rotation) -
     back = turn.inv()
     result = np.zeros(a["link_position"].shape[:2], bool)
     for i, link in enumerate(hand.links):
-        own = Rotation.from_quat(a["link_quaternion"][:, i], scalar_first=True)
+        own = _turn(a["link_quaternion"][:, i])
         nearest = np.full((len(result), len(points)), np.inf)
         for capsule in link.capsules:
             ends = [
@@ -138,6 +139,11 @@ def _nearest_is_minus(hand: Hand, a: Mapping[str, np.ndarray], turn: Rotation) -
     return result
 
 
+def _turn(quaternion: Any) -> Rotation:
+    """Rotations of quaternions (..., 4), w x y z."""
+    return Rotation.from_quat(quaternion, scalar_first=True)
+
+
 def _to_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """(T, N) distances of points (N, 3) from segments (T, 3) to (T, 3)."""
     along = end - start
@@ -147,7 +153,7 @@ def _to_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.nd
 
 
 def for_page(episode: Message) -> Message:
-    """The episode as the player needs it: poses, forces, rewards, object, goal and lanes; float32."""
+    """The episode as the player needs it: poses, forces, rewards, object, goal, reference pose and lanes."""
     found = lanes(episode)
     keep: tuple[str, ...] = (
         "link_position",
@@ -163,5 +169,10 @@ def for_page(episode: Message) -> Message:
     for name, lane in found.items():
         arrays |= {f"lane/{name}/met": lane.met, f"lane/{name}/counts": lane.counts}
         arrays |= {f"lane/{name}/{unit}": np.asarray(value, np.float32) for unit, value in lane.errors.items()}
+    if "pose" in found:
+        hand, turn = get_hand(str(episode.meta["hand"])), _turn(episode.arrays["goal/pose_quaternion"])
+        position, quaternion = link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
+        arrays["ghost_position"] = (turn.apply(position) + episode.arrays["goal/pose_position"]).astype(np.float32)
+        arrays["ghost_quaternion"] = (turn * _turn(quaternion)).as_quat(scalar_first=True).astype(np.float32)
     words = {name: lane.words for name, lane in found.items()}
     return Message(arrays, {**episode.meta, "lanes": words})

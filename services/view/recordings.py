@@ -14,6 +14,8 @@ from common.wire.codec import Message, decode
 
 MOST = 60
 """Episodes that one search finds at most; the nearest to the moment."""
+FARTHER = (1.0, 5.0, 25.0)
+"""Factors by which it is looked farther where there is no episode."""
 
 
 class Recordings:
@@ -33,37 +35,30 @@ class Recordings:
         if not self.path.exists():
             raise CongraspError(f"There is no file or folder {self.path}.", "Name a run's folder, or its recordings.")
 
-    def around(self, time: float, seconds: float) -> list[dict[str, Any]]:
-        """Episodes that were recorded within `seconds` of a time (seconds since 1970), in the order of their times.
+    def around(self, time: float, seconds: float) -> tuple[float, list[dict[str, Any]]]:
+        """Episodes that were recorded around a time, in the order of their times.
+
+        Args:
+          time: seconds since 1970.
+          seconds: how far from it they may be; where there are none, it is looked farther away.
 
         Returns:
-          For each what a list shows of it; `id` is for `episode`.
+          How far it was looked, and for each episode what a list shows of it; its `id` is for `episode`.
 
         Raises:
           CongraspError: there are no recordings.
         """
-        begin, end = int(1e9 * (time - seconds)), int(1e9 * (time + seconds))
-        found = [item for file in log_files(self.path) for item in _within(file, begin, end)]
+        files = log_files(self.path)
+        for farther in FARTHER:
+            begin, end = (int(1e9 * (time + sign * farther * seconds)) for sign in (-1, 1))
+            found = [item for file in files for item in _within(file, begin, end)]
+            if found:
+                break
         found = sorted(found, key=lambda item: abs(item[0] - 1e9 * time))[:MOST]
-        rows, kept = [], {}
-        for when, topic, data in sorted(found, key=lambda item: item[0]):
-            message = decode(data)
-            key = f"{when}{topic}"
-            kept[key] = message
-            rows.append(
-                {
-                    "id": key,
-                    "time": when / 1e9,
-                    "actor": topic.split("/")[2],
-                    "object": message.meta.get("object"),
-                    "version": message.meta.get("version"),
-                    "success": bool(message.meta.get("success")),
-                    "return": message.meta.get("metrics", {}).get("return"),
-                }
-            )
+        kept = {f"{when}{topic}": decode(data) for when, topic, data in sorted(found, key=lambda item: item[0])}
         with self._lock:
             self._found = kept
-        return rows
+        return farther * seconds, [_row(key, message) for key, message in kept.items()]
 
     def episode(self, key: str) -> Message:
         """An episode of the last search.
@@ -77,14 +72,27 @@ class Recordings:
             return self._found[key]
 
 
+def is_episode(topic: str) -> bool:
+    """Whether a topic is that of an actor's whole episodes."""
+    return topic.startswith("/episode/") and topic.endswith("/raw")
+
+
+def _row(key: str, message: Message) -> dict[str, Any]:
+    time, _, topic = key.partition("/")
+    return {
+        "id": key,
+        "time": int(time) / 1e9,
+        "actor": topic.split("/")[1],
+        "object": message.meta.get("object"),
+        "version": message.meta.get("version"),
+        "success": bool(message.meta.get("success")),
+    }
+
+
 def _within(file: pathlib.Path, begin: int, end: int) -> Iterator[tuple[int, str, bytes]]:
     """Time (ns), topic and bytes of a file's raw episodes between two times."""
-
-    def wanted(topic: str) -> bool:
-        return topic.startswith("/episode/") and topic.endswith("/raw")
-
     if not is_complete(file):  # being written, or cut off: no index, so all of it is read
-        for record in read_records(file, wanted):
+        for record in read_records(file, is_episode):
             if record.schema == EPISODE_SCHEMA and begin <= record.time <= end:
                 yield record.time, record.topic, record.data
         return
@@ -96,7 +104,7 @@ def _within(file: pathlib.Path, begin: int, end: int) -> Iterator[tuple[int, str
                 return
             if summary.statistics.message_start_time > end or summary.statistics.message_end_time < begin:
                 return
-            topics = [channel.topic for channel in summary.channels.values() if wanted(channel.topic)]
+            topics = [channel.topic for channel in summary.channels.values() if is_episode(channel.topic)]
             if not topics:
                 return
             for schema, channel, message in reader.iter_messages(topics, starting_at=begin, ending_at=end):

@@ -189,7 +189,7 @@ class Session:
             if path.is_dir():
                 path = pathlib.Path(shutil.make_archive(str(path), "zip", path))
             number = "".join(c if c.isalnum() else "-" for c in key)[-40:]
-            suffix = path.suffix if not FORMATS.get(kind, ".") else f"-{kind}{path.suffix}"
+            suffix = f".{kind}" if kind in ("npz", "mcap") else FORMATS[kind] or f"-{kind}.zip"
             return Download(f"{episode.meta['object']}-{number}{suffix}", path.read_bytes())
 
     def training(self, names: str) -> dict[str, Any]:
@@ -198,7 +198,7 @@ class Session:
             raise CongraspError("The studio follows no run.", "Start it with --connect, or with --recordings.")
         return self._window.view([name for name in names.split(",") if name])
 
-    def moment(self, time: str, seconds: str) -> list[Any]:
+    def moment(self, time: str, seconds: str) -> dict[str, Any]:
         """Episodes that were recorded around a time."""
         if self._recordings is None:
             raise CongraspError("No recordings were named.", "Start the studio with --recordings FOLDER.")
@@ -206,7 +206,8 @@ class Session:
             when, around = float(time), float(seconds)
         except ValueError:
             raise CongraspError("A moment needs two numbers: time and seconds.") from None
-        return list(self._recordings.around(when, min(max(around, 0.1), 3600.0)))
+        reach, episodes = self._recordings.around(when, min(max(around, 0.1), 3600.0))
+        return {"seconds": reach, "episodes": episodes}
 
     def _do(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
         """One action of the user; answers with the new state."""

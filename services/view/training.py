@@ -17,11 +17,12 @@ import numpy as np
 
 from common.errors import CongraspError, TransportError
 from common.logs.channels import flatten
-from common.logs.reader import log_files, read_records
+from common.logs.reader import Record, log_files, read_records
 from common.transport.base import Transport
 from common.transport.keys import Keys
-from common.wire.codec import Message
+from common.wire.codec import Message, decode
 from services import status as statuses
+from services.view.recordings import is_episode
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows first."""
@@ -119,17 +120,25 @@ class TrainingWindow:
                     del self._actors[name]
 
     def load(self, path: pathlib.Path) -> None:
-        """Curves of a run's recordings.
+        """Curves of a run's recordings, and every actor's newest episode there.
 
         Raises:
           CongraspError: there are none.
         """
+        newest: dict[str, Record] = {}
         for file in log_files(path):
-            for record in read_records(file, lambda topic: topic.startswith("/metrics/")):
-                _, _, role, name = record.topic.split("/", 3)
+            for record in read_records(file, lambda topic: topic.startswith("/metrics/") or is_episode(topic)):
+                _, kind, role, name = record.topic.split("/", 3)
+                if kind == "episode":
+                    newest[role] = record
+                    continue
                 meta = json.loads(record.data)
                 with self._lock:
                     self._metrics(role, name, {**meta, "values": flatten(meta["values"])}, record.time / 1e9)
+        for name, record in newest.items():
+            with self._lock:
+                if name not in self._actors or self._actors[name].episode is None:
+                    self._episode(name, decode(record.data), time.time())
 
     def episode(self, actor: str) -> Message:
         """The newest episode of an actor.

@@ -64,7 +64,7 @@ class App {
   async start() {
     const state = await ask("/api/state");
     await Promise.all([this.#hand(state.studio.hand), this.#object(state.studio)]);
-    this.panel.show(state);
+    await this.panel.show(state);
     this.#frameAll(state.studio);
     $("show-training").hidden = !state.training;
     if (new URLSearchParams(location.search).get("view") === "training" && state.training) this.view("training");
@@ -132,6 +132,8 @@ class App {
     $("banner").hidden = !motion.meta.note;
     $("banner").textContent = motion.meta.note ?? "";
     this.timeline.show(motion);
+    this.camera.target = [motion.center[0], motion.center[1], motion.center[2] + 0.04];
+    this.camera.distance = Math.min(this.camera.distance, 0.8);
     this.seek(0);
     this.playing = true;
     this.last = performance.now();

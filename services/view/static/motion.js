@@ -34,6 +34,7 @@ export class Motion {
       direction: Array.from(arrays["goal/heading_direction"].data),
       path: this.active.includes("trajectory") ? rows(arrays["goal/trajectory_position"]) : null,
     };
+    this.ghost = arrays.ghost_position ? { position: rows(arrays.ghost_position), quaternion: rows(arrays.ghost_quaternion) } : null;
     this.minus = this.active.includes("affordance") ? this.#labels(arrays) : null;
     this.rewards = {};
     for (const [name, { data }] of Object.entries(arrays)) if (name.startsWith("reward/")) this.rewards[name.slice(7)] = data;

@@ -1,6 +1,6 @@
 // What is seen: hand, object, constraints and contacts, as things for the renderer.
 
-import { add, cross, dot, norm, pose, rotate, scale, sub, unit, perpendicular, IDENTITY } from "./math.js";
+import { add, cross, dot, norm, pose, rotate, scale, sub, toWorld, unit, perpendicular, IDENTITY } from "./math.js";
 import * as shapes from "./shapes.js";
 
 const SKIN = [0.72, 0.75, 0.81];
@@ -142,6 +142,15 @@ export class Scene {
     return { mesh: this.table, model: [...IDENTITY.slice(0, 12), center[0], center[1], 0, 1], lit: 0 };
   }
 
+  // A reference pose, which is given in the object's frame.
+  #ghost(hand, links, place) {
+    const turned = {
+      position: links.position.map((point) => toWorld(place, point)),
+      quaternion: links.quaternion.map((turn) => product(place.quaternion, turn)),
+    };
+    return this.#links(hand, turned, () => ({ tint: GHOST, alpha: 0.28 }));
+  }
+
   // Things while constraints are edited. `arrow`: {tip, direction} in the world.
   editing(state, arrow, handles) {
     const place = state.rest;
@@ -149,19 +158,13 @@ export class Scene {
     if (this.body) things.push({ mesh: this.body.mesh, model: pose(place.position, place.quaternion) });
     things.push(...this.#links(state.hand, state.start, () => ({})));
     // An arrow that the rules overrule is faint, and beside it is the one that counts.
-    const counts = add(place.position, rotate(place.quaternion, state.active.position));
+    const counts = toWorld(place, state.active.position);
     things.push(this.#arrow(arrow.tip, arrow.direction, HEADING, state.active.overruled ? 0.3 : 1));
     if (state.active.overruled) things.push(this.#arrow(counts, rotate(place.quaternion, state.active.direction), COUNTS, 1));
     for (const [name, point] of Object.entries(handles.points))
       things.push({ mesh: this.ball, model: [...IDENTITY.slice(0, 12), ...point, 1], tint: name === handles.hover ? [1, 0.8, 0.2] : HEADING, lit: 0.5 });
     if (state.path && state.asked.includes("trajectory")) things.push(this.#path(state.path, place, 1));
-    if (state.pose && state.asked.includes("pose")) {
-      const turned = {
-        position: state.pose.position.map((p) => add(place.position, rotate(place.quaternion, p))),
-        quaternion: state.pose.quaternion.map((q) => product(place.quaternion, q)),
-      };
-      things.push(...this.#links(state.hand, turned, () => ({ tint: GHOST, alpha: 0.28 })));
-    }
+    if (state.pose && state.asked.includes("pose")) things.push(...this.#ghost(state.hand, state.pose, place));
     return things;
   }
 
@@ -182,9 +185,10 @@ export class Scene {
     });
     const { goal } = motion;
     const direction = rotate(place.quaternion, goal.direction);
-    const target = add(place.position, rotate(place.quaternion, goal.position));
+    const target = toWorld(place, goal.position);
     things.push(this.#arrow(target, direction, HEADING, 0.6));
     if (goal.path) things.push(this.#path(goal.path, place, 0.7));
+    if (motion.ghost) things.push(...this.#ghost(motion.hand, motion.ghost, place));
     return things;
   }
 }

@@ -50,11 +50,11 @@ export class StudioPanel {
       try {
         const state = await tell("/api/do", { action, ...values });
         this.error("");
-        this.show(state);
+        await this.show(state);
         return true;
       } catch (error) {
         this.error(error.message);
-        this.show(await ask("/api/state").catch(() => this.state));
+        await this.show(await ask("/api/state").catch(() => this.state));
         return false;
       } finally {
         this.busy(false);
@@ -64,7 +64,7 @@ export class StudioPanel {
   }
 
   busy(on) {
-    document.body.style.cursor = on ? "progress" : "";
+    document.body.toggleAttribute("data-busy", on);
   }
 
   error(text) {
@@ -75,12 +75,13 @@ export class StudioPanel {
     try {
       this.error("");
       await upload("/api/upload", file);
-      this.show(await ask("/api/state"));
+      await this.show(await ask("/api/state"));
     } catch (error) {
       this.error(error.message);
     }
   }
 
+  // Resolves when the picture can be drawn with it.
   show(state) {
     const { studio } = state;
     this.state = state;
@@ -106,7 +107,7 @@ export class StudioPanel {
     this.#job(state.job);
     $("grasp").disabled = Boolean(studio.trouble) || state.job.running;
     this.#motions(state.motions);
-    this.app.takeState(state);
+    return this.app.takeState(state);
   }
 
   // Shows a job's progress while it runs, and once what came of it.
@@ -133,7 +134,7 @@ export class StudioPanel {
     } while (!job || job.running);
     this.watching = false;
     const state = await ask("/api/state").catch(() => null);
-    if (state) this.show(state);
+    if (state) await this.show(state);
   }
 
   #motions(motions) {

@@ -48,13 +48,22 @@ export class TrainingPanel {
     this.looking = true;
     try {
       this.view = await ask("/api/training", { names: this.chosen.join(",") });
-      $("run-trouble").textContent = this.view.away && this.view.version !== null ? "The learner is away." : this.view.warnings.join(" ");
+      this.#say();
       this.#show();
     } catch (error) {
       $("run-trouble").textContent = error.message;
     } finally {
       this.looking = false;
     }
+  }
+
+  #say() {
+    const { view } = this;
+    const watched = view.actors.find((actor) => actor.id === this.watched);
+    const said = [...view.warnings];
+    if (view.away && view.version !== null) said.push("The learner is away.");
+    if (watched && !watched.episodes) said.push(`${watched.id} has sent no episode yet; the next one is played when it comes.`);
+    $("run-trouble").textContent = said.join(" ");
   }
 
   #show() {
@@ -213,9 +222,9 @@ export class TrainingPanel {
     found.hidden = false;
     found.textContent = "Searching the recordings …";
     try {
-      const episodes = await ask("/api/moment", { time: curve.times[index], seconds });
+      const { seconds: reach, episodes } = await ask("/api/moment", { time: curve.times[index], seconds });
       const title = document.createElement("p");
-      title.textContent = `${episodes.length} episodes within ${short(seconds)} s of update ${short(curve.steps[index])}, ${episodes.filter((e) => e.success).length} succeeded`;
+      title.textContent = `${episodes.length} episodes within ${short(reach)} s of update ${short(curve.steps[index])}, ${episodes.filter((e) => e.success).length} succeeded`;
       found.replaceChildren(title, ...episodes.map((episode) => {
         const button = document.createElement("button");
         button.dataset.episode = episode.id;

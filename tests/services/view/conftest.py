@@ -12,8 +12,8 @@ import pytest
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 RESULTS = ROOT / "test-results"
 SIZE = {"width": 1280, "height": 760}
-_BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-_ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
 
 
 @pytest.fixture(scope="session")
@@ -22,10 +22,10 @@ def browser() -> Iterator[Any]:
     playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
     with playwright.sync_playwright() as running:
         own = pathlib.Path(running.chromium.executable_path)
-        found = next(filter(None, map(shutil.which, _BROWSERS)), None) or (str(own) if own.exists() else None)
+        found = next(filter(None, map(shutil.which, BROWSERS)), None) or (str(own) if own.exists() else None)
         if found is None:
             pytest.skip("there is no browser here (tests/install_browser.sh installs one)")
-        started = running.chromium.launch(executable_path=found, args=_ARGUMENTS)
+        started = running.chromium.launch(executable_path=found, args=ARGUMENTS)
         yield started
         started.close()
 

@@ -58,7 +58,7 @@ def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:
     lane = lanes(Message(everywhere, made.meta))["affordance"]
     touching = np.linalg.norm(made.arrays["contact_force"], axis=-1).max(-1) > 0.05
     np.testing.assert_array_equal(lane.met, ~touching)
-    assert lane.errors["links that touch O-"][-1] == 5
+    assert lane.errors["links on O-"][-1] == 5
 
 
 def test_the_page_gets_one_message_with_everything_it_plays() -> None:
@@ -66,3 +66,6 @@ def test_the_page_gets_one_message_with_everything_it_plays() -> None:
     assert message.arrays["lane/heading/met"].shape == (STEPS,)
     assert "within" in message.meta["lanes"]["heading"]
     assert {"link_position", "object_quaternion", "reward/contact", "goal/mask"} <= message.arrays.keys()
+    # The made-up grasp ends in its reference pose: the ghost is where the hand is, in the object's frame.
+    last = message.arrays["link_position"][-1] - message.arrays["object_position"][-1]
+    np.testing.assert_allclose(message.arrays["ghost_position"], last, atol=1e-5)

@@ -111,7 +111,8 @@ def test_episodes_of_a_moment_come_from_finished_and_from_growing_files(tmp_path
     when = BEGIN + 10 * DIP
     made_up.record(tmp_path, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
     recordings = Recordings(tmp_path)
-    rows = recordings.around(when, 5.0)
+    reach, rows = recordings.around(when, 5.0)
+    assert reach == 5.0
     assert [row["actor"] for row in rows] == ["a002", "a003"]
     assert recordings.episode(rows[1]["id"]).meta["object"] == "thing-3"
     # The same of a file whose writer was killed: it has no index.
@@ -119,18 +120,21 @@ def test_episodes_of_a_moment_come_from_finished_and_from_growing_files(tmp_path
     cut = tmp_path / f"{file.name}.part"
     cut.write_bytes(file.read_bytes()[:-200])
     file.unlink()
-    assert [row["actor"] for row in recordings.around(when, 5.0)] == ["a002", "a003"]
+    assert [row["actor"] for row in recordings.around(when, 5.0)[1]] == ["a002", "a003"]
+    # Where there is none, the nearest are found.
+    reach, rows = recordings.around(when - 90, 3.0)
+    assert reach == 15.0 and [row["actor"] for row in rows] == ["a001"]
     with pytest.raises(CongraspError, match="not among those"):
         recordings.episode("nothing")
 
 
 def test_of_many_episodes_the_nearest_are_taken(tmp_path: pathlib.Path) -> None:
     made_up.record(tmp_path, [(BEGIN + n, n) for n in range(MOST + 5)])
-    rows = Recordings(tmp_path).around(BEGIN, 1000.0)
+    _, rows = Recordings(tmp_path).around(BEGIN, 1000.0)
     assert [row["actor"] for row in rows] == [f"a{n:03d}" for n in range(MOST)]
 
 
-def test_curves_are_read_from_recordings(tmp_path: pathlib.Path) -> None:
+def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.Path) -> None:
     transport = MemoryTransport(MemoryHub())
     with Recorder(transport, "made-up", tmp_path) as recorder:
         for update in range(40):
@@ -139,7 +143,10 @@ def test_curves_are_read_from_recordings(tmp_path: pathlib.Path) -> None:
         while recorder.messages < 40:
             assert time.monotonic() < deadline
             time.sleep(0.02)
+    made_up.record(tmp_path, [(BEGIN, 3), (BEGIN + 5, 3), (BEGIN + 6, 4)])
     window = TrainingWindow("made-up")
     window.load(tmp_path)
+    assert [row["id"] for row in window.view()["actors"]] == ["a003", "a004"]
+    assert window.episode("a004").meta["object"] == "thing-4"
     assert window.curve("episode/success").values[DIP] == 0.1
     assert window.curve("episode/success").times[DIP] == BEGIN + 10 * DIP
