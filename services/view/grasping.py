@@ -5,11 +5,11 @@ import os
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from actors.episode import episode_message
 from actors.rollout import Trace, goal_of_world
 from actors.trials import Beginnings, Outcome, Trials
-from common import rotations
 from common.constraints.priority import Request
 from common.errors import CongraspError, TransportError
 from common.hands import get_hand
@@ -115,11 +115,11 @@ def _beginnings(asked: Asked, points: int) -> tuple[Beginnings, np.ndarray]:
     third = np.cross(direction, cross)
     way = rng.uniform(0.0, 2 * np.pi, TRIES)
     axis = np.cos(way)[:, None] * cross + np.sin(way)[:, None] * third
-    turn = rotations.from_rotation_vector((tilt[:, None] * axis + roll[:, None] * direction).astype(np.float32))
+    turn = Rotation.from_rotvec(tilt[:, None] * axis + roll[:, None] * direction)
     goal = goal._replace(
         heading_position=goal.heading_position + shift.astype(np.float32),
-        heading_direction=np.asarray(rotations.rotate(turn, direction)),
-        heading_cross=np.asarray(rotations.rotate(turn, cross)),
+        heading_direction=turn.apply(direction).astype(np.float32),
+        heading_cross=turn.apply(cross).astype(np.float32),
         pose_position=goal.pose_position + shift.astype(np.float32),
         trajectory_position=goal.trajectory_position + shift[:, None].astype(np.float32),
     )

@@ -78,7 +78,8 @@ export class TrainingPanel {
       "largest lag": Math.max(0, ...view.actors.map((actor) => actor.lag ?? 0)),
       queue: view.queue ? `${view.queue.length} of ${view.queue.limit}` : "–",
     };
-    $("tiles").replaceChildren(...Object.entries(tiles).map(([name, value]) => {
+    const known = Object.entries(tiles).filter(([name]) => view.version !== null || name === "run");
+    $("tiles").replaceChildren(...known.map(([name, value]) => {
       const tile = document.createElement("div");
       tile.dataset.tile = name;
       tile.innerHTML = "<span class='quiet'></span><b></b>";
