@@ -14,6 +14,11 @@ def shipped(hand: str) -> pathlib.Path | None:
     return path if path.exists() else None
 
 
+def shipped_hands() -> list[str]:
+    """Names of the hands whose policies come with the package."""
+    return sorted(path.stem for path in _FOLDER.glob("*.safetensors"))
+
+
 def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path:
     """The policy file that a command was given, or the shipped one for this hand.
 

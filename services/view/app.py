@@ -7,13 +7,12 @@ import threading
 from collections.abc import Callable, Iterator
 
 from common.errors import CongraspError
-from common.hands import HANDS
 from common.objects import procedural, store
 from common.objects.meshes import ImportOptions, import_source
 from common.objects.pool import HELD_OUT_SEED
 from common.objects.sources import find_sources
 from common.objects.spec import GraspObject
-from common.policy.shipped import policy_file, shipped
+from common.policy.shipped import policy_file, shipped_hands
 from common.transport.security import check_exposure
 from common.transport.zenoh_transport import ZenohTransport
 from services.access import credentials
@@ -92,8 +91,7 @@ def _of_run(
 def _shipped() -> dict[str, Callable[[], PolicyGrasping]]:
     return {
         name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "shipped policy")
-        for name in HANDS
-        if shipped(name) is not None
+        for name in shipped_hands()
     }
 
 
