@@ -1,5 +1,6 @@
 """Objects that a user points to: folders of object files, object files, and meshes to import."""
 
+import logging
 import pathlib
 from collections.abc import Callable
 
@@ -8,6 +9,8 @@ from common.objects import store
 from common.objects.meshes import ImportOptions, import_source
 from common.objects.sources import find_sources
 from common.objects.spec import GraspObject
+
+_log = logging.getLogger(__name__)
 
 
 def objects_of(
@@ -29,7 +32,10 @@ def objects_of(
     advance = track("Importing objects", len(sources)) if track else lambda done: None
     objects = []
     for source in sources:
-        objects.append(import_source(source, ImportOptions())[0])
+        obj, notes = import_source(source, ImportOptions())
+        for note in notes:
+            _log.warning("%s: %s", source.name, note)
+        objects.append(obj)
         advance(len(objects))
     return objects
 

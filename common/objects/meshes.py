@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import logging
 import os
 import pathlib
 from collections.abc import Iterable, Sequence
@@ -24,7 +23,6 @@ UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""
 _CACHE_VERSION = 3
 _MAX_FACES = 20_000
-_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,8 +79,6 @@ def import_source(source: Source, options: ImportOptions) -> tuple[GraspObject, 
             cached.unlink()
     notes: list[str] = []
     obj = _build(source, options, int(key, 16), notes)
-    for note in notes:
-        _log.warning("%s: %s", source.name, note)
     store.save(obj, cached)
     return obj, notes
 
@@ -239,7 +235,10 @@ def _pieces(
             f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
         ) from None
     if missing > 0.1:
-        notes.append(f"round pieces were cut to 32 vertices ({missing:.0%} of a piece's volume, made up by its scale)")
+        notes.append(
+            "its round parts are a little angular in the simulation: pieces have 32 vertices "
+            f"(up to {missing:.0%} of a piece's volume is made up by its scale)"
+        )
     return hulls, owners
 
 

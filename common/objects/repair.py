@@ -93,7 +93,9 @@ def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
         if outwards.is_winding_consistent:
             notes.append("some of its triangles faced inwards and were turned")
             mesh = outwards
-    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0:
+    with np.errstate(invalid="ignore"):  # a flat mesh has no centre of mass
+        inside_out = mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0
+    if inside_out:
         mesh = mesh.copy()
         mesh.invert()
         notes.append("it was inside out and was turned")

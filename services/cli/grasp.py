@@ -56,8 +56,6 @@ def grasp(
       again: Also grasp anew what is done already.
       options: How meshes become objects.
     """
-    import logging
-
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -71,7 +69,6 @@ def grasp(
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
     if tries < 1:
         raise CongraspError(f"--tries is {tries}.", "It must be at least 1.")
-    logging.getLogger("common.objects.meshes").setLevel(logging.ERROR)  # its notes are in the results
     console = Console(highlight=False)
     file = policy_file(policy, hand)
     loaded = bundles.load(file)
