@@ -38,9 +38,9 @@ from common.wire.codec import Message
 from services.asked import Asked, read_asked
 from services.objects import one_object
 
-TRIES = 32
+TRIES = 16
 """Grasps that are simulated side by side."""
-ROUNDS = 3
+ROUNDS = 4
 """How often that many others are tried while none holds."""
 HOLD_SECONDS = 2.0
 """How long the object should be held without the table."""
@@ -128,6 +128,7 @@ class Grasper:
         self.hand = get_hand(policy.spec.hand)
         self.task = dataclasses.replace(policy.task, end_when_fallen=False)
         self._policy, self._tries, self._rounds, self._seed = policy, tries, rounds, seed
+        self._compiled = False
         hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
         self._trials = Trials(self.hand, self.task, policy, hold=hold, threads=threads or os.cpu_count() or 1)
 
@@ -149,6 +150,8 @@ class Grasper:
         held = tried = 0
         for round_ in range(self._rounds):
             beginnings, rests, different = self._beginnings(obj, asked, np.random.default_rng((self._seed, round_)))
+            progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
+            self._compiled = True
             what = f"Trying others ({round_ + 1})" if round_ else "Trying"
             outcome = self._trials.run(
                 obj, beginnings, functools.partial(lambda what, step: progress(what, step, self._trials.steps), what)

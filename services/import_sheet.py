@@ -7,6 +7,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from common.hands.spec import Hand
+from common.objects.repair import MAX_FACES
 from common.objects.shapes import tessellate
 from common.objects.sizes import length, size_in_words
 from common.objects.sources import Source, read_mesh
@@ -16,66 +17,67 @@ from services.raycast import Shape
 from services.render import OBJECT, SKIN, fit, posed_hand, shape_points, upright
 from services.sheets import contact_sheet
 
+Body = tuple[np.ndarray, np.ndarray, tuple[float, float, float]]
+"""Vertices (V, 3), faces (F, 3) and colour."""
 _SIZE = (460, 360)
 _VIEW = (0.9, -0.6, 0.45)
 _GAP = 0.03  # m between the hand and the object
 _LARGEST, _SMALLEST = 1.5, 0.01  # m; a mesh beyond is drawn at another scale before its import
-_MOST_FACES = 20_000
+_LARGE_FILE = 30 << 20  # bytes
 _COLOURS = ((0.90, 0.45, 0.36), (0.35, 0.63, 0.78), (0.95, 0.72, 0.30), (0.45, 0.70, 0.48), (0.66, 0.52, 0.78))
 
 
-def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh) -> np.ndarray:
-    """Three pictures, each beside the open hand: the file, the object on the table, and its convex pieces.
+def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -> np.ndarray:
+    """Pictures, each beside the open hand: the file, the object on the table, and its convex pieces.
 
     Args:
       hand: the hand.
       obj: what the import made.
-      before: the mesh of the file, in the file's unit.
+      before: the mesh of the file, in the file's unit, if it is to be drawn.
 
     Returns:
       (H, W, 3) uint8.
     """
     rest = Rotation.from_quat(obj.rest_poses[0][3:], scalar_first=True)
-    size = float(before.extents.max())
-    drawn = size if _SMALLEST <= size <= _LARGEST else float(np.ptp(obj.visual_vertices, axis=0).max())
-    raw = rest.apply(np.asarray(before.vertices) * drawn / size)
-    parts = [
-        [(raw, np.asarray(before.faces), OBJECT)],
-        [(rest.apply(obj.visual_vertices), obj.visual_faces, OBJECT)],
-        [
-            (rest.apply(vertices), faces, _COLOURS[i % len(_COLOURS)])
-            for i, (vertices, faces) in enumerate(map(tessellate, obj.pieces))
-        ],
+    sides = tuple(np.ptp(obj.visual_vertices, axis=0).tolist())
+    parts: dict[str, list[Body]] = {}
+    if before is not None:
+        size = float(before.extents.max())
+        drawn = size if _SMALLEST <= size <= _LARGEST else max(sides)
+        scaled = "" if drawn == size else " (not drawn to scale)"
+        label = f"the file: {len(before.faces):,} triangles, {length(size)} long in metres{scaled}"
+        parts[label] = [(rest.apply(np.asarray(before.vertices) * drawn / size), np.asarray(before.faces), OBJECT)]
+    parts[f"the object: {size_in_words(sides)}, {1000 * obj.mass:.0f} g"] = [
+        (rest.apply(obj.visual_vertices), obj.visual_faces, OBJECT)
     ]
-    scenes = [_beside(hand, meshes) for meshes in parts]
-    labels = [
-        f"the file: {len(before.faces):,} triangles, {length(size)} long in metres"
-        + ("" if drawn == size else " (not drawn to scale)"),
-        f"the object: {size_in_words(tuple(np.ptp(obj.visual_vertices, axis=0)))}, {1000 * obj.mass:.0f} g",
-        f"its {len(obj.pieces)} convex pieces, which physics uses",
+    pieces = enumerate(map(tessellate, obj.pieces))
+    parts[f"its {len(obj.pieces)} convex pieces, which physics uses"] = [
+        (rest.apply(vertices), faces, _COLOURS[i % len(_COLOURS)]) for i, (vertices, faces) in pieces
     ]
     raster = Raster()
     images = []
-    for shapes in scenes:
+    for shapes in (_beside(hand, bodies) for bodies in parts.values()):
         points = np.concatenate([shape_points(shape) for shape in shapes])
         images.append(raster.draw(shapes, fit(points, np.array(_VIEW), _SIZE[0] / _SIZE[1]), _SIZE))
-    return contact_sheet(images, labels, columns=3, title="  |  ".join([obj.name, *obj.notes]))
+    return contact_sheet(images, list(parts), columns=len(parts), title="  |  ".join([obj.name, *obj.notes]))
 
 
-def mesh_of_file(source: Source) -> trimesh.Trimesh:
-    """The surface of an object's files as they are, in their own unit, reduced for a picture."""
-    meshes = [read_mesh(file.path) for file in source.visuals or source.pieces]
-    whole: Any = trimesh.util.concatenate(meshes)
-    return whole if len(whole.faces) <= _MOST_FACES else whole.simplify_quadric_decimation(face_count=_MOST_FACES)
+def mesh_of_file(source: Source) -> trimesh.Trimesh | None:
+    """The surface of an object's files as they are, in their own unit; None where reading it twice takes too long."""
+    files = [file.path for file in source.visuals or source.pieces]
+    if sum(path.stat().st_size for path in files) > _LARGE_FILE:
+        return None
+    whole: Any = trimesh.util.concatenate([read_mesh(path) for path in files])
+    return whole if len(whole.faces) <= MAX_FACES else whole.simplify_quadric_decimation(face_count=MAX_FACES)
 
 
-def _beside(hand: Hand, meshes: list[tuple[np.ndarray, np.ndarray, tuple[float, float, float]]]) -> list[Shape]:
+def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
     """Meshes that stand at height zero, and the open hand, upright, beside them."""
-    points = np.concatenate([vertices for vertices, _, _ in meshes])
+    points = np.concatenate([vertices for vertices, _, _ in bodies])
     low, high = points.min(0), points.max(0)
     middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     shapes = [
-        Shape("mesh", (0, 0, 0), colour, vertices=vertices - middle, faces=faces) for vertices, faces, colour in meshes
+        Shape("mesh", (0, 0, 0), colour, vertices=vertices - middle, faces=faces) for vertices, faces, colour in bodies
     ]
     turn = upright(hand)
     standing = posed_hand(hand, hand.q_open, np.zeros(3), turn, SKIN)

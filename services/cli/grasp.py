@@ -25,7 +25,7 @@ def grasp(
     pictures: bool = True,
     policy: pathlib.Path | None = None,
     hand: str = "human",
-    tries: int = 32,
+    tries: int = 16,
     seed: int = 0,
     again: bool = False,
     options: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
