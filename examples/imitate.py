@@ -57,10 +57,11 @@ def main(arguments: Arguments) -> None:
     for row in report.dropped:
         print(f"dropped: {row['sequence']}: {row['reason']}")
     for obj, constraints in zip(objects, sets, strict=True):
+        fitting = obj.scaled(constraints.meta["object_scale"])
         heading = constraints.arrays["heading/direction"][0, 0]
-        at = constraints.arrays["heading/position"][0, 0] - obj.origin
+        at = constraints.arrays["heading/position"][0, 0] - fitting.origin
         done = grasp(
-            obj,
+            fitting,
             heading=" ".join(map(str, heading)),
             at=" ".join(map(str, at)),
             affordance=",".join(np.array(obj.part_names)[obj.graspable]) if not obj.graspable.all() else "",

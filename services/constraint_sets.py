@@ -44,14 +44,23 @@ _MEANING = {
 }
 
 
-def make_sets(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> list[Message]:
+def make_sets(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, taskset: TaskSet | None = None
+) -> list[Message]:
     """The constraint set of each object, as training and evaluation make it.
+
+    Args:
+      hand: the hand.
+      task: geometry of the approach.
+      objects: the objects.
+      seed: of the constraints.
+      taskset: of these objects in the hand's size, where it is there already; its reference poses are kept.
 
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
     fitting = sized(hand, task, objects)
-    taskset = TaskSet(*(np.asarray(field) for field in build_taskset(hand, task, fitting, seed)))
+    taskset = TaskSet(*(np.asarray(field) for field in taskset or build_taskset(hand, task, fitting, seed)))
     scale = object_scale(hand, task)
     return [
         set_of(

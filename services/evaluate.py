@@ -150,6 +150,24 @@ class Evaluator:
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
 
+    def references(self, share: float, progress: Callable[[int], None] = lambda done: None) -> TaskSet:
+        """The task set with reference poses and trajectories from the policy's own grasps under headings.
+
+        Args:
+          share: of the places for references on the whole surface that should be filled.
+          progress: is told how many batches of episodes there are.
+        """
+        with self._worker(mixture(self.task, ["heading", "affordance"]), self._batch) as worker:
+            worker.forget_references()
+            for batch in range(_PATIENCE):
+                worker.restart()
+                worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
+                worker.renew_references()
+                progress(batch + 1)
+                if np.asarray(worker.taskset.pose_valid)[:, 0].any(1).mean() >= share:
+                    break
+            return TaskSet(*(np.asarray(field) for field in worker.taskset))
+
     def rows_under_noise(self, progress: Callable[[int], None], episodes: int) -> list[Row]:
         """A row for each of `services.noise.LEVELS`; see there. The same references are disturbed in all of them.
 

@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -15,14 +15,17 @@ from common.objects.spec import GraspObject
 from services.cli.constraints_import import ConstraintsImport
 
 _console = Console(highlight=False)
+_FILLED = 0.9
+"""Share of the places for reference poses that a policy's grasps should fill."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ConstraintsGenerate:
     """Makes the constraint sets of objects and writes one file each, which says what its arrays mean.
 
-    For the whole surface and for the graspable region O+: 256 headings by the paper's rules, reference poses that
-    close the hand around the object, and wrist trajectories that end at them.
+    For the whole surface and for the graspable region O+: 256 headings by the paper's rules, 20 reference poses, and
+    wrist trajectories that end at them, from 15 to 25 cm away, replayed through the wrist's controller. 80 % of them
+    are for training, and the others are held out.
     """
 
     objects: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -35,6 +38,11 @@ class ConstraintsGenerate:
     """Seed of the first of them; the others follow."""
     hand: str = "human"
     """Name of the hand."""
+    references: Literal["closed", "policy"] = "closed"
+    """closed: poses that close the hand around the object; policy: final states of a policy's grasps under headings, as
+    in the paper. Places that the policy does not fill are not allowed."""
+    policy: pathlib.Path | None = None
+    """Policy file for its references; by default the hand's, which comes with the package."""
     folder: str = "objects"
     """Folder of objects."""
     out: pathlib.Path = pathlib.Path("constraints")
@@ -56,10 +64,27 @@ class ConstraintsGenerate:
             objects = [obj for text in self.objects for obj in _find(text, self.folder)]
             objects += generate_many(self.count, self.first_seed, self.families)
             status.update(f"Making the constraints of {len(objects)} objects")
-            for constraints in make_sets(hand, TaskConfig(hand=hand.name), objects, self.seed):
+            task, taskset = TaskConfig(hand=hand.name), None
+            if self.references == "policy":
+                taskset = self._grasped(objects, lambda done: status.update(f"Grasping: {done} batches of episodes"))
+            for constraints in make_sets(hand, task, objects, self.seed, taskset):
                 save(constraints, self.out)
         _console.print(f"The constraint sets of {len(objects)} objects are in {escape(str(self.out))}.")
         return 0
+
+    def _grasped(self, objects: list[GraspObject], progress: Callable[[int], None]) -> Any:
+        """The task set with references from a policy's grasps."""
+        import os
+
+        from common.policy import bundle as bundles
+        from common.policy.shipped import policy_file
+        from services.evaluate import Evaluator
+
+        bundle = bundles.load(policy_file(self.policy, self.hand))
+        if bundle.spec.hand != self.hand:
+            raise CongraspError(f"The policy is for the hand '{bundle.spec.hand}'.", f"Set --hand {bundle.spec.hand}.")
+        evaluator = Evaluator(bundle, objects, threads=os.cpu_count() or 1, seed=self.seed)
+        return evaluator.references(_FILLED, progress)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,14 +18,16 @@ from common.errors import CongraspError
 from common.hands.human import HUMAN
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
+from common.objects import store
 from common.objects.affordance import near_points, relabelled, two_parts
 from common.objects.meshes import UNLABELLED
+from common.objects.pool import object_scale
 from common.objects.spec import GraspObject
 from common.wire.codec import Message
 from services.constraint_sets import set_of
 from services.importers.extract import BEYOND, Demonstration, Surface, extract
 from services.importers.fit import joint_positions
-from services.importers.objects import load_object, scaled
+from services.importers.objects import load_object
 from services.importers.sequence import Dropped, Sequence
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
@@ -201,15 +203,15 @@ def _nearest(clouds: list[np.ndarray], points: np.ndarray) -> np.ndarray:
 
 
 def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) -> tuple[GraspObject, Message]:
-    """The object at the hand's scale, and its constraint set."""
+    """The object, and its constraint set in the size in which the hand grasps it."""
     task = TaskConfig(hand=hand.name, trajectory_points=options.waypoints)
     obj, demonstrations, seed = group.obj, group.demonstrations, (options.seed, number)
+    factor = object_scale(hand, task)
+    fitting = obj.scaled(factor)
     given = _headings(demonstrations) if options.headings == "demonstrated" else None
     if hand is not HUMAN:
-        factor = hand.object_scale
-        obj = scaled(obj, factor)
         given = given and given._replace(position=np.float32(factor) * given.position)
-        taskset = build_taskset(hand, task, [obj], options.seed, [given])
+        taskset = build_taskset(hand, task, [fitting], options.seed, [given])
         row = TaskSet(*(np.asarray(field)[0] for field in taskset))
     else:
         fields = headings_of(task, obj, seed, given)
@@ -230,8 +232,13 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
             trajectory_quaternion=_twice(quaternion),
             pose_valid=np.stack([clear.T, (clear & nearer[:, None]).T]),
         )
-    about = {"source": source, "demonstrations": [demonstration.name for demonstration in demonstrations]}
-    return obj, set_of(hand, row, obj, options.seed, about)
+    about = {
+        "source": source,
+        "demonstrations": [demonstration.name for demonstration in demonstrations],
+        "object_scale": factor,
+        "object_digest": store.digest(obj),
+    }
+    return obj, set_of(hand, row, fitting, options.seed, about)
 
 
 def _twice(values: np.ndarray) -> np.ndarray:

@@ -3,8 +3,6 @@
 import dataclasses
 import pathlib
 
-import numpy as np
-
 from common.errors import CongraspError
 from common.objects.meshes import ImportOptions, import_source
 from common.objects.sources import SUFFIXES, find_sources
@@ -66,34 +64,3 @@ def load_object(mesh: pathlib.Path, name: str) -> GraspObject:
         raise CongraspError(f"{mesh} holds {len(sources)} objects.", "Name the folder of one, or its file.")
     obj, _ = import_source(dataclasses.replace(sources[0], name=name), ImportOptions(unit="m"))
     return obj
-
-
-def scaled(obj: GraspObject, factor: float) -> GraspObject:
-    """The object `factor` times as large about its centre of mass, with the same mass."""
-    if factor == 1.0:
-        return obj
-
-    def larger(vector: tuple[float, float, float]) -> tuple[float, float, float]:
-        return vector[0] * factor, vector[1] * factor, vector[2] * factor
-
-    pieces = tuple(
-        dataclasses.replace(
-            piece,
-            size=larger(piece.size),
-            pos=larger(piece.pos),
-            vertices=None if piece.vertices is None else piece.vertices * factor,
-        )
-        for piece in obj.pieces
-    )
-    rest = obj.rest_poses.copy()
-    rest[:, :3] *= factor
-    return dataclasses.replace(
-        obj,
-        pieces=pieces,
-        inertia=obj.inertia * factor**2,
-        points=obj.points * np.float32(factor),
-        rest_poses=rest,
-        visual_vertices=obj.visual_vertices * np.float32(factor),
-        origin=larger(obj.origin),
-        file_scale=factor * obj.file_scale,
-    )

@@ -90,7 +90,9 @@ def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypat
 def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
-        constraint_sets, "make_sets", lambda hand, task, objects, seed: made.extend(obj.name for obj in objects) or []
+        constraint_sets,
+        "make_sets",
+        lambda hand, task, objects, seed, taskset: made.extend(obj.name for obj in objects) or [],
     )
     store.Catalogue(tmp_path / "objects").add(OBJECTS[1])
     folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]

@@ -77,6 +77,28 @@ def test_the_same_references_are_disturbed_in_every_row(taskset, monkeypatch, tm
             np.testing.assert_array_equal(getattr(seen, name), getattr(expected, name))
 
 
+def test_references_are_renewed_until_their_places_are_filled(taskset, monkeypatch):
+    config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
+    evaluator = Evaluator(untrained(config), OBJECTS, taskset=taskset)
+    worker, told = mock.Mock(taskset=taskset), []
+
+    def forget():
+        worker.taskset = taskset._replace(pose_valid=np.zeros_like(taskset.pose_valid))
+
+    def renew():
+        valid = np.array(worker.taskset.pose_valid)
+        valid[:, 0, 0, valid[0, 0].any(0).sum()] = True
+        worker.taskset = taskset._replace(pose_valid=valid)
+
+    worker.forget_references.side_effect, worker.renew_references.side_effect = forget, renew
+    monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
+    made = evaluator.references(0.5, told.append)
+    assert told == list(range(1, 11)) and made.pose_valid[:, 0].any(1).sum() == 20  # ten of twenty on two objects
+    sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 0, made)
+    assert [int(one.arrays["pose/allowed"][0].any(0).sum()) for one in sets] == [10, 10]
+    np.testing.assert_array_equal(sets[0].arrays["pose/q"], taskset.pose_q[0])
+
+
 def test_curves_show_every_kind_of_noise(tmp_path):
     errors = {"pose_rad": 0.1, "pose_m": 0.01, "traj_rad": 0.1, "traj_m": 0.01}
     row = mock.Mock(success=0.9, success_low=0.8, success_high=0.95, errors=errors)
