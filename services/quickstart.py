@@ -26,7 +26,7 @@ from services.access import check_training
 from services.client import PolicyClient
 from services.evaluate import Evaluator
 from services.load import example_episode, one_answer, serving, wait_until_ready
-from services.presets import easier
+from services.presets import PRESETS, easier
 from services.render import episode_sheet
 from services.scores import Row
 from services.sheets import save_png
@@ -90,8 +90,9 @@ def run_training(
         soft_wrap=True,
     )
     if words := easier(config):
+        preset = f"--preset {config.task.hand if config.task.hand in PRESETS else 'human'}"
         console.print(
-            f"Easier than the full task: {'; '.join(words)}.\nThe full task is --preset human, for a GPU.",
+            f"Easier than the full task: {'; '.join(words)}.\nThe full task is {preset}, for a GPU.",
             soft_wrap=True,
         )
     with on_signal() as stop:
