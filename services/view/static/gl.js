@@ -101,9 +101,9 @@ export class Renderer {
   // Told how long a picture took while something moves: without a graphics card fewer pixels are drawn until it is fast.
   pace(milliseconds, slowest) {
     if (!this.software) return;
-    this.mean += 0.1 * (milliseconds - this.mean);
+    this.mean += 0.2 * (milliseconds - this.mean);
     if (this.mean > 0.85 * slowest && this.coarse > 0.45) {
-      this.coarse *= 0.9;
+      this.coarse = Math.max(0.45, 0.8 * this.coarse);
       this.mean = 0.7 * slowest;
     }
   }

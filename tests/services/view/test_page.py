@@ -186,7 +186,8 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
     assert [item.get_attribute("data-lane") for item in opened.locator("#lanes [data-lane]").all()] == [
         "contact", "heading",
     ]  # fmt: skip
-    opened.click("#play")  # pauses
+    opened.select_option("#speed", "1")
+    opened.wait_for_selector("#play:has-text('Play')")  # it has come to its end
     opened.locator("#scrub").fill("0")
     first = picture(opened)
     # The lanes are clicked at their end: the hand has closed, the table is gone, and the heading is met.
