@@ -26,7 +26,7 @@ OBJECT = "object.png"
 """Pictures of the object before and after its import."""
 
 
-_SMALL = (320, 240)
+_SMALL, _VIDEO = (320, 240), (480, 360)  # pixels
 
 
 def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: bool, about: dict[str, Any]) -> None:
@@ -53,7 +53,7 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
         save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera, quick=True))
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera, quick=True)))
     if video:
-        save_episode_video(folder / VIDEO, episode, camera=camera)
+        save_episode_video(folder / VIDEO, episode, _VIDEO, camera)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 
 
