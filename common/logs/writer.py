@@ -118,7 +118,12 @@ class LogWriter:
             self._path = self._directory / f"{self._name}-{stamp}-{self._number:03d}.mcap{PART}"
             self._number += 1
             with contextlib.suppress(FileExistsError):  # another recorder's
-                self._file = self._open_file(self._path)
+                file = self._open_file(self._path)
+                if not self._path.with_suffix("").exists():
+                    self._file = file
+                else:  # that of another recorder of this second, which is finished
+                    file.close()
+                    self._path.unlink()
         self._first = time
         self._writer = Writer(self._file, CHUNK, CompressionType.ZSTD, _INDEXES)
         self._channels: dict[Channel, int] = {}

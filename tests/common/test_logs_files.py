@@ -109,6 +109,13 @@ def test_two_writers_in_one_folder_take_different_names(tmp_path: pathlib.Path) 
     assert len(log_files(tmp_path)) == 2 and not set(first.files) & set(second.files)
 
 
+def test_a_writer_leaves_the_finished_file_of_the_same_second_alone(tmp_path: pathlib.Path) -> None:
+    first, second = write(tmp_path, metric_entries(2)), write(tmp_path, metric_entries(1))
+    assert first != second
+    assert updates(first[0]) == [0, 1] and updates(second[0]) == [0]
+    assert sorted(tmp_path.iterdir()) == sorted([*first, *second])
+
+
 def test_episodes_come_back_as_they_were_sent(tmp_path: pathlib.Path) -> None:
     channel = opaque_channel("/episode/a0/raw", "congrasp.Episode")
     write(tmp_path, [*metric_entries(3), Entry(channel, SECOND, encode(episode()))])

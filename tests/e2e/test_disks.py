@@ -12,7 +12,7 @@ import pytest
 
 from common.errors import CongraspError
 from common.journal import AUDIT, Journal, read_journal
-from common.logs.reader import read_metrics, read_records
+from common.logs.reader import read_metrics
 from common.logs.recorder import Recorder
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
@@ -72,7 +72,7 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
 
         def on_update(values):
             if values["update"] == 4:
-                eventually(lambda: recorder.files and list(read_records(recorder.files[0])))
+                eventually(lambda: recorder.files and "learner/0/kl" in read_metrics(run_dir))
                 filler.append(fill(disk))
             if values["update"] == 8:
                 eventually(lambda: publish_noise(transport) or recorder.error)

@@ -33,4 +33,4 @@ def test_the_picture_has_a_row_for_each_constraint_and_counts_the_successes(monk
 def _policy():
     import types
 
-    return types.SimpleNamespace(version=3, spec=types.SimpleNamespace(hand="human"))
+    return types.SimpleNamespace(version=3, spec=types.SimpleNamespace(hand_name="human"))
