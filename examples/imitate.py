@@ -17,11 +17,11 @@ import tyro
 from common.hands import get_hand
 from common.hands.mano import read_mano
 from common.logs.motion import save_motion
-from services.grasp import grasp
+from services.grasping.grasp import grasp
 from services.importers.build import Options, import_sets
 from services.importers.objects import Meshes
-from services.render import episode_sheet
-from services.sheets import save_png
+from services.pictures.render import episode_sheet
+from services.pictures.sheets import save_png
 
 
 @dataclasses.dataclass

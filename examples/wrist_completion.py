@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from common.logs.motion import save_motion
 from services.cli.objects import find_object
-from services.grasp import grasp
+from services.grasping.grasp import grasp
+from services.grasping.wrist_paths import read_wrist_path
 from services.importers.extract import Surface, approach
-from services.render import episode_sheet
-from services.sheets import save_png
-from services.wrist_paths import read_wrist_path
+from services.pictures.render import episode_sheet
+from services.pictures.sheets import save_png
 
 
 @dataclasses.dataclass

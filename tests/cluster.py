@@ -23,13 +23,14 @@ from actors.link import ActorLink, RunFinished, RunRestarted
 from common.errors import TransportError
 from common.journal import AUDIT, Journal
 from common.transport.keys import FLOWS, Keys
+from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 from common.wire.messages import RolloutForm
 from learner.audit import AuditLog
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
-from services.audit import FAULTS, audit
+from services.operations.audit import FAULTS, audit
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 KEYS = Keys("chaos")
@@ -167,7 +168,7 @@ class Cluster:
 
     def __init__(self, folder):
         self.folder = folder
-        self.port = base_port()
+        self.port = free_port()
         self.endpoint = f"tcp/127.0.0.1:{self.port}"
         self.checkpoint = folder / "checkpoint"
         self.options = {}
@@ -253,7 +254,7 @@ class Proxy:
 
     def __init__(self, port):
         """Forwards to the learner's ports, from `endpoint` on."""
-        first = base_port()
+        first = free_port()
         self.endpoint = f"tcp/127.0.0.1:{first}"
         self.bytes_per_second = float("inf")
         self._open, self._ended = threading.Event(), threading.Event()
@@ -298,16 +299,6 @@ class Proxy:
         for one in (source, sink):
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
-
-
-def base_port():
-    while True:
-        base = random.randrange(15000, 30000)
-        with contextlib.suppress(OSError):
-            for port in range(base, base + len(FLOWS)):
-                with socket.socket() as probe:
-                    probe.bind(("127.0.0.1", port))
-            return base
 
 
 if __name__ == "__main__":

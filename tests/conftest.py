@@ -5,8 +5,6 @@ import os
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import pathlib
-import socket
-from collections.abc import Callable
 
 import pytest
 from hypothesis import settings
@@ -26,15 +24,3 @@ def shared_objects() -> pathlib.Path:
     if not folder.is_dir():
         pytest.skip("the scanned objects are not here (../shared/objects)")
     return folder
-
-
-@pytest.fixture
-def free_port() -> Callable[[], int]:
-    """A function that names a TCP port of the loopback interface that nobody listens on."""
-
-    def find() -> int:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            return probe.getsockname()[1]
-
-    return find

@@ -39,10 +39,10 @@ def actor(
     from common.journal import Journal
     from common.transport.keys import process_name
     from common.transport.zenoh_transport import ZenohTransport
-    from services.access import acting
-    from services.logs import say
-    from services.metrics import ActorMetrics
-    from services.shutdown import on_signal
+    from services.operations.access import acting
+    from services.operations.logs import say
+    from services.operations.metrics import ActorMetrics
+    from services.operations.shutdown import on_signal
 
     credentials, name = acting(certs, id or process_name("actor"))
     metrics = ActorMetrics()

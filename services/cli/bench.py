@@ -16,7 +16,7 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
       repeats: Measurements of each, alternating; medians and their ratio are printed, and the ratio of the best.
       engines: Engines to measure; those that the machine is made for if none is named.
     """
-    from services import bench
+    from services.bench import physics as bench
 
     bench.bench_physics(environments, threads or bench.cores(), repeats, list(engines) or bench.engines())  # type: ignore[arg-type]
     return 0
@@ -34,10 +34,10 @@ def query(repeat: int = 1000, concurrency: int = 1) -> int:
     import tempfile
 
     from common.policy import bundle as bundles
-    from services.client import PolicyClient
-    from services.load import example_episode, measure, processor_seconds, serving, wait_until_ready
-    from services.presets import get_preset
-    from services.quickstart import untrained
+    from services.serving.client import PolicyClient
+    from services.serving.load import example_episode, measure, processor_seconds, serving, wait_until_ready
+    from services.training.presets import get_preset
+    from services.training.quickstart import untrained
 
     with tempfile.TemporaryDirectory() as folder:
         policy = pathlib.Path(folder, "policy.safetensors")
@@ -66,7 +66,7 @@ def shutdown(tries: int = 100, within: float = 45.0, seed: int = 0) -> int:
     """
     from rich.progress import track
 
-    from services.drain import Try, attempts, summary
+    from services.bench.drain import Try, attempts, summary
 
     results: list[Try] = []
     try:
@@ -89,7 +89,7 @@ def security(repeats: int = 5) -> int:
     Args:
       repeats: Measurements of each, alternating; medians are printed.
     """
-    from services.bench_security import measure
+    from services.bench.security import measure
 
     found = measure(repeats)
     plain, secure, flooded = (found[f"{name}_mb_per_s"] for name in ("plain", "secure", "flood"))
@@ -113,7 +113,7 @@ def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: 
       actors: Actor processes that wait for weights.
       versions: Publications of weights, four a second.
     """
-    from services.bench_transport import measure_ingest, measure_weights
+    from services.bench.transport import measure_ingest, measure_weights
 
     ours, bare = measure_ingest(senders, seconds, repeats)
     print(
@@ -135,7 +135,7 @@ def staleness(lag: int = 4, seeds: int = 5, updates: int = 40, worlds: int = 32)
       updates: Updates of each training.
       worlds: Episodes in one update.
     """
-    from services.bench_staleness import bench_staleness
+    from services.bench.staleness import bench_staleness
 
     bench_staleness(lag, seeds, updates, worlds)
     return 0
@@ -148,7 +148,7 @@ def faults(actors: int = 3, repeats: int = 3) -> int:
       actors: Actor processes.
       repeats: How often each is killed.
     """
-    from services.bench_faults import bench_faults
+    from services.bench.faults import bench_faults
 
     bench_faults(actors, repeats)
     return 0
@@ -162,7 +162,7 @@ def recording(actors: int = 2, seconds: float = 20.0, turns: int = 3) -> int:
       seconds: Length of a turn.
       turns: Turns of each kind.
     """
-    from services.bench_recording import bench_recording
+    from services.bench.recording import bench_recording
 
     bench_recording(actors, seconds, turns)
     return 0
@@ -195,8 +195,8 @@ def scaling(
     """
     import dataclasses
 
-    from services.presets import get_preset
-    from services.scaling import bench_scaling
+    from services.bench.scaling import bench_scaling
+    from services.training.presets import get_preset
 
     config = get_preset(preset)
     config = dataclasses.replace(config, physics=physics, environments=environments or config.environments)

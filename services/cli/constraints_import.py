@@ -57,7 +57,7 @@ class ConstraintsImport:
         from common.files import write_atomically
         from common.hands import get_hand
         from common.objects.store import Catalogue
-        from services.constraint_sets import save
+        from services.grasping.constraint_sets import save
         from services.importers.build import Options, import_sets
 
         if not self.path.exists():

@@ -70,9 +70,9 @@ def evaluate(
     from common.objects.pool import HELD_OUT_SEED
     from common.policy import bundle as bundles
     from common.policy.shipped import policy_file
-    from services.noise import LEVELS
-    from services.objects import objects_of
-    from services.scores import TABLES, tables_of, write_json
+    from services.evaluation.noise import LEVELS
+    from services.evaluation.scores import TABLES, tables_of, write_json
+    from services.grasping.objects import objects_of
 
     for name, value, least in (("episodes", episodes, 1), ("pool", pool, 0), ("batch", batch, 0), ("seed", seed, 0)):
         if value < least:
@@ -121,13 +121,13 @@ def evaluate(
         }
         write_json(rows, json, about)
     if pictures is not None and noisy:
-        from services.noise_sheet import draw_noise
+        from services.pictures.noise_sheet import draw_noise
 
         title = f"{loaded.spec.hand_name} hand, version {loaded.version}: {episodes} episodes a level"
         draw_noise(evaluator, noisy, pictures, title)
         console.print(f"Curves and examples of noisy references are drawn in {pictures}.", soft_wrap=True)
     if pictures is not None and names:
-        from services.failures import failure_sheet
+        from services.evaluation.failures import failure_sheet
 
         for name in names:
             failure_sheet(evaluator, loaded, name, pictures / f"{name}.png", _PICTURED, _PICTURED)
@@ -139,7 +139,7 @@ def _captured(
     folder: pathlib.Path, split: Split, given: "list[GraspObject] | None", objects: pathlib.Path | None
 ) -> "tuple[list[GraspObject], TaskSet]":
     """The objects that have a constraint set in a folder, and the task set of their sets."""
-    from services.constraint_sets import load_for, taskset_of
+    from services.grasping.constraint_sets import load_for, taskset_of
 
     if given is None:
         raise CongraspError("--constraints needs the sets' objects.", "Name their folder with --objects.")
@@ -161,7 +161,7 @@ def _evaluator(
 
     from common.config import ObjectsConfig
     from common.objects.pool import HELD_OUT_SEED, load_pool
-    from services.evaluate import Evaluator, two_seconds
+    from services.evaluation.evaluate import Evaluator, two_seconds
 
     track("Making constraints", None)
     return Evaluator(
@@ -185,7 +185,7 @@ def _object_rows(
     import os
 
     from common.objects.pool import HELD_OUT_SEED
-    from services.unseen import POOL, evaluate_objects, procedural_pools
+    from services.evaluation.unseen import POOL, evaluate_objects, procedural_pools
 
     pools = iter([given]) if given else procedural_pools(pool, HELD_OUT_SEED)
     number = 1 if given else -(-pool // POOL)

@@ -62,8 +62,8 @@ def grasp(
 
     from common.policy import bundle as bundles
     from common.policy.shipped import policy_file
-    from services.grasp import Grasper
-    from services.grasp_jobs import SHEET, Result, Settings, find_jobs, run_job, save_summary
+    from services.grasping.grasp import Grasper
+    from services.grasping.jobs import SHEET, Result, Settings, find_jobs, run_job, save_summary
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")

@@ -33,9 +33,9 @@ def query(
     import json as json_module
 
     from common.errors import CongraspError
-    from services.access import credentials
-    from services.client import PolicyClient
-    from services.load import example_episode, measure, one_answer
+    from services.operations.access import credentials
+    from services.serving.client import PolicyClient
+    from services.serving.load import example_episode, measure, one_answer
 
     if repeat < 1 or concurrency < 1:
         raise CongraspError(f"--repeat {repeat} and --concurrency {concurrency} must be at least 1.")

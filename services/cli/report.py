@@ -12,8 +12,8 @@ from common.errors import CongraspError
 
 if TYPE_CHECKING:
     from common.policy.bundle import PolicyBundle
-    from services.evaluate import Evaluator
-    from services.report import Picture
+    from services.evaluation.evaluate import Evaluator
+    from services.evaluation.report import Picture
 
 _POOL = 64
 _PICTURED = 4
@@ -51,10 +51,10 @@ def report(
     from common.policy import bundle as bundles
     from common.policy.shipped import policy_file
     from learner.run_directory import POLICY_FILE
-    from services.evaluate import Evaluator, two_seconds
-    from services.objects import objects_of
-    from services.report import Made, write_report
-    from services.scores import TABLES
+    from services.evaluation.evaluate import Evaluator, two_seconds
+    from services.evaluation.report import Made, write_report
+    from services.evaluation.scores import TABLES
+    from services.grasping.objects import objects_of
 
     for name, value in (("episodes", episodes), ("pool", pool)):
         if value < 1:
@@ -103,8 +103,8 @@ def report(
 def _curves(run_dir: pathlib.Path) -> "Iterator[Picture]":
     """Figures of a run's recordings, if it has any."""
     from common.logs.reader import read_metrics
-    from services.plot import draw, figures
-    from services.report import Picture
+    from services.evaluation.report import Picture
+    from services.pictures.plots import draw, figures
 
     if any(run_dir.rglob("*.mcap")):
         series = read_metrics(run_dir)
@@ -113,8 +113,8 @@ def _curves(run_dir: pathlib.Path) -> "Iterator[Picture]":
 
 
 def _sheet(evaluator: "Evaluator", policy: "PolicyBundle", constraint: str) -> "Iterator[Picture]":
-    from services.failures import failure_sheet
-    from services.report import Picture, causes_in_words
+    from services.evaluation.failures import failure_sheet
+    from services.evaluation.report import Picture, causes_in_words
 
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder, "sheet.png")

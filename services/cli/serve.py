@@ -37,11 +37,11 @@ def serve(
     from common.policy.shipped import policy_file
     from common.transport.keys import Keys
     from common.transport.zenoh_transport import ZenohTransport
-    from services.access import listening
-    from services.logs import say
-    from services.metrics import ServerMetrics
-    from services.server import PolicyServer, follow_file, follow_run
-    from services.shutdown import on_signal
+    from services.operations.access import listening
+    from services.operations.logs import say
+    from services.operations.metrics import ServerMetrics
+    from services.operations.shutdown import on_signal
+    from services.serving.server import PolicyServer, follow_file, follow_run
 
     if policy is not None and connect:
         raise CongraspError(

@@ -30,7 +30,7 @@ def view(
       insecure: Offer the page beyond loopback.
       certs: Folder of an observer's certificate (congrasp certs), for --connect.
     """
-    from services.shutdown import on_signal
+    from services.operations.shutdown import on_signal
     from services.view.app import open_view
 
     with (

@@ -11,7 +11,7 @@ import numpy as np
 from common.errors import CongraspError
 from common.logs.motion import GraspMotion, load_motion, motion_of_episode
 from services.export.frames import TOLERANCE_MM, error_mm
-from services.render import pick_episode
+from services.pictures.render import pick_episode
 
 FORMATS = {
     "glb": ".glb",
@@ -37,7 +37,7 @@ _UNIT = 1e-3
 
 
 def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:
-    """The motion of an NPZ file, or one of the episodes recorded at `path` (see `services.render.pick_episode`)."""
+    """The motion of an NPZ file, or one of the episodes recorded at `path` (see `pictures.render`)."""
     if not path.exists():
         raise CongraspError(f"There is no {path}.", "Name a motion (.npz), a recording (.mcap) or a run's folder.")
     if path.suffix == ".npz":

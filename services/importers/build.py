@@ -24,7 +24,7 @@ from common.objects.meshes import UNLABELLED
 from common.objects.pool import object_scale
 from common.objects.spec import GraspObject
 from common.wire.codec import Message
-from services.constraint_sets import set_of
+from services.grasping.constraint_sets import set_of
 from services.importers.extract import BEYOND, Demonstration, Surface, extract
 from services.importers.fit import joint_positions
 from services.importers.objects import load_object

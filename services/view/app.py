@@ -15,9 +15,9 @@ from common.objects.spec import GraspObject
 from common.policy.shipped import policy_file, shipped_hands
 from common.transport.security import check_exposure
 from common.transport.zenoh_transport import ZenohTransport
-from services.access import credentials
-from services.logs import say
-from services.server import follow_file, follow_run
+from services.operations.access import credentials
+from services.operations.logs import say
+from services.serving.server import follow_file, follow_run
 from services.view.grasping import PolicyGrasping
 from services.view.recordings import Recordings
 from services.view.server import PageServer

@@ -15,8 +15,8 @@ from common.errors import CongraspError, TransportError
 from common.hands import get_hand
 from common.task.types import Goal, Surface
 from common.wire.codec import Message
-from services.grasp import costs
-from services.server import Source
+from services.grasping.grasp import costs
+from services.serving.server import Source
 from services.view.jobs import Progress
 from services.view.state import OPTIONAL, Asked
 
@@ -26,7 +26,7 @@ HOLD_SECONDS = 2.0
 _ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
 """How far the others are from what was drawn: m, rad, rad (one standard deviation)."""
 _OTHER = 2.0
-"""What it costs not to be the one that was drawn, beside the costs of `services.grasp`."""
+"""What it costs not to be the one that was drawn, beside the costs of `services.grasping.grasp`."""
 
 
 class PolicyGrasping:

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from common.errors import CongraspError
-from services.logs import say
+from services.operations.logs import say
 
 Progress = Callable[[str, float], None]
 """(what is being done, how much of it is done from 0 to 1)."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from common.errors import CongraspError, TransportError
 from common.wire.codec import Message, encode
-from services.logs import say
+from services.operations.logs import say
 
 STATIC = pathlib.Path(__file__).with_name("static")
 MOST_BYTES = 128 << 20

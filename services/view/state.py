@@ -22,8 +22,8 @@ from common.objects.shapes import matrix
 from common.objects.spec import GraspObject
 from common.task.types import MASKS, Goal, Surface, first
 from common.wire.codec import Message
-from services.constraint_sets import make_sets
-from services.grasp import with_minus
+from services.grasping.constraint_sets import make_sets
+from services.grasping.grasp import with_minus
 
 OPTIONAL = ("affordance", "pose", "trajectory")
 """Constraints that can be asked for; the heading always is."""

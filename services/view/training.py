@@ -21,7 +21,7 @@ from common.logs.reader import Record, log_files, read_records
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, decode
-from services import status as statuses
+from services.operations import status as statuses
 from services.view.recordings import is_episode
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")

@@ -6,7 +6,7 @@ import pytest
 
 from common.config import CurriculumConfig, RewardWeights, RunConfig, run_config_from_json, to_json
 from common.errors import CongraspError
-from services.presets import PRESETS
+from services.training.presets import PRESETS
 
 
 @pytest.mark.parametrize("name", PRESETS)

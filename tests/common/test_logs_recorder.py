@@ -19,8 +19,9 @@ from common.logs.channels import Entry
 from common.logs.reader import is_complete, log_files, read_episodes, read_metrics, read_records, read_rollouts
 from common.logs.recorder import Recorder
 from common.logs.writer import LogWriter
-from common.transport.keys import FLOWS, Keys
+from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
+from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 from tests.episodes import episode
@@ -154,17 +155,6 @@ def test_files_rotate_while_recording(transport: MemoryTransport, tmp_path: path
     assert len(recorder.files) == 3 and all(is_complete(path) for path in recorder.files)
 
 
-def free_endpoint(free_port: Callable[[], int]) -> str:
-    """An endpoint with free ports above it, one for each flow."""
-    for _ in range(50):
-        try:
-            ZenohTransport(listen=[endpoint := f"tcp/127.0.0.1:{free_port()}"], flows=FLOWS).close()
-            return endpoint
-        except Exception:
-            continue
-    raise AssertionError("no free ports")
-
-
 def start_recorder(endpoint: str, out: pathlib.Path, *options: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "services.cli.main", "record", "--connect", endpoint, "--run", "r"]
     return subprocess.Popen(
@@ -190,7 +180,7 @@ def recorded(out: pathlib.Path) -> int:
     return sum(len(list(read_records(path))) for path in log_files(out)) if out.exists() and any(out.iterdir()) else 0
 
 
-def test_another_process_records_over_zenoh_until_ctrl_c(free_port: Callable[[], int], tmp_path: pathlib.Path) -> None:
+def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path: pathlib.Path) -> None:
     endpoint = free_endpoint(free_port)
     with ZenohTransport(listen=[endpoint]) as transport:
         process = start_recorder(endpoint, tmp_path / "out")
@@ -209,9 +199,7 @@ def test_another_process_records_over_zenoh_until_ctrl_c(free_port: Callable[[],
     assert "messages recorded" in errors and "Traceback" not in errors
 
 
-def test_a_killed_recorder_leaves_a_readable_file_and_the_run_goes_on(
-    free_port: Callable[[], int], tmp_path: pathlib.Path
-) -> None:
+def test_a_killed_recorder_leaves_a_readable_file_and_the_run_goes_on(tmp_path: pathlib.Path) -> None:
     endpoint = free_endpoint(free_port)
     with ZenohTransport(listen=[endpoint]) as transport:
         process = start_recorder(endpoint, tmp_path / "out")
@@ -244,7 +232,7 @@ def doctor(path: pathlib.Path) -> set[str]:
     return set(re.findall(r"\b[A-Z]+(?:_[A-Z]+)+\b", said))
 
 
-def test_a_stopped_recorder_holds_nobody_up(free_port: Callable[[], int], tmp_path: pathlib.Path) -> None:
+def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:
     """Twenty megabytes are published at it, more than it may keep; when it goes on, it says how much it missed."""
     endpoint = free_endpoint(free_port)
     big, big_size = Message({"x": np.zeros(250_000, np.float32)}, {"actor": "a"}), 1_000_000
@@ -274,7 +262,7 @@ def test_a_stopped_recorder_holds_nobody_up(free_port: Callable[[], int], tmp_pa
     assert sum(size >= big_size for size in sizes()) + int(found[1]) >= 20 and int(found[1]) > 0
 
 
-def test_a_recorder_without_a_run_says_so(free_port: Callable[[], int], tmp_path: pathlib.Path) -> None:
+def test_a_recorder_without_a_run_says_so(tmp_path: pathlib.Path) -> None:
     process = start_recorder(f"tcp/127.0.0.1:{free_port()}", tmp_path / "out", "--duration", "1")
     try:
         _, errors = process.communicate(timeout=40)

@@ -1,6 +1,5 @@
 """Both transports behave alike; Zenoh's ends refuse what they should and always let their process end."""
 
-import random
 import signal
 import socket
 import subprocess
@@ -16,24 +15,12 @@ from common.errors import CongraspError, TransportError
 from common.transport.base import RefusedError
 from common.transport.keys import Keys, check_name, flow, matches, parse_alive
 from common.transport.memory import MemoryHub, MemoryTransport
+from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message, encode
 
 pytestmark = pytest.mark.timeout(60)
 KEYS = Keys("test")
-
-
-def base_port(count=4):
-    """The first of `count` free ports in a row."""
-    while True:
-        base = random.randrange(15000, 30000)  # below the ports that systems hand out
-        try:
-            for port in range(base, base + count):
-                with socket.socket() as probe:
-                    probe.bind(("127.0.0.1", port))
-            return base
-        except OSError:
-            continue
 
 
 def wait_for(condition, timeout=5.0):
@@ -50,7 +37,7 @@ def pair(request):
         hub = MemoryHub()
         ends = MemoryTransport(hub), MemoryTransport(hub)
     else:
-        endpoint = f"tcp/127.0.0.1:{base_port()}"
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
         ends = ZenohTransport(listen=[endpoint]), ZenohTransport(connect=[endpoint])
     yield ends
     for end in ends:
@@ -257,7 +244,7 @@ def test_memory_copies_nothing():
 
 
 def test_busy_port_is_named():
-    base = base_port()
+    base = free_port()
     with (
         ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"]),
         pytest.raises(CongraspError, match=f"port of tcp/127.0.0.1:{base} is in use.* choose another"),
@@ -268,7 +255,7 @@ def test_busy_port_is_named():
 
 
 def test_busy_port_of_a_later_flow_frees_the_earlier_ones():
-    base = base_port()
+    base = free_port()
     with socket.socket() as other:
         other.bind(("127.0.0.1", base + 1))
         other.listen()
@@ -287,7 +274,7 @@ def test_malformed_endpoint_is_named(endpoint):
 
 
 def test_absent_peer_is_an_error_with_a_deadline():
-    endpoint = f"tcp/127.0.0.1:{base_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     start = time.monotonic()
     with pytest.raises(TransportError, match=f"Nobody answers at {endpoint}"):
         ZenohTransport(connect=[endpoint], wait=0.2)
@@ -295,7 +282,7 @@ def test_absent_peer_is_an_error_with_a_deadline():
 
 
 def test_flows_decide_the_ports():
-    base = base_port(1)
+    base = free_port()
     with (
         ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"], flows=["policy"]) as server,
         ZenohTransport(connect=[f"tcp/127.0.0.1:{base}"], flows=["policy"]) as client,
@@ -309,7 +296,7 @@ def test_flows_decide_the_ports():
 def test_damaged_and_oversized_messages_are_refused():
     import zenoh
 
-    endpoint = f"tcp/127.0.0.1:{base_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     damaged = []
     with ZenohTransport(listen=[endpoint], max_message=1 << 20) as server, ZenohTransport(connect=[endpoint]) as client:
         server.serve(KEYS.act, lambda key, message: message, on_damage=lambda key, error: damaged.append(str(error)))
@@ -328,7 +315,7 @@ def test_damaged_and_oversized_messages_are_refused():
 
 
 def test_peer_that_comes_back_is_found_again():
-    endpoint = f"tcp/127.0.0.1:{base_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     server = ZenohTransport(listen=[endpoint])
     with ZenohTransport(connect=[endpoint]) as client:
         seen = []
@@ -380,7 +367,7 @@ BUSY_PROCESS = """
 def test_process_always_ends(end, code):
     script = textwrap.dedent(BUSY_PROCESS).replace("{end}", end)
     process = subprocess.Popen(
-        [sys.executable, "-c", script, f"tcp/127.0.0.1:{base_port()}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-c", script, f"tcp/127.0.0.1:{free_port()}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     try:
         assert process.stdout.readline() == b"ready\n"

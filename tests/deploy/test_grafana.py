@@ -3,16 +3,17 @@
 import json
 import re
 
-from services.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
+from common.transport.ports import free_port
+from services.operations.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
 from tests.conftest import ROOT
-from tests.services.test_metrics import STATUS, scrape
+from tests.services.operations.test_metrics import STATUS, scrape
 
 DASHBOARD = json.loads((ROOT / "deploy" / "grafana" / "congrasp.json").read_text())
 UPDATE = ("episode/success", "episode/return", "update_seconds", "wait_seconds")
 WORDS = {"min", "max", "sum", "by", "le", "rate", "histogram_quantile", "outcome"}
 
 
-def test_every_expression_names_metrics_that_are_exposed(free_port):
+def test_every_expression_names_metrics_that_are_exposed():
     learner, actor, server, port = LearnerMetrics(lambda: STATUS), ActorMetrics(), ServerMetrics(), free_port()
     learner.update(dict.fromkeys(UPDATE, 1.0))
     server.health = lambda: {"ready": True, "version": 5, "queue": 2}

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from common.logs.reader import read_metrics
-from services.drain import SMALL
+from services.bench.drain import SMALL
 from tests.conftest import ROOT
 
 SERVICES = yaml.safe_load((ROOT / "deploy" / "compose.yaml").read_text())["services"]

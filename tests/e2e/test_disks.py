@@ -19,7 +19,7 @@ from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
 from learner.process import run_learner
 from learner.run_directory import LOGS, create_run
-from services.audit import audit
+from services.operations.audit import audit
 from tests.learner.test_process import CONFIG, MadeUpActor
 
 

@@ -19,14 +19,14 @@ from actors.link import ActorLink
 from common.certificates import create_authority, issue, read
 from common.errors import CongraspError, TransportError
 from common.transport.keys import Keys
+from common.transport.ports import free_port
 from common.transport.security import RIGHTS, Credentials
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message, encode
 from common.wire.messages import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
-from services.client import PolicyClient
-from services.train import free_port
+from services.serving.client import PolicyClient
 from tests.cluster import A, B, D, T, bundle, rollout
 
 pytestmark = pytest.mark.timeout(60)

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from services.cli.main import load
-from services.constraint_sets import load as load_set
+from services.grasping.constraint_sets import load as load_set
 from services.importers.build import Report
 
 

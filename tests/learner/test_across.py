@@ -14,7 +14,7 @@ import jax, numpy as np
 from jax.sharding import Mesh
 from learner import update as updates
 from learner.across import AXIS
-from services import toy
+from services.bench import toy
 from tests.learner.test_update import fresh, rollout
 
 # One minibatch: then both have the same samples in it, whatever order they draw.

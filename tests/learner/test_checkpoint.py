@@ -12,7 +12,7 @@ import pytest
 from common.errors import CongraspError
 from learner import update as updates
 from learner.checkpoint import Checkpoints
-from services import toy
+from services.bench import toy
 from tests.learner.test_update import rollout
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

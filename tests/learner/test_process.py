@@ -20,6 +20,7 @@ from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
+from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from learner import update as updates
 from learner.process import run_learner
@@ -121,7 +122,7 @@ with ZenohTransport(listen=[endpoint]) as transport:
 
 
 @pytest.mark.timeout(150)
-def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path, free_port):
+def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path):
     """Killed between two checkpoints; its second life redoes the lost updates under versions of their own."""
     create_run(tmp_path, dataclasses.replace(CONFIG, checkpoint_every=4))
     endpoint = f"tcp/127.0.0.1:{free_port()}"

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from common.errors import CongraspError, TransportError
+from common.transport.ports import free_port
 from learner import ranks as ranks_module
 from learner.ranks import Ranks, ended_by
 from learner.run_directory import create_run
@@ -67,7 +68,7 @@ class Party:
 
 
 @pytest.fixture
-def party(free_port, monkeypatch):
+def party(monkeypatch):
     monkeypatch.setattr(ranks_module, "_RELAY_SECONDS", 0.2)
     party = Party(free_port())
     yield party
@@ -118,7 +119,7 @@ def test_a_killed_rank_ends_the_others(party, victim):
     assert all(f"Rank {victim} ended" in party.said[rank] for rank in others)
 
 
-def test_a_silent_rank_ends_the_others(free_port, monkeypatch):
+def test_a_silent_rank_ends_the_others(monkeypatch):
     monkeypatch.setattr(ranks_module, "_SILENCE_SECONDS", 0.5)
     party = Party(free_port())  # whose hearts beat every two seconds only
     assert party.all_said({0, 1, 2})
@@ -155,7 +156,7 @@ def test_ranks_and_addresses_that_make_no_sense(arguments, complaint):
         Ranks.join(*arguments)
 
 
-def test_nobody_waits_for_ever_for_a_rank_that_never_comes(free_port, monkeypatch):
+def test_nobody_waits_for_ever_for_a_rank_that_never_comes(monkeypatch):
     monkeypatch.setattr(ranks_module, "JOIN_SECONDS", 0.5)
     with pytest.raises(TransportError, match=r"Ranks \[1\] of 2 did not come"):
         Ranks.join(0, 2, f"127.0.0.1:{free_port()}")
@@ -210,7 +211,7 @@ class Job:
 
 
 @pytest.fixture
-def job(tmp_path, free_port):
+def job(tmp_path):
     create_run(tmp_path, CONFIG)
     job = Job(tmp_path, free_port())
     yield job

@@ -10,7 +10,7 @@ from common.errors import CongraspError, PhysicsError
 from common.policy import bundle as bundles
 from common.policy import network, normalizer
 from learner import update as updates
-from services import toy
+from services.bench import toy
 
 
 def fresh(seed: int = 0) -> updates.TrainState:

@@ -10,6 +10,7 @@ import sys
 import pytest
 
 import services.cli.main as cli
+from common.transport.ports import free_port
 from services.cli.main import COMMANDS, load
 
 
@@ -84,7 +85,7 @@ def test_a_log_on_a_full_disk_does_not_change_the_exit_code():
         assert subprocess.run(command, stdout=full, stderr=full, timeout=60, check=False).returncode == 2
 
 
-def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, free_port):
+def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path):
     port = free_port()
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", port))
@@ -100,7 +101,7 @@ def test_the_client_needs_neither_jax_nor_mujoco():
         "import sys\n"
         "for name in ('jax', 'flax', 'mujoco', 'scipy', 'trimesh', 'mcap', 'tyro', 'rich', 'dacite'):\n"
         "    sys.modules[name] = None\n"
-        "import services.client\n"
+        "import services.serving.client\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

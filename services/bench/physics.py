@@ -1,0 +1,162 @@
+"""Benchmarks that print ratios against a reference measured in the same run."""
+
+import concurrent.futures
+import functools
+import itertools
+import os
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from actors.physics import make_physics
+from actors.physics.engine import Physics, Readout
+from actors.physics.native import NativePhysics
+from actors.rollout import RolloutWorker
+from actors.taskset import build_taskset
+from common.config import PhysicsName
+from common.hands import get_hand
+from common.objects.pool import load_pool, sized
+from common.policy.bundle import PolicyBundle, sample_action
+from services.training.presets import get_preset
+from services.training.quickstart import untrained
+
+_STEPS = 75
+"""One whole episode: every repeat begins with fresh episodes and ends with their reset."""
+_DEFINITION = (
+    "Actor: policy, observation, physics, reward and reset of whole episodes. Engine alone: for native, mj_step on "
+    "the same models, start states and control targets, hence the same contacts, with as many threads; for others, "
+    "steps that hold the actor's last targets. Ratio: the actor's control steps/s over the engine's."
+)
+
+
+def engines() -> list[PhysicsName]:
+    """Engines that this machine has; `jax` only where it is not a CPU's second choice."""
+    return ["native"] if jax.default_backend() == "cpu" else ["native", "warp", "jax"]
+
+
+class Recorder(NativePhysics):
+    """A native engine that keeps what it is told, so that another can go through the same states."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        """As `NativePhysics`."""
+        super().__init__(*args, **kwargs)
+        self.commands: list[tuple[np.ndarray, np.ndarray]] = []
+        """Targets (B, 6 + F) and tables (B,) of every control step."""
+
+    def step(self, state: Any, target: Any, table: Any) -> tuple[NativePhysics, Readout]:
+        """One control step, written down."""
+        self.commands.append((np.array(target), np.array(table)))
+        return super().step(state, target, table)
+
+
+def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> None:
+    """Goes through recorded control steps with nothing but `mj_step`; threads share the worlds and never wait."""
+
+    def run(worlds: np.ndarray, targets: Sequence[np.ndarray]) -> None:
+        for target in targets:
+            for i in worlds:
+                cell = physics.cells[i]
+                cell.ctrl[:] = target[i]
+                mujoco.mj_step(cell.model, cell.data, substeps)
+
+    shares = np.array_split(np.arange(len(physics.cells)), physics.threads)
+    with concurrent.futures.ThreadPoolExecutor(physics.threads) as pool:
+        for _, group in itertools.groupby(commands, key=lambda command: command[1].tobytes()):
+            targets, tables = zip(*group, strict=True)
+            physics.place_tables(tables[0])
+            list(pool.map(run, shares, itertools.repeat(targets)))
+
+
+def bench_physics(environments: int, threads: int, repeats: int, names: list[PhysicsName]) -> None:
+    """Control steps a second of actors (policy, observation, reward, reset) beside engines that only step."""
+    console = Console()
+    config = get_preset("quickstart")
+    hand = get_hand(config.task.hand)
+    objects = sized(hand, config.task, load_pool(config.objects))
+    taskset = build_taskset(hand, config.task, objects, 0)
+    policy = untrained(config)
+    table = Table(title=f"{environments} environments, {threads} thread(s), {_STEPS} control steps, {repeats} repeats")
+    for column in ("engine", "actor, control steps/s", "engine alone, control steps/s", "ratio of medians", "of bests"):
+        table.add_column(column, justify="left" if column == "engine" else "right")
+    for name in names:
+        if name == "native":
+            physics: Physics = Recorder(hand, config.task, objects, threads)
+        else:
+            physics = make_physics(name, hand, config.task, objects, threads=threads)
+        worker = RolloutWorker(
+            hand,
+            config.task,
+            physics,
+            taskset,
+            functools.partial(sample_action, policy.spec.layout),
+            batch=environments,
+            seed=0,
+            half=True,
+        )
+        _collect(worker, policy)
+        twin = NativePhysics(hand, config.task, objects, threads) if isinstance(physics, Recorder) else None
+        bare: Callable[[], object]
+        actor_seconds, bare_seconds = [], []
+        for _ in range(repeats):
+            if isinstance(physics, Recorder) and twin is not None:
+                twin.start(worker.env.world)
+                physics.commands.clear()
+                bare = functools.partial(replay, twin, physics.commands, config.task.substeps)
+            else:
+                bare = _compiled_loop(worker)
+            actor_seconds.append(_timed(functools.partial(_collect, worker, policy)))
+            bare_seconds.append(_timed(bare))
+        table.add_row(name, *_row(environments * _STEPS, np.array(actor_seconds), np.array(bare_seconds)))
+        physics.close()
+        if twin is not None:
+            twin.close()
+    console.print(table)
+    console.print(_DEFINITION)
+
+
+def _row(steps: int, actor: np.ndarray, bare: np.ndarray) -> list[str]:
+    """The table's cells, from seconds of every repeat."""
+    a, b = np.median(actor), np.median(bare)
+    return [f"{steps / a:,.0f}", f"{steps / b:,.0f}", f"{b / a:.2f}", f"{bare.min() / actor.min():.2f}"]
+
+
+def _timed(run: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    run()
+    return time.perf_counter() - began
+
+
+def _collect(worker: RolloutWorker, policy: PolicyBundle) -> None:
+    jax.block_until_ready(worker.collect(policy.acting, _STEPS).reward)
+
+
+@functools.lru_cache(maxsize=1)
+def _compiled_loop(worker: RolloutWorker) -> Callable[[], object]:
+    physics = worker.physics
+
+    def loop(state: object, target: jax.Array, table: jax.Array) -> object:
+        def body(carry: object, _: None) -> tuple[object, None]:
+            return physics.step(carry, target, table)[0], None
+
+        return jax.lax.scan(body, state, None, length=_STEPS)[0]
+
+    compiled = jax.jit(loop)
+    target = jax.numpy.concatenate([worker.env.u_target, worker.env.q_target], -1)
+    table = jax.numpy.ones(len(target), bool)
+
+    def run() -> object:
+        return jax.block_until_ready(compiled(worker.state, target, table))
+
+    run()
+    return run
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,199 @@
+"""Weak scaling: trained steps a second of 1, 2, … learner ranks, each a process of its own on a GPU of its own."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import platform
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+from rich.console import Console
+from rich.table import Table
+
+from common.config import RunConfig
+from common.errors import CongraspError, TransportError
+from learner.run_directory import create_run
+from services.training.train import engine_of, leave_gpus_to, train
+
+_WARM_UPDATES = 5
+"""Updates before the measurement: the first ones compile, and begin with fresh episodes everywhere."""
+_LEAST_UPDATES = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """What one number of ranks achieved."""
+
+    ranks: int
+    updates: int
+    """Updates measured."""
+    seconds: float
+    """From the end of the first to the end of the last of them."""
+    steps_per_second: float
+    """Environment steps of all ranks that updates consumed, by rank 0's clock."""
+    efficiency: float
+    """Steps per second and rank over those of the first stage."""
+    wait_seconds: float
+    """Mean time from one update to the next batch of all ranks: rollouts, and the slowest rank's at that."""
+    update_seconds: float
+    """Mean time of an update with its collectives."""
+    start_seconds: float
+    """From the start of the processes to the end of the first update: imports, compiling, connections."""
+
+
+class _Meter:
+    """Watches a run's metrics, and stops it when enough was seen."""
+
+    def __init__(self, seconds: float, deadline: float, stop: threading.Event, say: Callable[[str], None]):
+        self.metrics: list[dict[str, Any]] = []
+        self.late = False
+        self._seconds, self._stop, self._say = seconds, stop, say
+        self._began = self._said = time.monotonic()
+        self._deadline = self._began + deadline
+        self.start_seconds = float("nan")
+
+    def show(self, status: dict[str, Any]) -> None:
+        """Takes the newest metrics, if there are any."""
+        now = time.monotonic()
+        if "values" in status:
+            if not self.metrics and status["update"] == 1:
+                self.start_seconds = now - self._began
+            if status["update"] >= _WARM_UPDATES:
+                self.metrics.append(status)
+        span = self.metrics[-1]["time"] - self.metrics[0]["time"] if self.metrics else 0.0
+        if span >= self._seconds and len(self.metrics) > _LEAST_UPDATES:
+            self._stop.set()
+        elif now > self._deadline:
+            self.late = True
+            self._stop.set()
+        if now - self._said > 10.0:
+            self._said = now
+            self._say(f"{now - self._began:.0f} s, " + (f"measured {span:.0f} s" if span else "starting"))
+
+    def stage(self, ranks: int, first: Stage | None) -> Stage:
+        """The figures."""
+        begin, end = self.metrics[0], self.metrics[-1]
+        seconds = end["time"] - begin["time"]
+        rate = (end["values"]["transitions"] - begin["values"]["transitions"]) / seconds
+        measured = [entry["values"] for entry in self.metrics[1:]]
+        alone = rate / ranks if first is None else first.steps_per_second / first.ranks
+        return Stage(
+            ranks,
+            end["update"] - begin["update"],
+            seconds,
+            rate,
+            rate / ranks / alone,
+            sum(values["wait_seconds"] for values in measured) / len(measured),
+            sum(values["update_seconds"] for values in measured) / len(measured),
+            self.start_seconds,
+        )
+
+
+def bench_scaling(
+    config: RunConfig,
+    ranks: Sequence[int],
+    *,
+    seconds: float,
+    actors: int | None,
+    deadline: float,
+    out: pathlib.Path,
+) -> None:
+    """Measures every number of ranks in turn, prints a table, and writes JSON after each of them.
+
+    Args:
+      config: the run of every rank; it learns for real, but is thrown away.
+      ranks: numbers of ranks; efficiency is against the first.
+      seconds: of measurement, for each.
+      actors: actor processes of each rank; by default none where there are GPUs (one inside each rank), otherwise one.
+      deadline: seconds that one number of ranks may take in all.
+      out: file of the results.
+
+    Raises:
+      CongraspError: the machine has too few GPUs, a process failed for good, or a deadline passed.
+    """
+    if not ranks or min(ranks) < 1:
+        raise CongraspError("Name numbers of ranks from 1 on.", "For example --ranks 1 2 4.")
+    gpus = leave_gpus_to(max(ranks))
+    physics = engine_of(config.physics, gpus)
+    if actors is None:
+        actors = 0 if gpus else 1
+    config = dataclasses.replace(config, updates=10**9, physics=physics, collapse_patience=0)
+    console = Console(highlight=False)
+    stages: list[Stage] = []
+    for count in ranks:
+        console.print(f"{count} rank(s): at most {deadline:.0f} s …")
+        stages.append(_measure(config, count, actors, gpus, seconds, deadline, stages[0] if stages else None, console))
+        result = {
+            "machine": {"host": platform.node(), "cores": os.cpu_count(), "jax": jax.__version__, "gpus": gpus},
+            "config": dataclasses.asdict(config),
+            "actors": actors,
+            "stages": [dataclasses.asdict(stage) for stage in stages],
+        }
+        out.write_text(json.dumps(result, indent=2))
+        _print(console, config, stages)
+    console.print(f"Written to {out}.", soft_wrap=True)
+
+
+def _measure(
+    config: RunConfig,
+    ranks: int,
+    actors: int,
+    gpus: bool,
+    seconds: float,
+    deadline: float,
+    first: Stage | None,
+    console: Console,
+) -> Stage:
+    run_dir = pathlib.Path(tempfile.mkdtemp(prefix=f"congrasp-scaling-{ranks}-"))
+    stop = threading.Event()
+    meter = _Meter(seconds, deadline, stop, lambda text: console.print(f"  {text}"))
+    create_run(run_dir, config)
+    try:
+        train(
+            run_dir,
+            config,
+            actors=actors,
+            physics=config.physics,
+            stop=stop,
+            ranks=ranks,
+            gpus=gpus,
+            report=meter.show,
+            notify=lambda text: console.print(f"  {text}", soft_wrap=True),
+        )
+        if len(meter.metrics) <= _LEAST_UPDATES:
+            raise TransportError(
+                f"{ranks} rank(s) made {len(meter.metrics)} update(s) to measure within {deadline:.0f} s.",
+                f"Look at {run_dir}/logs, or give them longer with --deadline.",
+            )
+    except CongraspError:
+        for log in sorted((run_dir / "logs").glob("*.log")):
+            console.print(
+                f"[bold]{log}[/]", *log.read_text(errors="replace").splitlines()[-15:], sep="\n", markup=False
+            )
+        raise
+    shutil.rmtree(run_dir, ignore_errors=True)
+    return meter.stage(ranks, first)
+
+
+def _print(console: Console, config: RunConfig, stages: Sequence[Stage]) -> None:
+    steps = config.environments * config.rollout_steps * config.ppo.rollouts_per_update
+    table = Table(title=f"{config.environments} environments, {steps} steps an update of each rank, '{config.physics}'")
+    for column in ("ranks", "steps/s", "efficiency", "wait, s", "update, s", "updates", "start, s"):
+        table.add_column(column, justify="right")
+    for stage in stages:
+        table.add_row(
+            str(stage.ranks),
+            f"{stage.steps_per_second:,.0f}",
+            f"{100 * stage.efficiency:.1f} %",
+            f"{stage.wait_seconds:.3f}",
+            f"{stage.update_seconds:.3f}",
+            str(stage.updates),
+            f"{stage.start_seconds:.0f}",
+        )
+    console.print(table)

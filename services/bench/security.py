@@ -1,0 +1,110 @@
+"""What mutual TLS, access control and a hostile actor cost, as ratios against a run without them."""
+
+import contextlib
+import multiprocessing
+import pathlib
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from common.certificates import create_authority, issue
+from common.errors import TransportError
+from common.transport.keys import Keys
+from common.transport.ports import free_port
+from common.transport.security import Credentials
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message
+from learner.limits import Credit
+
+_KEYS = Keys("bench")
+_ACTOR, _EVIL = "0.a", "1.b"
+_MEGABYTES = 8
+_SMALL = Message(meta={"actor": _ACTOR, "incarnation": "01", "ticket": "t"})
+_LARGE = Message({"x": np.zeros(_MEGABYTES * 10**6, np.uint8)})
+
+
+def measure(repeats: int) -> dict[str, float]:
+    """Medians of `repeats` alternating measurements: times in ms, and rates in MB/s, one of them beside a flood."""
+    with tempfile.TemporaryDirectory() as folder:
+        create_authority(pathlib.Path(folder))
+        for role in ("learner", "actor", "actor"):
+            issue(pathlib.Path(folder), role)
+        found: dict[str, list[float]] = {}
+
+        def note(name: str, value: float) -> None:
+            found.setdefault(name, []).append(value)
+
+        for _ in range(repeats):
+            for name, certs in (("plain", None), ("secure", pathlib.Path(folder))):
+                began = time.perf_counter()
+                with _learner(certs) as (endpoint, credit):
+                    note(f"{name}_open_ms", 1e3 * (time.perf_counter() - began))
+                    with _connected(endpoint, certs, 0) as actor:
+                        note(f"{name}_query_ms", 1e3 * _seconds(actor, _KEYS.ticket(_ACTOR), _SMALL, 300))
+                        note(f"{name}_mb_per_s", _MEGABYTES / _seconds(actor, _KEYS.rollout(_ACTOR), _LARGE, 10))
+                        if certs is not None:
+                            with _flood(endpoint, certs, credit):
+                                before = credit.turned_away
+                                note("flood_mb_per_s", _MEGABYTES / _seconds(actor, _KEYS.rollout(_ACTOR), _LARGE, 10))
+                                note("flood_turned_away", credit.turned_away - before)
+        return {name: statistics.median(values) for name, values in found.items()}
+
+
+@contextlib.contextmanager
+def _learner(certs: pathlib.Path | None) -> Iterator[tuple[str, Credit]]:
+    """What answers tickets and rollouts as a learner's hub does, without looking into them."""
+    credentials = None if certs is None else Credentials(certs / "learner.0", "learner")
+    endpoint, credit = f"tcp/127.0.0.1:{free_port()}", Credit()
+
+    def accept(key: str, request: Message) -> Message:
+        return Message(meta={"outcome": "refused" if key.endswith(_EVIL) else "accepted"})
+
+    def turnstile(key: str) -> Message | None:
+        return None if credit.admits(key) else Message(meta={"outcome": "retry"})
+
+    with ZenohTransport(listen=[endpoint], credentials=credentials) as transport:
+        for keys in (_KEYS.tickets, _KEYS.rollouts):
+            transport.serve(keys, credit.charging(accept), workers=2, depth=8, turnstile=turnstile)
+        yield endpoint, credit
+
+
+def _connected(endpoint: str, certs: pathlib.Path | None, number: int) -> ZenohTransport:
+    credentials = None if certs is None else Credentials(certs / f"actor.{number}", "actor")
+    return ZenohTransport(connect=[endpoint], credentials=credentials, flows=("control", "bulk"))
+
+
+def _seconds(transport: ZenohTransport, key: str, message: Message, count: int) -> float:
+    """The median of the times that a request takes."""
+    times = []
+    for _ in range(count + 1):
+        began = time.perf_counter()
+        transport.query(key, message, timeout=30.0)
+        times.append(time.perf_counter() - began)
+    return statistics.median(times[1:])
+
+
+@contextlib.contextmanager
+def _flood(endpoint: str, certs: pathlib.Path, credit: Credit) -> Iterator[None]:
+    """Another process, with an actor's certificate of its own, sends rubbish while the block runs."""
+    hostile = multiprocessing.get_context("spawn").Process(target=_send_rubbish, args=(endpoint, certs), daemon=True)
+    hostile.start()
+    try:
+        deadline = time.monotonic() + 60.0
+        while not credit.turned_away and time.monotonic() < deadline:
+            time.sleep(0.1)
+        yield
+    finally:
+        hostile.kill()
+        hostile.join()
+
+
+def _send_rubbish(endpoint: str, certs: pathlib.Path) -> None:
+    """1 MB at a time, as fast as it is answered."""
+    rubbish = Message({"x": np.zeros(10**6, np.uint8)})
+    with _connected(endpoint, certs, 1) as transport:
+        while True:
+            with contextlib.suppress(TransportError):
+                transport.query(_KEYS.rollout(_EVIL), rubbish, timeout=5.0)

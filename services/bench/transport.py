@@ -1,0 +1,252 @@
+"""What the wire carries: rollouts into one learner beside bare PUSH/PULL sockets, and weights out to its actors.
+
+Everything but the policy and the physics is the real thing: the hub with its checks, admission and journals, and links
+with theirs, in processes of their own over the loopback interface.
+"""
+
+import contextlib
+import json
+import multiprocessing
+import pathlib
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from actors.link import ActorLink, RunFinished
+from common.errors import CongraspError
+from common.journal import AUDIT, Journal
+from common.transport.ports import free_port
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message, encode
+from common.wire.messages import RolloutForm
+from learner.audit import AuditLog
+from learner.hub import LearnerHub
+from learner.staleness import StalenessManager
+
+_FORM = RolloutForm(steps=20, worlds=340, observation=534, action=26, half=True)
+"""Of the human hand's rollouts; these have 8.0 MB."""
+_RUN, _EPOCH, _SCHEMA = "bench", "epoch", "schema"
+_BATCH = 4
+_WARM_UP = 1.0  # seconds that are not counted
+_START = 30.0  # seconds that processes may take to start
+_INTERVAL = 0.25  # seconds between two versions of the weights
+
+
+def measure_ingest(senders: int, seconds: float, repeats: int) -> tuple[float, float]:
+    """MB/s into a learner, and between bare sockets: medians of `repeats` alternating measurements."""
+    ours, bare = [], []
+    for _ in range(repeats):
+        ours.append(_through_the_hub(senders, seconds))
+        bare.append(_through_sockets(senders, seconds))
+    return statistics.median(ours), statistics.median(bare)
+
+
+def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]:
+    """Seconds from the publication of weights until each actor holds them, for every actor and version, sorted.
+
+    Versions that an actor never held, since a newer one was there, count from their own publication as well.
+    """
+    parameters = np.random.default_rng(0).normal(size=int(megabytes * 250_000)).astype(np.float32)
+    with tempfile.TemporaryDirectory() as name, _learner(folder := pathlib.Path(name)) as (hub, endpoint):
+        published: list[float] = []
+
+        def publish() -> None:
+            published.append(time.monotonic())
+            hub.publish_weights(_bundle(len(published) - 1, parameters), len(published) - 1)
+
+        publish()
+        with _processes(actors, _pull, endpoint, folder):
+            _until(lambda: all(_held(folder, i) for i in range(actors)), "The actors got no weights.")
+            for _ in range(versions):
+                time.sleep(_INTERVAL)
+                publish()
+            last = len(published) - 1
+            _until(lambda: all(_held(folder, i)[-1][0] == last for i in range(actors)), "The last weights never came.")
+            hub.finish()
+        delays = []
+        for i in range(actors):
+            held = iter(_held(folder, i)[1:])
+            version, when = next(held)
+            for number in range(1, last + 1):
+                while version < number:
+                    version, when = next(held)
+                delays.append(when - published[number])
+        return sorted(delays)
+
+
+@contextlib.contextmanager
+def _learner(folder: pathlib.Path) -> Iterator[tuple[LearnerHub, str]]:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ZenohTransport(listen=[endpoint]) as transport:
+        hub = LearnerHub(
+            transport,
+            run=_RUN,
+            config_json="{}",
+            epoch=_EPOCH,
+            schema=_SCHEMA,
+            form=_FORM,
+            staleness=StalenessManager(1, _BATCH),
+            audit=AuditLog(folder, "0"),
+        )
+        yield hub, endpoint
+        hub.close()
+
+
+def _bundle(version: int, parameters: np.ndarray) -> Message:
+    sizes = {"observation": (_FORM.observation,), "value": ()}
+    arrays: dict[str, Any] = {f"{kind}/{m}": np.zeros(size) for kind, size in sizes.items() for m in ("mean", "m2")}
+    arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": parameters}
+    meta = {"version": version, "epoch": _EPOCH, "schema": _SCHEMA, "hand": "human", "layout": [], "format": 1}
+    return Message(arrays, {**meta, "action_size": _FORM.action})
+
+
+def _rollout() -> Message:
+    rng, (steps, worlds, observation, action, _) = np.random.default_rng(0), _FORM
+    arrays = {
+        "observation": rng.normal(size=(steps, worlds, observation)).astype(np.float16),
+        "action": rng.normal(size=(steps, worlds, action)).astype(np.float32),
+        "log_probability": rng.normal(size=(steps, worlds)).astype(np.float32),
+        "reward": rng.normal(size=(steps, worlds)).astype(np.float32),
+        "terminal": np.zeros((steps, worlds), bool),
+        "last_observation": rng.normal(size=(worlds, observation)).astype(np.float16),
+    }
+    return Message(arrays, {"version": 0, "schema": _SCHEMA, "steps": steps * worlds})
+
+
+def _through_the_hub(senders: int, seconds: float) -> float:
+    size, weights = len(encode(_rollout())), np.zeros(1000, np.float32)
+    with tempfile.TemporaryDirectory() as name, _learner(folder := pathlib.Path(name)) as (hub, endpoint):
+        hub.publish_weights(_bundle(0, weights), 0)
+        version = 0
+
+        def receive() -> int:
+            nonlocal version
+            batch = hub.next_batch(_BATCH, 0.5)
+            if batch is None:
+                return 0
+            version += 1
+            hub.publish_weights(_bundle(version, weights), version)
+            return size * len(batch)
+
+        with _processes(senders, _upload, endpoint, folder):
+            rate = _rate(receive, seconds)
+            hub.finish()
+        return rate
+
+
+def _through_sockets(senders: int, seconds: float) -> float:
+    zmq = _zmq()
+    with zmq.Context() as context, context.socket(zmq.PULL) as socket:
+        socket.rcvhwm, socket.rcvtimeo = 8, 500
+        port = socket.bind_to_random_port("tcp://127.0.0.1")
+
+        def receive() -> int:
+            try:
+                return len(socket.recv(copy=False).buffer)
+            except zmq.Again:
+                return 0
+
+        with _processes(senders, _push, f"tcp://127.0.0.1:{port}", pathlib.Path()):
+            return _rate(receive, seconds)
+
+
+def _rate(receive: Callable[[], int], seconds: float) -> float:
+    """MB/s that a function receives, after a while in which it is not counted."""
+    _until(lambda: receive() > 0, "Nothing was received.")
+    received, began = 0, time.monotonic() + _WARM_UP
+    while (now := time.monotonic()) < began + seconds:
+        size = receive()
+        received += size if now >= began else 0
+    return received / (time.monotonic() - began) / 1e6
+
+
+def _until(condition: Callable[[], bool], complaint: str) -> None:
+    deadline = time.monotonic() + _START
+    while not condition():
+        if time.monotonic() > deadline:
+            raise CongraspError(f"{complaint[:-1]} within {_START:g} s.", "Is the machine busy otherwise?")
+        time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def _processes(count: int, role: Callable[[str, pathlib.Path, int], None], *arguments: Any) -> Iterator[None]:
+    """Runs a function of this module in processes of their own, which are killed at the end of the block."""
+    spawn = multiprocessing.get_context("spawn")
+    processes = [spawn.Process(target=role, args=(*arguments, i), daemon=True) for i in range(count)]
+    try:
+        for process in processes:
+            process.start()
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+
+
+@contextlib.contextmanager
+def _link(endpoint: str, folder: pathlib.Path, number: int) -> Iterator[ActorLink]:
+    journal = Journal(folder / AUDIT / f"a{number}.jsonl")
+    with (
+        ZenohTransport(connect=[endpoint], flows=("control", "bulk", "log")) as transport,
+        ActorLink(transport, _RUN, f"a{number}", window=2, journal=journal) as link,
+        contextlib.suppress(RunFinished),
+    ):
+        link.config(_START)
+        yield link
+
+
+def _upload(endpoint: str, folder: pathlib.Path, number: int) -> None:
+    """An actor that makes the same rollout again and again, in no time."""
+    message = _rollout()
+    with _link(endpoint, folder, number) as link:
+        while True:
+            if ticket := link.acquire_ticket(1.0):
+                link.upload(Message(message.arrays, {**message.meta, "version": ticket.version}), ticket)
+
+
+def _push(address: str, _: pathlib.Path, number: int) -> None:
+    zmq = _zmq()
+    data = encode(_rollout())
+    with zmq.Context() as context, context.socket(zmq.PUSH) as socket:
+        socket.sndhwm = 2
+        socket.connect(address)
+        while True:
+            socket.send(data, copy=False)
+
+
+def _pull(endpoint: str, folder: pathlib.Path, number: int) -> None:
+    """An actor that takes new weights at once, and writes down when it held them."""
+    version = -1
+    with _link(endpoint, folder, number) as link, _file(folder, number).open("w", buffering=1) as log:
+        while True:
+            message = link.weights(version)
+            if message is not None:
+                version = message.meta["version"]
+                log.write(json.dumps([version, time.monotonic()]) + "\n")
+            else:
+                link.acquire_ticket(0.0)  # notices the end of the run
+                time.sleep(0.001)
+
+
+def _held(folder: pathlib.Path, number: int) -> list[tuple[int, float]]:
+    path = _file(folder, number)
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    return [tuple(json.loads(line)) for line in lines if line.endswith("\n")]
+
+
+def _file(folder: pathlib.Path, number: int) -> pathlib.Path:
+    return folder / f"weights.{number}.jsonl"
+
+
+def _zmq() -> Any:
+    try:
+        import zmq
+    except ImportError:
+        raise CongraspError(
+            "The reference of this benchmark is pyzmq, which is not here.", "pip install pyzmq"
+        ) from None
+    return zmq

@@ -1,0 +1,65 @@
+"""Failures and successes of a row as a contact sheet, each failure with its cause in words."""
+
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from common.policy.bundle import PolicyBundle
+from common.wire.codec import Message
+from services.evaluation.evaluate import Evaluator
+from services.pictures.render import episode_strip
+from services.pictures.sheets import contact_sheet, save_png
+
+_MOMENTS = 5
+_SIZE = (300, 225)
+_PUSHED = 0.05  # m that an object may move before the table goes
+
+
+def cause(episode: Message, drop_height: float) -> str:
+    """Why an episode ended with the object `drop_height` (m) or more below where it was, or `held`."""
+    metrics = episode.meta["metrics"]
+    if metrics["bad"]:
+        return "the physics diverged"
+    if metrics["held"]:
+        return "held"
+    if metrics["moved_at_removal"] > _PUSHED:
+        return "pushed away before the table went"
+    if not metrics["links_at_removal"]:
+        return "not touched when the table went"
+    without_table = ~np.asarray(episode.arrays["table"], bool)
+    height = np.asarray(episode.arrays["object_position"])[without_table, 2]
+    fell = int(np.argmax(height < height[0] - drop_height))
+    return f"slipped {fell * episode.meta['control_dt']:.2f} s after the table went"
+
+
+def failure_sheet(
+    evaluator: Evaluator, policy: PolicyBundle, constraint: str, path: pathlib.Path, successes: int, failures: int
+) -> Sequence[str]:
+    """Draws episodes of a row, failures first.
+
+    Args:
+      evaluator: of the policy.
+      policy: for the title.
+      constraint: name of the row.
+      path: the PNG file to write, if there is an episode to show.
+      successes: how many to show.
+      failures: how many to show, if there are so many.
+
+    Returns:
+      What became of each episode, in words.
+    """
+    episodes = evaluator.examples(constraint, successes, failures)
+    if not episodes:
+        return []
+    images: list[np.ndarray] = []
+    labels: list[str] = []
+    causes = [cause(episode, evaluator.task.drop_height) for episode in episodes]
+    for episode, what in zip(episodes, causes, strict=True):
+        pictures, words = episode_strip(episode, _MOMENTS, _SIZE, episode.meta["object"], f": {what}")
+        images += pictures
+        labels += words
+    who = f"{policy.spec.hand_name} hand, version {policy.version}"
+    title = f"{who}, {constraint}: {len(episodes)} episodes, failures first"
+    save_png(path, contact_sheet(images, labels, columns=_MOMENTS, title=title))
+    return causes

@@ -1,0 +1,244 @@
+"""Quick pictures of shapes, for videos and sheets: triangles into a depth buffer, one lamp, its shadow on the table.
+
+A fraction of a second a picture, where `services.pictures.shade`, whose light is better, takes seconds.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from services.pictures.raycast import Camera, Shape, painted
+from services.pictures.smooth import SmoothNormals
+
+SAMPLES = 2
+"""Samples along each side of a pixel."""
+_KEY = np.array([-0.45, -0.55, 1.0])  # towards the lamp: right, away from the camera, up
+_KEY_STRENGTH, _SKY_STRENGTH, _BOUNCE, _SHINE = 0.70, 0.42, 0.06, 0.25
+_SHADOW, _SOFT = 0.55, 0.006  # how dark a shadow is, and how wide its border, as a share of the picture's height
+_GAMMA = 2.2
+_TOP, _BOTTOM = np.array([0.93, 0.945, 0.965]), np.array([0.80, 0.82, 0.85])  # background, sRGB
+_NEAR = 0.01  # m
+
+
+class Patch(NamedTuple):
+    """Triangles in the world."""
+
+    corners: np.ndarray
+    """(F, 3, 3)."""
+    normals: np.ndarray
+    """(F, 3, 3) at the corners."""
+    colours: np.ndarray
+    """(F, 3, 3) sRGB at the corners."""
+    closed: bool
+    """Whether only the outside can be seen: a closed surface whose triangles wind outwards."""
+
+
+class Raster:
+    """Draws one picture after another; what it knows of a mesh serves all of them."""
+
+    def __init__(self) -> None:
+        """Knows no mesh yet."""
+        self._meshes: dict[tuple[int, int], tuple[Patch, Shape]] = {}
+
+    def draw(self, shapes: list[Shape], camera: Camera, size: tuple[int, int] = (640, 480)) -> np.ndarray:
+        """(height, width, 3) uint8 sRGB; of cylinders, which must stand upright, only the upper face is drawn.
+
+        Args:
+          shapes: what to draw; the world's z axis points up.
+          camera: from where.
+          size: width and height in pixels.
+        """
+        bodies = [shape for shape in shapes if shape.kind != "cylinder"]
+        solid = [self._patch(shape) for shape in bodies if shape.alpha >= 1]
+        coarse = _Frame(camera, *size)  # the table has hardly an edge: one sample a pixel is enough
+        for shape in shapes:
+            if shape.kind == "cylinder":
+                coarse.add_disc(shape, solid)
+        frame = coarse.finer()
+        frame.add(solid)
+        for alpha in sorted({shape.alpha for shape in bodies if shape.alpha < 1}):
+            frame.add([self._patch(shape) for shape in bodies if shape.alpha == alpha], alpha)
+        samples = frame.image.reshape(size[1], SAMPLES, size[0], SAMPLES, 3)
+        image = sum(samples[:, i, :, j] for i, j in np.ndindex(SAMPLES, SAMPLES)) / SAMPLES**2
+        return (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8)
+
+    def _patch(self, shape: Shape) -> Patch:
+        local = self._local(shape)
+        turn = Rotation.from_quat(shape.quaternion, scalar_first=True).as_matrix().astype(np.float32)
+        place = np.asarray(shape.position, np.float32)
+        return local._replace(corners=local.corners @ turn.T + place, normals=local.normals @ turn.T)
+
+    def _local(self, shape: Shape) -> Patch:
+        if shape.kind != "mesh":
+            corners, normals = _round(shape.size[0], shape.size[1] if shape.kind == "capsule" else 0.0)
+            return Patch(corners, normals, _even(shape.colour, corners), True)
+        key = (id(shape.vertices), id(shape.paint_colours))
+        if key not in self._meshes:
+            vertices, faces = np.asarray(shape.vertices, float), np.asarray(shape.faces)
+            smooth = SmoothNormals(vertices, faces)
+            corners = smooth.corners.astype(np.float32)
+            colours = _even(shape.colour, corners)
+            if shape.paint_points is not None:
+                tree, of_points = cKDTree(shape.paint_points), np.asarray(shape.paint_colours)
+                colours = painted(tree, of_points, corners.reshape(-1, 3)).reshape(corners.shape).astype(np.float32)
+            closed = trimesh.Trimesh(vertices, faces).is_volume
+            # The shape is kept, so that nothing else can get its arrays' identities.
+            self._meshes[key] = Patch(corners, smooth.corner_normals.astype(np.float32), colours, closed), shape
+        return self._meshes[key][0]
+
+
+def _even(colour: tuple[float, float, float], corners: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(np.asarray(colour, np.float32), corners.shape)
+
+
+@functools.lru_cache(maxsize=128)
+def _round(radius: float, half_length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and normals (F, 3, 3) of a capsule along z, or of a ball."""
+    ball = trimesh.creation.icosphere(2, 1.0)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    # A ball that is pulled apart at its equator; the triangles that cross it become the shaft.
+    lift = np.where(vertices[:, 2] > 1e-6, half_length, np.where(vertices[:, 2] < -1e-6, -half_length, 0.0))
+    places = radius * vertices + lift[:, None] * np.array([0.0, 0.0, 1.0])
+    return places[faces].astype(np.float32), vertices[faces].astype(np.float32)
+
+
+class _Frame:
+    """A picture that is being drawn."""
+
+    def __init__(self, camera: Camera, width: int, height: int):
+        self._camera, self._width, self._height = camera, width, height
+        self._axes = camera.axes()
+        self._focus = height / 2 / np.tan(np.radians(camera.field_of_view) / 2)
+        right = self._axes[0]
+        key = _KEY @ np.stack([right, np.cross([0.0, 0.0, 1.0], right), [0.0, 0.0, 1.0]])
+        self._key = (key / np.linalg.norm(key)).astype(np.float32)
+        self._nearness = np.zeros(width * height, np.float32)
+        """One over the depth of what each sample shows."""
+        share = np.linspace(1, 0, height, dtype=np.float32)[:, None, None]
+        self.image = np.broadcast_to(share * _TOP + (1 - share) * _BOTTOM, (height, width, 3)).reshape(-1, 3)
+
+    def finer(self) -> "_Frame":
+        """The same picture with more samples."""
+        fine = _Frame(self._camera, SAMPLES * self._width, SAMPLES * self._height)
+        grid = self.image.astype(np.float32).reshape(self._height, self._width, 3)
+        fine.image = grid.repeat(SAMPLES, 0).repeat(SAMPLES, 1).reshape(-1, 3)
+        nearness = self._nearness.reshape(self._height, self._width)
+        fine._nearness = nearness.repeat(SAMPLES, 0).repeat(SAMPLES, 1).ravel()
+        return fine
+
+    def add(self, patches: list[Patch], alpha: float = 1.0) -> None:
+        """Draws triangles where they are nearest."""
+        if not patches:
+            return
+        corners, normals, colours = (np.concatenate(parts) for parts in list(zip(*patches, strict=True))[:3])
+        closed = np.concatenate([np.full(len(patch.corners), patch.closed) for patch in patches])
+        face, sample, weights, nearness = self._cover(corners, closed)
+        seen = nearness > self._nearness[sample] * (1 + 1e-6)
+        face, sample, nearness = face[seen], sample[seen], nearness[seen]
+        weights = [weight[seen] for weight in weights]
+        order = np.argsort(nearness)  # what is written last, the nearest, stays
+        owner = np.full(len(self._nearness), -1, np.int64)
+        owner[sample[order]] = order
+        mine = owner[owner >= 0]
+        face, sample = face[mine], sample[mine]
+        here = [weight[mine, None] for weight in weights]
+
+        def between(values: np.ndarray) -> np.ndarray:
+            return here[0] * values[face, 0] + here[1] * values[face, 1] + here[2] * values[face, 2]
+
+        colour = self._lit(between(colours), between(normals), between(corners))
+        self.image[sample] = alpha * colour + (1 - alpha) * self.image[sample]
+        if alpha >= 1:
+            self._nearness[sample] = nearness[mine]
+
+    def add_disc(self, shape: Shape, above: list[Patch]) -> None:
+        """Draws the upper face of an upright cylinder, and the shadow that triangles above cast on it."""
+        top = shape.position[2] + shape.size[1]
+        y, x = np.divmod(np.arange(self._width * self._height), self._width)
+        rays = self._camera.rays(x + 0.5, y + 0.5, self._width, self._height)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = (top - self._camera.position[2]) / rays[:, 2]
+        way = np.where(rays[:, 2] < 0, way, np.inf)
+        sample = np.flatnonzero(np.isfinite(way))
+        places = self._camera.position + way[sample, None] * rays[sample]
+        inside = np.linalg.norm(places[:, :2] - shape.position[:2], axis=-1) < shape.size[0]
+        sample, places = sample[inside], places[inside]
+        light = np.ones(self._width * self._height, np.float32)
+        for patch in above:
+            height = np.maximum(patch.corners[..., 2] - top, 0.0)
+            on_table = patch.corners - height[..., None] / self._key[2] * self._key
+            light[self._cover(on_table)[1]] = 1 - _SHADOW
+        soft = gaussian_filter(light.reshape(self._height, self._width), _SOFT * self._height).ravel()
+        normal = np.broadcast_to([0.0, 0.0, 1.0], places.shape)
+        colour = self._lit(np.broadcast_to(shape.colour, places.shape), normal, places, soft[sample], shine=0.0)
+        self.image[sample] = colour
+        self._nearness[sample] = 1 / ((places - self._camera.position) @ self._axes[2])
+
+    def _cover(
+        self, corners: np.ndarray, closed: np.ndarray | bool = False
+    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
+        """Samples (n,) that triangles (F, 3, 3) cover: the triangle, the sample, the corners' weights, the nearness."""
+        local = (corners - self._camera.position) @ self._axes.T
+        depth = local[..., 2]
+        near = np.where(depth > _NEAR, depth, np.nan)
+        x = self._width / 2 + self._focus * local[..., 0] / near - 0.5
+        y = self._height / 2 - self._focus * local[..., 1] / near - 0.5
+        area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
+        shown = np.abs(area) > 1e-6  # false for what is not wholly before the camera
+        # The picture's y points down: what winds outwards and faces the camera has a negative area.
+        face = np.flatnonzero(shown & ~(closed & (area > 0)))
+        x, y, area, depth = x[face], y[face], area[face], depth[face]
+        left, upper = (np.ceil(v.min(1)).clip(0) for v in (x, y))
+        right = np.floor(x.max(1)).clip(max=self._width - 1)
+        lower = np.floor(y.max(1)).clip(max=self._height - 1)
+        across, down = (right - left + 1).clip(0).astype(int), (lower - upper + 1).clip(0).astype(int)
+        counts = across * down
+        which = np.repeat(np.arange(len(face)), counts)
+        number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+        rows, columns = np.divmod(number, across[which])
+        columns, rows = (columns + left[which]).astype(np.float32), (rows + upper[which]).astype(np.float32)
+        # Weights are linear over the picture.
+        weights = []
+        inside = np.ones(len(which), bool)
+        for one, other in ((1, 2), (2, 0), (0, 1)):
+            a = (y[:, one] - y[:, other]) / area
+            b = (x[:, other] - x[:, one]) / area
+            c = (x[:, one] * y[:, other] - x[:, other] * y[:, one]) / area
+            weights.append(a[which] * columns + b[which] * rows + c[which])
+            inside &= weights[-1] >= 0
+        which = which[inside]
+        sample = (rows[inside] * self._width + columns[inside]).astype(np.int64)
+        over = [weight[inside] / depth[which, corner] for corner, weight in enumerate(weights)]
+        nearness = over[0] + over[1] + over[2]
+        return face[which], sample, [part / nearness for part in over], nearness
+
+    def _lit(
+        self,
+        albedo: np.ndarray,
+        normal: np.ndarray,
+        place: np.ndarray,
+        light: np.ndarray | float = 1.0,
+        shine: float = 1.0,
+    ) -> np.ndarray:
+        """(n, 3) sRGB of points (n, 3); normals are turned to the camera, so that a mesh may wind either way."""
+        rays = place - self._camera.position.astype(np.float32)
+        rays, normal = _unit(rays), _unit(normal)
+        normal = np.where(_dot(normal, rays)[:, None] > 0, -normal, normal)
+        half = _unit(self._key - rays)
+        total = _KEY_STRENGTH * light * np.clip(normal @ self._key, 0, None)
+        total += _SKY_STRENGTH * (0.6 + 0.4 * normal[:, 2]) * (0.5 + 0.5 * np.asarray(light)) + _BOUNCE
+        gloss = shine * _SHINE * np.clip(_dot(normal, half), 0, None) ** 60
+        return np.clip(albedo**_GAMMA * total[:, None] + gloss[:, None], 0, 1) ** (1 / _GAMMA)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", a, b)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / (np.sqrt(_dot(vectors, vectors)) + 1e-12)[:, None]

@@ -1,0 +1,46 @@
+"""The benchmark's reference goes through what the actor went through."""
+
+import numpy as np
+
+from actors.physics.engine import World
+from actors.physics.native import NativePhysics
+from common.config import TaskConfig
+from common.hands import get_hand
+from common.objects import procedural
+from services.bench.physics import Recorder, replay
+
+HAND = get_hand("human")
+TASK = TaskConfig()
+WORLDS = 3
+
+
+def test_a_replay_ends_in_the_very_states_of_the_recording():
+    box = procedural.generate(0, "box")
+    height = float(np.abs(box.points[:, 2]).max())
+    one = np.ones((WORLDS, 1))
+    world = World(
+        object_index=np.zeros(WORLDS, int),
+        mass_scale=np.linspace(0.5, 1.5, WORLDS),
+        friction=np.ones(WORLDS),
+        base_position=one * [0.0, -0.05, 0.5],
+        base_quaternion=one * [0.0, 1.0, 0.0, 0.0],  # palm up, under the object
+        q=np.zeros((WORLDS, len(HAND.joints))),
+        object_position=one * [0.0, 0.0, 0.52 + height],
+        object_quaternion=one * [1.0, 0.0, 0.0, 0.0],
+        stationary=np.zeros(WORLDS, bool),
+    )
+    recorder, twin = (make(HAND, TASK, [box], 2) for make in (Recorder, NativePhysics))
+    rng = np.random.default_rng(0)
+    state, touched = recorder.start(world), False
+    for step in range(20):
+        targets = 0.03 * rng.normal(size=(WORLDS, 6 + len(HAND.joints)))
+        state, seen = recorder.step(state, targets, np.full(WORLDS, step < 10))
+        touched |= bool(seen.contact_found.any())
+    assert touched
+    twin.start(world)
+    replay(twin, recorder.commands, TASK.substeps)
+    for a, b in zip(recorder.cells, twin.cells, strict=True):
+        np.testing.assert_array_equal(a.data.qpos, b.data.qpos)
+        np.testing.assert_array_equal(a.data.mocap_pos, b.data.mocap_pos)
+    recorder.close()
+    twin.close()

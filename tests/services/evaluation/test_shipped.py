@@ -1,0 +1,27 @@
+"""The policy that comes with the package grasps objects that it never saw."""
+
+import pytest
+
+from common.objects.pool import HELD_OUT_SEED
+from common.objects.procedural import generate_many
+from common.policy import bundle as bundles
+from common.policy.shipped import shipped
+from services.evaluation.evaluate import Evaluator
+
+EPISODES = 24
+
+
+@pytest.mark.timeout(300)
+def test_the_shipped_policy_grasps_under_every_constraint():
+    """A broken bundle, or physics that it does not know, falls far below these floors."""
+    path = shipped("human")
+    assert path is not None
+    objects = generate_many(8, HELD_OUT_SEED, ("bottle", "cylinder", "dumbbell", "hammer", "ellipsoid", "flashlight"))
+    evaluator = Evaluator(bundles.load(path), objects, batch=48)
+    rows = {row.constraint: row for row in evaluator.rows(["heading", "pose", "trajectory", "affordance"], EPISODES)}
+    for name, row in rows.items():
+        assert row.success > 0.8, name
+    assert rows["heading"].errors["heading_rad"] < 0.35
+    assert rows["pose"].errors["pose_rad"] < 0.3
+    assert rows["trajectory"].errors["traj_m"] < 0.04
+    assert rows["affordance"].errors["affordance_ratio"] < 0.3

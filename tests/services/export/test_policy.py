@@ -1,0 +1,165 @@
+"""An exported policy answers as the Flax policy does, says what its numbers mean, and runs without JAX."""
+
+import importlib.util
+import json
+import pathlib
+import subprocess
+import sys
+import zipfile
+from typing import Any
+
+import jax.export
+import numpy as np
+import onnxruntime
+import pytest
+from scipy.spatial.transform import Rotation
+
+from common.config import NetworkConfig, TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.policy import bundle as bundles
+from common.policy import network
+from common.policy.bundle import PolicyBundle, policy_spec
+from common.policy.normalizer import Statistics
+from common.policy.shipped import policy_file
+from common.task import observation
+from common.task.features import features
+from common.task.types import CONTACTS_PER_LINK, MASKS, Goal, SceneState, Surface
+from services.export import policy as exports
+
+ROOT = pathlib.Path(__file__).resolve().parents[3]
+EXAMPLE = ROOT / "examples" / "onnx_grasp.py"
+
+
+@pytest.fixture(scope="module")
+def bundle() -> PolicyBundle:
+    """A policy whose normalisation and biases do something."""
+    spec = policy_spec(TaskConfig(), NetworkConfig(hidden=(32, 16), encoder=8))
+    rng = np.random.default_rng(0)
+    size = sum(width for _, width in spec.layout)
+    params = network.init(1, spec.layout, spec.action_size, spec.network)
+    for layer in params["actor"]["network"].values():
+        layer["bias"] = rng.normal(size=layer["bias"].shape).astype(np.float32)
+    seen = Statistics(np.float64(1000), rng.normal(size=size), 1000 * rng.uniform(0.1, 4.0, size))
+    return PolicyBundle(spec, TaskConfig(), params, seen, Statistics(*np.ones(3)), 7, "e", 1)
+
+
+@pytest.mark.parametrize("kind", ["onnx", "stablehlo"])
+def test_exported_policies_answer_as_the_flax_policy(bundle: PolicyBundle, kind: str, tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "policy"
+    assert exports.export_policy(bundle, kind, path) <= 1e-5
+    # Other observations than those of the exporter, far outside the clip, and another batch size.
+    observations = 50 * exports.sample_observations(bundle, 33, seed=9)
+    expected = np.asarray(bundles.mean_action(bundle.spec.layout, bundle.acting, observations))
+    assert np.abs(expected).max() > 0.1
+    if kind == "onnx":
+        (got,) = onnxruntime.InferenceSession(path.read_bytes()).run(None, {"observation": observations})
+    else:
+        with zipfile.ZipFile(path) as archive:
+            got = jax.export.deserialize(bytearray(archive.read("policy.jax"))).call(observations)
+            assert archive.read("policy.mlirbc")[:4] == b"ML\xefR"  # MLIR bytecode
+            assert json.loads(archive.read("meta.json"))["hand"] == "human"
+    np.testing.assert_allclose(got, expected, atol=1e-5)
+
+
+def test_the_file_says_what_every_number_is(bundle: PolicyBundle, tmp_path: pathlib.Path) -> None:
+    exports.export_policy(bundle, "onnx", tmp_path / "policy.onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    meta = {name: json.loads(text) for name, text in session.get_modelmeta().custom_metadata_map.items()}
+    hand = get_hand("human")
+    for block, size in bundle.spec.layout:
+        assert sum(field["size"] for field in meta["observation"] if field["block"] == block) == size
+    assert [entry["joint"] for entry in meta["action"]] == [*(j.name for j in hand.joints), *meta["wrist_joints"]]
+    assert session.get_inputs()[0].shape == ["batch", sum(field["size"] for field in meta["observation"])]
+    assert session.get_outputs()[0].shape == ["batch", len(meta["action"])]
+    assert "w, x, y, z" in meta["units"] and meta["version"] == 7
+
+
+@pytest.mark.parametrize("kind", ["onnx", "stablehlo"])
+def test_a_file_that_answers_differently_is_not_written(
+    bundle: PolicyBundle, kind: str, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = getattr(exports, f"_run_{kind}")
+    monkeypatch.setattr(exports, f"_run_{kind}", lambda encoded, x: run(encoded, x) + 2e-5)
+    with pytest.raises(CongraspError, match=r"differs from the Flax policy by 2\.\d+e-05"):
+        exports.export_policy(bundle, kind, tmp_path / "policy")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def shipped_onnx(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    path = tmp_path_factory.mktemp("onnx") / "policy.onnx"
+    exports.export_policy(bundles.load(policy_file(None)), "onnx", path)
+    return path
+
+
+def test_the_example_grasps_with_onnxruntime_alone(shipped_onnx: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    absent = "import sys, runpy; sys.modules.update(dict.fromkeys(['jax', 'flax', 'common', 'services', 'actors'])); "
+    code = f"{absent}sys.argv[1:] = [{str(shipped_onnx)!r}]; runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the cylinder is held" in done.stdout
+
+
+def test_the_example_observes_what_the_policy_was_trained_on(shipped_onnx: pathlib.Path) -> None:
+    spec: Any = importlib.util.spec_from_file_location("onnx_grasp", EXAMPLE)
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    grasp = example.Grasp(onnxruntime.InferenceSession(shipped_onnx))
+    for _ in range(57):  # the hand holds the object, and the table is gone
+        grasp.step()
+    hand, data, task = get_hand("human"), grasp.data, bundles.load(policy_file(None)).task
+    force, touching = grasp.forces()
+    assert touching.sum() >= 2
+    contacts = np.zeros((1, len(hand.links), CONTACTS_PER_LINK, 3))
+    contacts[0, :, 0] = force  # one contact a link that carries its whole force
+    found = np.zeros(contacts.shape[:-1], bool)
+    found[0, :, 0] = touching > 0
+
+    def turn(m: np.ndarray) -> np.ndarray:
+        return Rotation.from_matrix(m).as_quat(scalar_first=True)
+
+    now = data.xmat[grasp.object].reshape(3, 3)
+    state = SceneState(
+        q=data.qpos[grasp.fingers],
+        u=data.qpos[grasp.wrist],
+        q_velocity=data.qvel[grasp.finger_speeds],
+        u_velocity=data.qvel[grasp.wrist_speeds],
+        q_target=grasp.q_target,
+        u_target=grasp.u_target,
+        object_position=data.xpos[grasp.object],
+        object_quaternion=turn(now),
+        object_velocity=data.qvel[grasp.free : grasp.free + 3],
+        object_angular_velocity=now @ data.qvel[grasp.free + 3 : grasp.free + 6],
+        contact_force=contacts[0],
+        contact_position=contacts[0],
+        contact_found=found[0],
+        base_position=grasp.base_position,
+        base_quaternion=turn(grasp.base),
+        q_initial=hand.q_open,
+        object_position_initial=grasp.object_position,
+        object_quaternion_initial=turn(grasp.object_matrix),
+        time=np.float32(grasp.time),
+        table=np.bool_(False),
+    )
+    zeros = {name: np.zeros(3) for name in Goal._fields}
+    goal = Goal(**{
+        **zeros,
+        "heading_position": grasp.heading_position,
+        "heading_direction": example.HEADING,
+        "pose_q": np.zeros(len(hand.joints)),
+        "pose_quaternion": np.array([1.0, 0, 0, 0]),
+        "trajectory_position": np.zeros((task.trajectory_points, 3)),
+        "trajectory_quaternion": np.tile([1.0, 0, 0, 0], (task.trajectory_points, 1)),
+        "mask": np.zeros(len(MASKS)),
+    })  # fmt: skip
+
+    def batch(tree: Any) -> Any:
+        return type(tree)(*(np.asarray(x)[None].astype(bool if np.asarray(x).dtype == bool else "f4") for x in tree))
+
+    def observe(state: SceneState, surface: Surface, goal: Goal) -> Any:
+        return observation.observe(task, state, features(hand, task, state, surface, goal), goal)
+
+    surface = Surface(grasp.points, np.zeros(len(grasp.points), bool))
+    expected = np.asarray(jax.jit(observe)(batch(state), batch(surface), batch(goal)))[0]
+    np.testing.assert_allclose(grasp.observe(), expected, atol=2e-5)

@@ -1,0 +1,228 @@
+"""The live policy: answers, refusals in words, and swaps of weights, over both ends of the real wire."""
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import pathlib
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from common.config import NetworkConfig
+from common.errors import CongraspError, TransportError
+from common.policy import bundle as bundles
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.transport.ports import free_port
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message
+from services.operations.metrics import ServerMetrics, exposed
+from services.serving.client import PolicyClient
+from services.serving.inference import PolicyFunction
+from services.serving.load import example_episode, measure
+from services.serving.server import DEPTH, PolicyServer, follow_file, follow_run
+from services.training.presets import get_preset
+from services.training.quickstart import untrained
+from tests.services.operations.test_metrics import scrape
+
+pytestmark = pytest.mark.timeout(300)
+CONFIG = dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
+
+
+@pytest.fixture(scope="module")
+def metrics():
+    """What the server is watched by."""
+    return ServerMetrics()
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory, metrics):
+    """A server over Zenoh that follows a policy file, and the start of an episode."""
+    path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
+    bundles.save(untrained(CONFIG), path)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ZenohTransport(listen=[endpoint], flows=("policy",)) as transport:
+        server = PolicyServer(transport, "policy", follow_file(path), on_answer=metrics.answer, on_batch=metrics.batch)
+        metrics.health = server.health
+        yield path, endpoint, example_episode(1_000_000)
+        server.close()
+
+
+def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
+    _, endpoint, episode = served
+    with PolicyClient(endpoint) as client:
+        client.reset(**episode["reset"])
+        first, second = (client.act(episode["state"]) for _ in range(2))
+        assert client.health()["ready"] and client.health()["hand"] == "human"
+    assert first.q_target.shape == (20,) and first.u_target.shape == (6,) and first.action.shape == (26,)
+    assert first.version == 0 and first.active == ("The heading guides the wrist.",)
+    # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the limits.
+    expected = first.q_target + 0.1 * second.action[:20]
+    np.testing.assert_allclose(second.q_target[3:7], expected[3:7], atol=1e-4)
+
+
+def test_answers_refusals_and_batches_are_counted(served, metrics):
+    _, endpoint, episode = served
+    port = free_port()
+    with PolicyClient(endpoint) as client, exposed(port, "127.0.0.1", metrics):
+        before = scrape(port)
+        client.reset(**episode["reset"])
+        for _ in range(3):
+            client.act(episode["state"])
+        client.reset(**{**episode["reset"], "constraints": ["levitation"]})
+        with pytest.raises(TransportError):
+            client.act(episode["state"])
+        after = scrape(port)
+    grown = {name: value - before[name] for name, value in after.items()}
+    assert grown["congrasp_policy_queries_total", "answered"] == 3 == grown["congrasp_policy_seconds_count",]
+    assert grown["congrasp_policy_queries_total", "refused"] == 1
+    assert grown["congrasp_policy_batch_count",] == 3 == grown["congrasp_policy_batch_sum",]
+    assert after["congrasp_policy_ready",] == 1 and after["congrasp_policy_version",] == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"constraints": ["levitation"]}, "no constraint 'levitation'"),
+        ({"constraints": ["affordance"]}, "neither a heading"),
+        ({"constraints": ["pose"]}, "lacks the field 'pose_q'"),
+        ({"heading_direction": np.array([0.0, 0.0, 2.0])}, "not 1"),
+        ({"heading_position": np.array([np.nan, 0.0, 0.0])}, "not finite"),
+        ({"surface": np.zeros((5, 2))}, "surface_points"),
+        ({"q": np.zeros(7)}, "shape"),
+    ],
+)
+def test_bad_queries_are_refused_in_words_and_nobody_else_suffers(served, change, words):
+    _, endpoint, episode = served
+    with PolicyClient(endpoint) as client:
+        client.reset(**{**episode["reset"], **change})
+        with pytest.raises(TransportError, match=words):
+            client.act(episode["state"])
+        client.reset(**episode["reset"])
+        assert client.act(episode["state"]).version == 0
+
+
+def test_constraints_that_contradict_each_other_are_refused_alone(served):
+    """A trajectory that ends on the part that must not be touched; one that ends on the other part is answered."""
+    _, endpoint, episode = served
+    points = np.asarray(episode["reset"]["surface"])
+    minus = points[:, 0] > np.median(points[:, 0])
+    count = CONFIG.task.trajectory_points
+    asked = {
+        **episode["reset"],
+        "constraints": ["trajectory", "affordance"],
+        "surface_minus": minus,
+        "trajectory_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+    }
+    with PolicyClient(endpoint) as client:
+        client.reset(**asked, trajectory_position=np.tile(points[points[:, 0].argmax()], (count, 1)))
+        with pytest.raises(TransportError, match=r"contradict each other: the trajectory ends nearer to O-"):
+            client.act(episode["state"])
+        client.reset(**asked, trajectory_position=np.tile(points[points[:, 0].argmin()], (count, 1)))
+        assert "The affordance keeps the fingers off O-." in client.act(episode["state"]).active
+
+
+def test_many_clients_and_a_swap_of_weights_without_a_failed_query(served):
+    path, endpoint, episode = served
+    newer = dataclasses.replace(untrained(CONFIG), version=7)
+    bundles.save(newer, path)
+    result = measure(endpoint, "policy", episode, repeat=200, concurrency=4, timeout=5.0)
+    assert result["failed"] == 0 and result["overloaded"] == 0
+    with PolicyClient(endpoint) as client:
+        for _ in range(100):
+            client.reset(**episode["reset"])
+            if client.act(episode["state"]).version == 7:
+                return
+    raise AssertionError("the server never took the newer policy")
+
+
+def test_a_client_of_another_hand_is_refused(served):
+    _, endpoint, episode = served
+    with PolicyClient(endpoint, hand="paw") as client:
+        client.reset(**episode["reset"])
+        with pytest.raises(TransportError, match="no hand 'paw'"):
+            client.act(episode["state"])
+
+
+def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, metrics, monkeypatch):
+    _, endpoint, episode = served
+    entered, go = threading.Semaphore(0), threading.Event()
+    infer = PolicyFunction.__call__
+
+    def hold(self, weights, queries):
+        entered.release()
+        assert go.wait(60)
+        return infer(self, weights, queries)
+
+    monkeypatch.setattr(PolicyFunction, "__call__", hold)
+
+    def ask(client: PolicyClient) -> int:
+        client.reset(**episode["reset"])
+        return client.act(episode["state"]).version
+
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(PolicyClient(endpoint, timeout=50.0)) for _ in range(DEPTH + 2)]
+        pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(len(clients)))
+        stack.callback(go.set)
+        asked = [pool.submit(ask, clients[0])]
+        assert entered.acquire(timeout=60)
+        asked += [pool.submit(ask, client) for client in clients[1:-1]]
+        deadline = time.monotonic() + 60
+        while clients[-1].health()["queue"] < DEPTH:
+            assert time.monotonic() < deadline, "the queue never filled"
+            time.sleep(0.01)
+        with pytest.raises(TransportError, match="Overloaded"):
+            ask(clients[-1])
+        assert metrics.outcomes["overloaded"] == 1
+        assert not any(future.done() for future in asked)
+        go.set()
+        assert len({future.result(60) for future in asked}) == 1
+
+
+def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(served):
+    path, endpoint, _ = served
+    with PolicyClient(endpoint) as client:
+        version = client.health()["version"]
+        for other, words in (
+            (dataclasses.replace(CONFIG.task, dynamic_center=False), "another task"),
+            (dataclasses.replace(CONFIG.task, trajectory_points=3), "is needed"),
+        ):
+            policy = untrained(dataclasses.replace(CONFIG, task=other))
+            bundles.save(dataclasses.replace(policy, version=99), path)
+            deadline = time.monotonic() + 60
+            while words not in client.health()["trouble"]:
+                assert time.monotonic() < deadline, client.health()
+                time.sleep(0.05)
+            assert client.health()["version"] == version
+
+
+def test_following_a_run_pulls_only_what_is_newer():
+    keys, policy = Keys("r"), untrained(CONFIG)
+    with MemoryTransport(MemoryHub()) as transport:
+        pull = follow_run(transport, "r")
+        with pytest.raises(TransportError):
+            pull(-1)
+
+        def weights(key: str, request: Message) -> Message:
+            current = request.meta["newer_than"] == policy.version
+            return Message({}, {"version": policy.version}) if current else policy.to_message()
+
+        transport.serve(keys.weights, weights)
+        assert pull(-1).version == policy.version
+        assert pull(policy.version) is None
+
+
+def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: pathlib.Path):
+    with MemoryTransport(MemoryHub()) as transport:
+        with pytest.raises(CongraspError, match="cannot be read"):
+            PolicyServer(transport, "p", follow_file(tmp_path / "none.safetensors"))
+        broken = tmp_path / "broken.safetensors"
+        broken.write_bytes(b"PK\x03\x04 not a policy")
+        with pytest.raises(CongraspError, match="damaged"):
+            PolicyServer(transport, "p", follow_file(broken))
+        with pytest.raises(CongraspError, match="no policy to serve"):
+            PolicyServer(transport, "p", lambda version: None)
+        with pytest.raises(TransportError):
+            transport.query(Keys("p").health, Message({}, {}), timeout=0.5)
