@@ -181,7 +181,7 @@ def recorded(out: pathlib.Path) -> int:
 
 
 def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path: pathlib.Path) -> None:
-    endpoint = free_endpoint(free_port)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as transport:
         process = start_recorder(endpoint, tmp_path / "out")
         try:
@@ -200,7 +200,7 @@ def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path: pathlib.Path)
 
 
 def test_a_killed_recorder_leaves_a_readable_file_and_the_run_goes_on(tmp_path: pathlib.Path) -> None:
-    endpoint = free_endpoint(free_port)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as transport:
         process = start_recorder(endpoint, tmp_path / "out")
         try:
@@ -234,7 +234,7 @@ def doctor(path: pathlib.Path) -> set[str]:
 
 def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:
     """Twenty megabytes are published at it, more than it may keep; when it goes on, it says how much it missed."""
-    endpoint = free_endpoint(free_port)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     big, big_size = Message({"x": np.zeros(250_000, np.float32)}, {"actor": "a"}), 1_000_000
     rollouts = KEYS.log("rollout", "actor", "a")
 
