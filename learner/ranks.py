@@ -157,10 +157,6 @@ class Ranks:
             coordinator_bind_address=f"{bind or '[::]'}:{port}",
             shutdown_timeout_seconds=int(_SILENCE_SECONDS),
         )
-        if jax.default_backend() != "cpu":
-            # GPU programs are cached under keys that do not tell devices apart: one that rank 0 compiled for its own
-            # would be loaded by the others, and fail there.
-            jax.config.update("jax_enable_compilation_cache", False)
         first = {device.process_index: device for device in reversed(jax.devices())}
         ranks.mesh = Mesh(np.array([first[number] for number in range(count)]), (AXIS,))
         return ranks

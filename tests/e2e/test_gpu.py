@@ -46,16 +46,3 @@ def test_training_on_the_device_stops_and_goes_on(tmp_path):
     second = bundles.load(tmp_path / "run" / POLICY_FILE)
     assert second.version > first.version and second.epoch == first.epoch
     assert second.transitions * 3 == first.transitions * 5
-
-
-def test_two_ranks_start_beside_a_cache_that_one_rank_has_filled(tmp_path, monkeypatch):
-    """JAX's cache of compiled programs does not tell GPUs apart; the ranks must not share what is in it."""
-    if jax.device_count() < 2:
-        pytest.skip("two ranks need two GPUs")
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    small = ["--preset", "human", "--environments", 256, "--objects.count", 8, "--evaluation", 0, "--physics", "warp"]
-    congrasp("train", *small, "--updates", 1, "--run-dir", tmp_path / "one")
-    congrasp("train", *small, "--updates", 2, "--run-dir", tmp_path / "two", "--ranks", 2)
-    policy = bundles.load(tmp_path / "two" / POLICY_FILE)
-    assert policy.transitions == 2 * 2 * 256 * 75
