@@ -31,7 +31,7 @@ Probe = Callable[[SceneState, Features], Any]
 
 
 class Trace(NamedTuple):
-    """What is kept of world 0 at every step, for logs and pictures (T leads)."""
+    """What is kept of world 0, or of several, at every step, for logs and pictures (T leads)."""
 
     q: Array
     u: Array
@@ -91,6 +91,7 @@ class RolloutWorker:
         seed: int,
         half: bool,
         probe: Probe = lambda scene, seen: None,
+        traced: int | slice = 0,
     ):
         """Starts fresh episodes.
 
@@ -104,10 +105,11 @@ class RolloutWorker:
           seed: seed of episodes and actions.
           half: observations are rounded to float16, for the policy as well as for the learner.
           probe: what else to keep of every step.
+          traced: of which worlds a trace is kept.
         """
         self.physics = physics
         self._hand, self._task, self._taskset, self._policy = hand, task, taskset, policy
-        self._probe = probe
+        self._probe, self._traced = probe, traced
         self._dtype = jnp.float16 if half else jnp.float32
         self._weights, self._control, self._stationary = task.reward, task.control, np.array(False)
         episode_key, self._key = jax.random.split(jax.random.key(seed))
@@ -181,7 +183,7 @@ class RolloutWorker:
         self, weights: Any, env: EnvironmentState, readout: Readout, target: Action, action: Array
     ) -> tuple[EnvironmentState, environment.Score, SceneState, Features, tuple[Trace, Any]]:
         env, score, scene, seen = environment.score(self._hand, self._task, weights, env, readout, target)
-        return env, score, scene, seen, (traced(scene, seen, action, score), self._probe(scene, seen))
+        return env, score, scene, seen, (traced(scene, seen, action, score, self._traced), self._probe(scene, seen))
 
     def _advance(
         self,
@@ -281,9 +283,7 @@ class RolloutWorker:
         return carry, Rollout(*(*columns, last, env.finished, env.has_finished, trace, probed))
 
 
-def traced(
-    scene: SceneState, seen: Features, action: Array, score: environment.Score, worlds: int | slice = 0
-) -> Trace:
+def traced(scene: SceneState, seen: Features, action: Array, score: environment.Score, worlds: int | slice) -> Trace:
     """What is kept of a step of one world, or of several."""
     force = jnp.sum(jnp.where(scene.contact_found[worlds][..., None], scene.contact_force[worlds], 0.0), -2)
     return Trace(

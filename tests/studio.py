@@ -120,4 +120,4 @@ def take_mesh(path: pathlib.Path) -> tuple[GraspObject, list[str]]:
 
 def session(grasping: MadeUpGrasping | None = None, **more: Any) -> Session:
     made = grasping or MadeUpGrasping()
-    return Session({"human": lambda: made}, objects(), take_mesh, **more)
+    return Session({"of the run": lambda: made}, objects(), take_mesh, **more)

@@ -127,10 +127,11 @@ def evaluate(
         draw_noise(evaluator, noisy, pictures, title)
         console.print(f"Curves and examples of noisy references are drawn in {pictures}.", soft_wrap=True)
     if pictures is not None and names:
-        from services.evaluation.failures import failure_sheet
+        from services.evaluation.failures import failure_sheets
+        from services.pictures.sheets import save_png
 
-        for name in names:
-            failure_sheet(evaluator, loaded, name, pictures / f"{name}.png", _PICTURED, _PICTURED)
+        for name, sheet, _ in failure_sheets(evaluator, loaded, names, _PICTURED, _PICTURED):
+            save_png(pictures / f"{name}.png", sheet)
             console.print(f"Episodes of '{name}' are drawn in {pictures}.", soft_wrap=True)
     return 0
 
@@ -161,7 +162,8 @@ def _evaluator(
 
     from common.config import ObjectsConfig
     from common.objects.pool import HELD_OUT_SEED, load_pool
-    from services.evaluation.evaluate import Evaluator, two_seconds
+    from services.evaluation.evaluate import Evaluator
+    from services.evaluation.worlds import two_seconds
 
     track("Making constraints", None)
     return Evaluator(

@@ -1,62 +1,37 @@
 """Evaluation by the paper's protocol: the deterministic policy under chosen constraints on a pool of objects."""
 
 import contextlib
-import dataclasses
 import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from actors.environment import METRICS, EnvironmentState
 from actors.episode import episode_message
-from actors.physics import make_physics
-from actors.rollout import Rollout, RolloutWorker, finished_episodes, goal_of_world
+from actors.rollout import Rollout, RolloutWorker, Trace, finished_episodes, goal_of_world
 from actors.taskset import TaskSet, build_taskset
 from common.config import PhysicsName, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
-from common.hands.spec import Hand
 from common.objects.pool import sized
 from common.objects.spec import GraspObject
-from common.policy.bundle import PolicyBundle, mean_action
-from common.task.features import Features
-from common.task.types import Array, SceneState, Surface
+from common.policy.bundle import PolicyBundle
+from common.task.types import Surface
 from common.wire.codec import Message
 from services.evaluation.noise import LEVELS, Noise, disturbed
 from services.evaluation.scores import Row, Sample, active_mask, joined, matching, summarise
+from services.evaluation.worlds import acting, mixture, protocol, two_seconds
 
-HOLD_SECONDS = 2.0
-"""How long a grasp should last without the table, beyond the paper's quarter of a second."""
 _BATCH = {"native": 64, "warp": 4096, "jax": 256}
 _PATIENCE = 100
 _REFERENCES = 4
 """References that an object needs, on average."""
-
-
-def mixture(task: TaskConfig, constraints: Sequence[str]) -> TaskConfig:
-    """The task whose episodes belong to these rows, each row with the same probability or more than others."""
-    asked = [constraint.split("+") for constraint in constraints]
-
-    def probability(part: str) -> float:
-        share = sum(part in parts for parts in asked) / len(asked)
-        return share if share in (0.0, 1.0) else 0.5
-
-    return dataclasses.replace(
-        task,
-        p_affordance=probability("affordance"),
-        p_pose=probability("pose"),
-        p_trajectory=probability("trajectory"),
-    )
-
-
-def two_seconds(task: TaskConfig) -> int:
-    """Control steps in `HOLD_SECONDS`."""
-    return round(HOLD_SECONDS / task.control_dt)
+_KEPT = 8
+"""Episodes of a row that can be looked at afterwards: so many that hold the object to the end, and so many others."""
 
 
 class Evaluator:
@@ -92,14 +67,7 @@ class Evaluator:
         base = task or bundle.task
         hold = hold_steps or base.hold_steps
         self.bundle = bundle
-        self.task = dataclasses.replace(
-            base,
-            hold_steps=min(base.hold_steps, hold),
-            hold_steps_max=hold,
-            end_when_fallen=False,
-            mass_range=_nominal(base.mass_range),
-            friction_range=_nominal(base.friction_range),
-        )
+        self.task = protocol(base, hold)
         self._hold = hold
         self._hand = get_hand(bundle.spec.hand)
         self.objects = sized(self._hand, self.task, objects)
@@ -107,6 +75,7 @@ class Evaluator:
         self._batch = batch or _BATCH[physics]
         self._taskset = taskset or build_taskset(self._hand, self.task, self.objects, seed)
         self._referred = taskset is not None
+        self._kept: dict[str, dict[bool, list[Message]]] = {}
 
     def samples(
         self, constraints: Sequence[str], episodes: int, progress: Callable[[int], None] = lambda done: None
@@ -123,7 +92,8 @@ class Evaluator:
         """
         with self._worker(mixture(self.task, constraints), episodes) as worker:
             self._refer(worker, constraints)
-            return self._gather(worker, constraints, episodes, progress)
+            self._kept |= {constraint: {False: [], True: []} for constraint in constraints}
+            return self._gather(worker, constraints, episodes, progress, keep=True)
 
     def samples_of_pools(
         self,
@@ -189,12 +159,12 @@ class Evaluator:
 
     def noisy_example(self, noise: Noise) -> Message | None:
         """An episode under a noisy reference in which the object is held to the end, if there is one."""
-        taskset = self._taskset
+        kept = self._taskset, self._kept
         try:
-            self._taskset = disturbed(self._hand, taskset, noise, self._seed)
-            return next(iter(self.examples(noise.constraint, 1, 0)), None)
+            self._taskset, self._kept = disturbed(self._hand, self._taskset, noise, self._seed), {}
+            return next(iter(self.examples(noise.constraint, 1, 0, self._batch)), None)
         finally:
-            self._taskset = taskset
+            self._taskset, self._kept = kept
 
     def _refer(self, worker: RolloutWorker, constraints: Sequence[str]) -> None:
         """References from the policy's own grasps under headings, as the paper makes them for its hands; once."""
@@ -216,7 +186,12 @@ class Evaluator:
         worker.restart()
 
     def _gather(
-        self, worker: RolloutWorker, constraints: Sequence[str], episodes: int, progress: Callable[[int], None]
+        self,
+        worker: RolloutWorker,
+        constraints: Sequence[str],
+        episodes: int,
+        progress: Callable[[int], None],
+        keep: bool = False,
     ) -> dict[str, Sample]:
         for constraint in constraints:
             self._check_available(constraint)
@@ -230,10 +205,15 @@ class Evaluator:
                     f"Of {seen} episodes only {counts[scarce]} had the constraints '{scarce}'.",
                     "Ask for fewer --episodes, or add objects that allow these constraints.",
                 )
-            batch = self._batch_of_episodes(worker)
+            batch, message = self._batch_of_episodes(worker)
             seen += len(batch.values["success"])
             for name in constraints:
-                sample = batch.where(matching(batch.values, name)).first(episodes - counts[name])
+                fits = matching(batch.values, name)
+                sample = batch.where(fits).first(episodes - counts[name])
+                for row in np.flatnonzero(fits)[: episodes - counts[name]] if keep else ():
+                    kept = self._kept[name][bool(batch.values["held"][row] > 0)]
+                    if len(kept) < _KEPT:
+                        kept.append(message(int(row)))
                 found[name].append(sample)
                 counts[name] += len(sample.values["success"])
             progress(sum(counts.values()))
@@ -260,37 +240,15 @@ class Evaluator:
     def examples(self, constraint: str, successes: int, failures: int, most: int = 300) -> list[Message]:
         """Episodes of a row to look at, failures first; the object must be held to the end of the hold to succeed.
 
-        They are picked from up to `most` episodes of many worlds, and each is simulated once more alone, to be
-        recorded; the few that then end otherwise are left out.
+        They are some of those that `samples` evaluated last, or of `most` that are evaluated now.
 
         Raises:
           CongraspError: the pool does not allow these constraints.
         """
-        self._check_available(constraint)
-        task = mixture(self.task, [constraint])
-        wanted = {False: failures, True: successes}
-        chosen: dict[bool, list[EnvironmentState]] = {False: [], True: []}
-        with self._worker(task, most) as worker:
-            self._refer(worker, [constraint])
-            for _ in range(0, most, self._batch):
-                env = self._begin(worker)
-                values = self._batch_of_episodes(worker).values
-                for row in np.flatnonzero(matching(values, constraint)):
-                    held = bool(values["held"][row] > 0)
-                    if len(chosen[held]) < wanted[held]:
-                        chosen[held].append(_world(env, int(row)))
-                if all(len(chosen[held]) == count for held, count in wanted.items()):
-                    break
-        messages = []
-        with self._worker(task, 1) as alone:
-            for held, envs in chosen.items():
-                for env in envs:
-                    alone.begin(env._replace(key=alone.env.key))
-                    rollout = alone.collect(self.bundle.acting, self.task.approach_steps + self._hold)
-                    message = self._message(env, rollout)
-                    if (message.meta["metrics"]["held"] > 0) is held:
-                        messages.append(message)
-        return messages
+        if constraint not in self._kept:
+            self.samples([constraint], most)
+        kept = self._kept[constraint]
+        return [*kept[False][:failures], *kept[True][:successes]]
 
     def episode(self, constraint: str, tries: int = 1) -> Message:
         """An episode of one world under a set of constraints: the first that succeeds, or the last of `tries`.
@@ -299,27 +257,25 @@ class Evaluator:
           CongraspError: the pool does not allow these constraints.
         """
         self._check_available(constraint)
-        message: Message | None = None
         with self._worker(mixture(self.task, [constraint]), 1) as worker:
             for _ in range(_PATIENCE * tries):
-                env = self._begin(worker)
-                rollout = worker.collect(self.bundle.acting, self.task.approach_steps + self._hold)
-                if not matching(_metrics(rollout), constraint)[0]:
+                sample, message = self._batch_of_episodes(worker)
+                if not matching(sample.values, constraint)[0]:
                     continue
-                message, tries = self._message(env, rollout), tries - 1
-                if message.meta["success"] or not tries:
-                    return message
+                tries -= 1
+                if sample.values["success"][0] > 0 or not tries:
+                    return message(0)
         raise CongraspError(f"No episode had the constraints '{constraint}'.", "Choose other objects.")
 
-    def _message(self, env: EnvironmentState, rollout: Rollout) -> Message:
-        metrics = {name: float(column[0]) for name, column in _metrics(rollout).items()}
+    def _message(self, begun: EnvironmentState, trace: Trace, metrics: dict[str, float], world: int) -> Message:
+        """The episode of one of the worlds, from how all of them began and what was recorded of it."""
         return episode_message(
             self._hand,
             self.task,
-            rollout.trace,
-            goal_of_world(env.goal),
-            Surface(*(np.asarray(field)[0] for field in env.surface)),
-            self.objects[int(np.asarray(env.world.object_index)[0])],
+            trace,
+            goal_of_world(begun.goal, world),
+            Surface(*(np.asarray(field)[world] for field in begun.surface)),
+            self.objects[int(np.asarray(begun.world.object_index)[world])],
             {
                 "version": self.bundle.version,
                 "actor": "evaluation",
@@ -341,36 +297,27 @@ class Evaluator:
                 "An affordance needs labelled parts, poses and trajectories need room above the table.",
             )
 
-    @contextlib.contextmanager
-    def _worker(self, task: TaskConfig, episodes: int) -> Iterator[RolloutWorker]:
-        """Worlds that act by the policy's mean, not many more than `episodes` of each row need."""
+    def _worker(self, task: TaskConfig, episodes: int) -> contextlib.AbstractContextManager[RolloutWorker]:
+        """Acting worlds, not many more than `episodes` of each row need."""
         rows = 2 ** sum(p not in (0.0, 1.0) for p in (task.p_affordance, task.p_pose, task.p_trajectory))
-        batch = min(self._batch, 1 << (episodes * rows - 1).bit_length())
-        physics = make_physics(self._physics, self._hand, task, self.objects, threads=self._threads)
-        layout, hand = self.bundle.spec.layout, self._hand
-
-        def policy(acting: Any, observation: Array, key: Array) -> tuple[Array, Array]:
-            return mean_action(layout, acting, observation), observation[..., 0] * 0.0
-
-        def probe(scene: SceneState, seen: Features) -> tuple[Array, Array]:
-            force = jnp.linalg.norm(seen.force, axis=-1)
-            return force.astype(jnp.float16), torque_share(hand, scene).astype(jnp.float16)
-
-        try:
-            worker = RolloutWorker(
-                hand, task, physics, self._taskset, policy, batch=batch, seed=self._seed, half=False, probe=probe
-            )
-            yield worker
-        finally:
-            physics.close()
+        return acting(
+            self.bundle,
+            task,
+            self.objects,
+            self._taskset,
+            physics=self._physics,
+            threads=self._threads,
+            batch=min(self._batch, 1 << (episodes * rows - 1).bit_length()),
+            seed=self._seed,
+        )
 
     def _begin(self, worker: RolloutWorker) -> EnvironmentState:
         """Gives the episodes that begin now the full hold, whatever was drawn for them."""
         worker.env = worker.env._replace(hold=jnp.full_like(worker.env.hold, self._hold))
         return worker.env
 
-    def _batch_of_episodes(self, worker: RolloutWorker) -> Sample:
-        """One episode of every world; all of them begin and end together.
+    def _batch_of_episodes(self, worker: RolloutWorker) -> tuple[Sample, Callable[[int], Message]]:
+        """One episode of every world, and what gives the recording of one; all of them begin and end together.
 
         It is collected in pieces, so that a large batch's observations need not be in memory for all steps.
         """
@@ -378,32 +325,25 @@ class Evaluator:
         length = start + self._hold
         piece = math.gcd(start, self._hold)
         piece = piece if piece >= 10 else length
-        kept: list[Any] = []
-        self._begin(worker)
+        probed: list[Any] = []
+        traces: list[Trace] = []
+        begun = self._begin(worker)
         for step in range(0, length, piece):
             rollout = worker.collect(self.bundle.acting, piece)
+            traces.append(rollout.trace)
             if step + piece > start and step < start + window:
                 rows = slice(max(0, start - step), start + window - step)
-                kept.append([np.asarray(values)[rows].swapaxes(0, 1) for values in rollout.probed])
-        force, torque = (np.concatenate(parts, 1) for parts in zip(*kept, strict=True))
-        return Sample(_metrics(rollout), force, torque)
+                probed.append([np.asarray(values)[rows].swapaxes(0, 1) for values in rollout.probed])
+        force, torque = (np.concatenate(parts, 1) for parts in zip(*probed, strict=True))
+        values = _metrics(rollout)
 
+        def message(world: int) -> Message:
+            trace = Trace(
+                *(np.concatenate([np.asarray(x[:, world]) for x in field]) for field in zip(*traces, strict=True))
+            )
+            return self._message(begun, trace, {name: float(column[world]) for name, column in values.items()}, world)
 
-def _world(env: EnvironmentState, index: int) -> EnvironmentState:
-    """One of the worlds."""
-    return jax.tree.map(lambda x: x[index : index + 1], env._replace(key=env.bad))
-
-
-def _nominal(bounds: tuple[float, float]) -> tuple[float, float]:
-    middle = (bounds[0] + bounds[1]) / 2
-    return middle, middle
-
-
-def torque_share(hand: Hand, scene: SceneState) -> Array:
-    """(B, F) |clip(kp (q_target - q) - kv q_velocity, limit)| / limit: finger torques by the hand's position servos."""
-    gains = np.array([(joint.kp, joint.kv, joint.torque_limit) for joint in hand.joints], np.float32)
-    torque = gains[:, 0] * (scene.q_target - scene.q) - gains[:, 1] * scene.q_velocity
-    return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)
+        return Sample(values, force, torque), message
 
 
 def _metrics(rollout: Rollout) -> dict[str, np.ndarray]:

@@ -1,7 +1,6 @@
 """Failures and successes of a row as a contact sheet, each failure with its cause in words."""
 
-import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -9,7 +8,7 @@ from common.policy.bundle import PolicyBundle
 from common.wire.codec import Message
 from services.evaluation.evaluate import Evaluator
 from services.pictures.render import episode_strip
-from services.pictures.sheets import contact_sheet, save_png
+from services.pictures.sheets import contact_sheet
 
 _MOMENTS = 5
 _SIZE = (300, 225)
@@ -33,33 +32,32 @@ def cause(episode: Message, drop_height: float) -> str:
     return f"slipped {fell * episode.meta['control_dt']:.2f} s after the table went"
 
 
-def failure_sheet(
-    evaluator: Evaluator, policy: PolicyBundle, constraint: str, path: pathlib.Path, successes: int, failures: int
-) -> Sequence[str]:
-    """Draws episodes of a row, failures first.
+def failure_sheets(
+    evaluator: Evaluator, policy: PolicyBundle, constraints: Sequence[str], successes: int, failures: int
+) -> Iterator[tuple[str, np.ndarray, Sequence[str]]]:
+    """Draws episodes of rows, failures first.
 
     Args:
-      evaluator: of the policy.
-      policy: for the title.
-      constraint: name of the row.
-      path: the PNG file to write, if there is an episode to show.
-      successes: how many to show.
-      failures: how many to show, if there are so many.
+      evaluator: of the policy; episodes that it evaluated are not evaluated anew.
+      policy: for the titles.
+      constraints: names of the rows.
+      successes: how many of each to show.
+      failures: how many of each to show, if there are so many.
 
-    Returns:
-      What became of each episode, in words.
+    Yields:
+      For each row that has an episode to show: its name, the sheet (H, W, 3) uint8, and what became of each episode.
     """
-    episodes = evaluator.examples(constraint, successes, failures)
-    if not episodes:
-        return []
-    images: list[np.ndarray] = []
-    labels: list[str] = []
-    causes = [cause(episode, evaluator.task.drop_height) for episode in episodes]
-    for episode, what in zip(episodes, causes, strict=True):
-        pictures, words = episode_strip(episode, _MOMENTS, _SIZE, episode.meta["object"], f": {what}")
-        images += pictures
-        labels += words
-    who = f"{policy.spec.hand_name} hand, version {policy.version}"
-    title = f"{who}, {constraint}: {len(episodes)} episodes, failures first"
-    save_png(path, contact_sheet(images, labels, columns=_MOMENTS, title=title))
-    return causes
+    for constraint in constraints:
+        episodes = evaluator.examples(constraint, successes, failures)
+        if not episodes:
+            continue
+        images: list[np.ndarray] = []
+        labels: list[str] = []
+        causes = [cause(episode, evaluator.task.drop_height) for episode in episodes]
+        for episode, what in zip(episodes, causes, strict=True):
+            pictures, words = episode_strip(episode, _MOMENTS, _SIZE, episode.meta["object"], f": {what}", quick=True)
+            images += pictures
+            labels += words
+        who = f"{policy.spec.hand_name} hand, version {policy.version}"
+        title = f"{who}, {constraint}: {len(episodes)} episodes, failures first"
+        yield constraint, contact_sheet(images, labels, columns=_MOMENTS, title=title), causes

@@ -3,6 +3,7 @@
 import base64
 import collections
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,7 +12,7 @@ from common.errors import CongraspError
 from common.files import write_atomically
 from common.policy.bundle import PolicyBundle, content_hash
 from common.wire.codec import encode
-from services.evaluation.scores import FORCES, RATES, Row, force_cells, rate_cells
+from services.evaluation.scores import FORCES, Row, force_cells, paper_cells, rate_cells
 
 _LIMITS = (
     "What it is for: grasps in simulation, of rigid objects that fit the hand, under headings, affordances, reference "
@@ -65,17 +66,11 @@ def write_report(
     Raises:
       CongraspError: jinja2 is absent, or the file cannot be written.
     """
-    try:
-        import jinja2
-    except ImportError:
-        raise CongraspError("Reports need the package 'jinja2'.", "Run: pip install 'congrasp[viz]'") from None
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    template = environment.from_string(pathlib.Path(__file__).with_suffix(".html").read_text(encoding="utf-8"))
-    text = template.render(
-        title=f"{policy.spec.hand} hand, policy version {policy.version}",
+    text = template().render(
+        title=f"Grasping policy of the {policy.spec.hand} hand, version {policy.version}",
         summary=_summary(rows),
         conditions=conditions,
-        rates={"columns": RATES, "rows": [{"cells": rate_cells(row), "verdict": _verdict(row)} for row in rows]},
+        rates=[{"cells": _compared(row), "verdict": _verdict(row)} for row in rows],
         forces={"columns": FORCES, "rows": [force_cells(row) for row in rows]},
         command=made.table,
         sheets=[_embedded(sheet) for sheet in sheets],
@@ -88,6 +83,17 @@ def write_report(
     write_atomically(out, text.encode())
 
 
+@functools.cache
+def template() -> Any:
+    """The page that reports fill; a CongraspError if jinja2 is absent."""
+    try:
+        import jinja2
+    except ImportError:
+        raise CongraspError("Reports need the package 'jinja2'.", "Run: pip install 'congrasp[viz]'") from None
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    return environment.from_string(pathlib.Path(__file__).with_suffix(".html").read_text(encoding="utf-8"))
+
+
 def causes_in_words(causes: Sequence[str]) -> str:
     """Such as "2 held, 1 slipped 0.82 s after the table went"."""
     return ", ".join(f"{count} {cause}" for cause, count in collections.Counter(causes).items())
@@ -96,8 +102,19 @@ def causes_in_words(causes: Sequence[str]) -> str:
 def _summary(rows: Sequence[Row]) -> str:
     compared = [row for row in rows if row.paper]
     above = sum(row.success >= row.paper.success for row in compared if row.paper)
-    episodes = sum(row.episodes for row in rows)
-    return f"{episodes} episodes; at or above the paper's success in {above} of {len(compared)} rows that it has."
+    clear = collections.Counter(_verdict(row) for row in compared)
+    return (
+        f"{sum(row.episodes for row in rows)} episodes in simulation. Success is at or above the paper's in {above} of "
+        f"the {len(compared)} rows that it has; the 95 % interval is above it in {clear['better']} and below it in "
+        f"{clear['worse']}."
+    )
+
+
+def _compared(row: Row) -> tuple[str, ...]:
+    """A row's cells: rates, then errors, each followed by the paper's."""
+    name, episodes, success, held, errors, _ = rate_cells(row)
+    rate, paper_errors = paper_cells(row)
+    return name, episodes, success, rate, held, errors, paper_errors
 
 
 def _verdict(row: Row) -> str:

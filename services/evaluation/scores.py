@@ -280,8 +280,13 @@ def rate_cells(row: Row) -> tuple[str, ...]:
         _rate(row.success, row.success_low, row.success_high),
         _rate(row.held_2s, row.held_2s_low, row.held_2s_high),
         _errors(row.errors),
-        f"{_percent(row.paper.success)}  {_errors(row.paper.errors)}".strip() if row.paper else "",
+        "  ".join(paper_cells(row)).strip(),
     )
+
+
+def paper_cells(row: Row) -> tuple[str, str]:
+    """The paper's success and errors beside a row, empty where it has none."""
+    return (_percent(row.paper.success), _errors(row.paper.errors)) if row.paper else ("", "")
 
 
 def force_cells(row: Row) -> tuple[str, ...]:

@@ -10,8 +10,9 @@ from common.objects import procedural
 from common.objects.spec import GraspObject
 from common.parallel import parallel_map
 from common.policy.bundle import PolicyBundle
-from services.evaluation.evaluate import Evaluator, two_seconds
+from services.evaluation.evaluate import Evaluator
 from services.evaluation.scores import Row, Sample, joined, object_groups
+from services.evaluation.worlds import two_seconds
 
 POOL = 4096
 """Most objects that the worlds draw from at a time; then others take their place."""

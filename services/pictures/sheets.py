@@ -52,11 +52,16 @@ def _font(text: str, size: int, width: int) -> ImageFont.FreeTypeFont | ImageFon
     return font
 
 
-def save_png(path: pathlib.Path, image: np.ndarray) -> None:
-    """Writes (H, W, 3) uint8 as PNG, whole or not at all; a CongraspError names a path that cannot be written."""
+def png_of(image: np.ndarray) -> bytes:
+    """(H, W, 3) uint8 as a PNG file's content."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG", optimize=True)
-    write_atomically(path, buffer.getvalue())
+    return buffer.getvalue()
+
+
+def save_png(path: pathlib.Path, image: np.ndarray) -> None:
+    """Writes (H, W, 3) uint8 as PNG, whole or not at all; a CongraspError names a path that cannot be written."""
+    write_atomically(path, png_of(image))
 
 
 def save_video(path: pathlib.Path, frames: Iterable[np.ndarray], size: tuple[int, int], frame_rate: float) -> None:

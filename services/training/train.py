@@ -146,6 +146,8 @@ def train(
             child.start()
         transport = _connected(connect, learners[0], stop, credentials(certs, "observer"))
         if transport is not None:
+            watch = [f"congrasp view --connect {connect} --run {config.name} --recordings {run_dir}", *secure]
+            notify(f"Watch it in the browser with: {' '.join(watch)}")
             with transport:
                 _supervise(learners, children, transport, config.name, stop, report, notify)
     finally:

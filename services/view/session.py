@@ -136,6 +136,7 @@ class Session:
             return {
                 "studio": self._studio.view(),
                 "hands": list(self._hands),
+                "hand": self._hand,
                 "objects": self._objects.names,
                 "chosen": self._object,
                 "notes": self._notes,

@@ -13,7 +13,7 @@ import { ask, fetchMessage } from "./wire.js";
 const $ = (id) => document.getElementById(id);
 const BACKGROUND = [0.953, 0.961, 0.969];
 const SLOWEST = 34; // ms between two pictures while something moves
-const READABLE = 120; // ms between two changes of the numbers while a motion plays
+const READABLE = 200; // ms between two changes of the numbers while a motion plays
 
 class App {
   constructor() {
@@ -99,8 +99,8 @@ class App {
     if (before && before.hand !== studio.hand) await this.#hand(studio.hand);
     if (other || studio.object.name !== this.shownObject) {
       await this.#object(studio);
-      this.#frameAll(studio);
       this.closeMotion();
+      this.#frameAll(studio);
     } else if (studio.painted !== this.shownPaint) {
       this.shownPaint = studio.painted;
       this.body.paint((await fetchMessage("/api/paint")).arrays.minus.data);
@@ -126,6 +126,7 @@ class App {
     $("now").hidden = false;
     $("tools").hidden = $("hint").hidden = true;
     const { motion } = this;
+    this.looked ??= { target: this.camera.target, distance: this.camera.distance };
     $("scrub").max = motion.steps - 1;
     $("result").textContent = `${motion.meta.object}: ${motion.meta.success ? "success" : "no success"}, policy version ${motion.meta.version}`;
     $("result").className = motion.meta.success ? "good" : "bad";
@@ -144,6 +145,8 @@ class App {
   closeMotion() {
     this.motion = null;
     this.playing = false;
+    Object.assign(this.camera, this.looked); // the constraints are seen as before
+    this.looked = null;
     $("player").hidden = $("now").hidden = $("banner").hidden = true;
     $("tools").hidden = $("hint").hidden = false;
     this.redraw();
@@ -168,6 +171,7 @@ class App {
     $("show-studio").setAttribute("aria-pressed", String(name === "studio"));
     $("show-training").setAttribute("aria-pressed", String(name === "training"));
     this.training.open(name === "training");
+    if (name === "studio") this.panel.refresh();
     if (name === "studio" && this.motion && /^(actor|record):/.test(this.motion.id)) this.closeMotion();
     this.redraw();
   }

@@ -34,7 +34,8 @@ export class Body {
     this.vertices = vertices;
     this.faces = faces;
     const mesh = shapes.smooth(vertices, faces);
-    this.corners = mesh.positions;
+    this.points = mesh.positions;
+    this.vertex = mesh.vertex;
     this.colours = mesh.colours;
     this.normals = mesh.normals;
     this.mesh = renderer.mesh(mesh);
@@ -45,15 +46,15 @@ export class Body {
 
   // Colours by a label for each vertex; all alike without labels.
   paint(minus) {
-    for (let corner = 0; corner < this.faces.length; corner++) this.colours.set(minus && minus[this.faces[corner]] ? MINUS : OBJECT, 3 * corner);
+    this.vertex.forEach((vertex, i) => this.colours.set(minus && minus[vertex] ? MINUS : OBJECT, 3 * i));
     this.renderer.recolour(this.mesh, this.colours);
   }
 
   // Colours what a brush at a point of the object frame touches, until the server's answer is there.
   brush(point, radius, minus) {
     const colour = minus ? MINUS : OBJECT;
-    for (let i = 0; i < this.corners.length; i += 3) {
-      const [x, y, z] = [this.corners[i] - point[0], this.corners[i + 1] - point[1], this.corners[i + 2] - point[2]];
+    for (let i = 0; i < this.points.length; i += 3) {
+      const [x, y, z] = [this.points[i] - point[0], this.points[i + 1] - point[1], this.points[i + 2] - point[2]];
       if (x * x + y * y + z * z <= radius * radius) this.colours.set(colour, i);
     }
     this.renderer.recolour(this.mesh, this.colours);
@@ -63,21 +64,22 @@ export class Body {
   hit(origin, direction) {
     let nearest = Infinity;
     let normal = null;
-    const c = this.corners;
-    for (let i = 0; i < c.length; i += 9) {
-      const e1x = c[i + 3] - c[i], e1y = c[i + 4] - c[i + 1], e1z = c[i + 5] - c[i + 2];
-      const e2x = c[i + 6] - c[i], e2y = c[i + 7] - c[i + 1], e2z = c[i + 8] - c[i + 2];
+    const { vertices: v, faces } = this;
+    for (let f = 0; f < faces.length; f += 3) {
+      const [a, b, c] = [3 * faces[f], 3 * faces[f + 1], 3 * faces[f + 2]];
+      const e1x = v[b] - v[a], e1y = v[b + 1] - v[a + 1], e1z = v[b + 2] - v[a + 2];
+      const e2x = v[c] - v[a], e2y = v[c + 1] - v[a + 1], e2z = v[c + 2] - v[a + 2];
       const px = direction[1] * e2z - direction[2] * e2y;
       const py = direction[2] * e2x - direction[0] * e2z;
       const pz = direction[0] * e2y - direction[1] * e2x;
       const determinant = e1x * px + e1y * py + e1z * pz;
       if (Math.abs(determinant) < 1e-14) continue;
-      const tx = origin[0] - c[i], ty = origin[1] - c[i + 1], tz = origin[2] - c[i + 2];
+      const tx = origin[0] - v[a], ty = origin[1] - v[a + 1], tz = origin[2] - v[a + 2];
       const u = (tx * px + ty * py + tz * pz) / determinant;
       if (u < 0 || u > 1) continue;
       const qx = ty * e1z - tz * e1y, qy = tz * e1x - tx * e1z, qz = tx * e1y - ty * e1x;
-      const v = (direction[0] * qx + direction[1] * qy + direction[2] * qz) / determinant;
-      if (v < 0 || u + v > 1) continue;
+      const w = (direction[0] * qx + direction[1] * qy + direction[2] * qz) / determinant;
+      if (w < 0 || u + w > 1) continue;
       const far = (e2x * qx + e2y * qy + e2z * qz) / determinant;
       if (far > 1e-6 && far < nearest) {
         nearest = far;

@@ -4,6 +4,7 @@ import { add, cross, norm, perpendicular, scale, sub, unit } from "./math.js";
 
 const SECTIONS = 14;
 const RINGS = 4; // of a half ball
+const ALIKE = 0.9999; // cosine between normals that count as one
 
 function white(count) {
   return new Float32Array(count).fill(1);
@@ -112,7 +113,8 @@ export function table(radius) {
   return { ...builder.build(), colours: new Float32Array(colours) };
 }
 
-// An object's mesh with a normal for each corner: smooth where neighbouring faces turn by less than 35 degrees.
+// An object's mesh, smooth where neighbouring faces turn by less than 35 degrees. Corners at one vertex share a point of the
+// result where their normals agree; `vertex` says which vertex each point is at.
 export function smooth(vertices, faces) {
   const count = faces.length / 3;
   const at = (i) => [vertices[3 * i], vertices[3 * i + 1], vertices[3 * i + 2]];
@@ -129,18 +131,30 @@ export function smooth(vertices, faces) {
   }
   const turned = flat.map(unit);
   const crease = Math.cos((35 * Math.PI) / 180);
-  const positions = new Float32Array(9 * count);
-  const normals = new Float32Array(9 * count);
+  const made = new Map(); // points by vertex: [normal, index] of each
+  const positions = [];
+  const normals = [];
+  const vertex = [];
+  const indices = new Uint32Array(3 * count);
   for (let f = 0; f < count; f++)
     for (let k = 0; k < 3; k++) {
-      const vertex = faces[3 * f + k];
+      const v = faces[3 * f + k];
       let sum = [0, 0, 0];
-      for (const g of around.get(vertex)) {
+      for (const g of around.get(v)) {
         const cosine = turned[f][0] * turned[g][0] + turned[f][1] * turned[g][1] + turned[f][2] * turned[g][2];
         if (cosine > crease) sum = add(sum, flat[g]);
       }
-      positions.set(at(vertex), 9 * f + 3 * k);
-      normals.set(unit(sum), 9 * f + 3 * k);
+      const normal = unit(sum);
+      if (!made.has(v)) made.set(v, []);
+      let point = made.get(v).find(([other]) => other[0] * normal[0] + other[1] * normal[1] + other[2] * normal[2] > ALIKE);
+      if (!point) {
+        point = [normal, vertex.length];
+        made.get(v).push(point);
+        vertex.push(v);
+        positions.push(...at(v));
+        normals.push(...normal);
+      }
+      indices[3 * f + k] = point[1];
     }
-  return { positions, normals, colours: white(9 * count) };
+  return { positions: new Float32Array(positions), normals: new Float32Array(normals), colours: white(positions.length), indices, vertex };
 }

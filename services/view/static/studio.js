@@ -63,6 +63,12 @@ export class StudioPanel {
     return this.queue;
   }
 
+  // Shows what the server knows now, such as a run's newer weights.
+  async refresh() {
+    const state = await ask("/api/state").catch(() => null);
+    if (state) await this.show(state);
+  }
+
   busy(on) {
     document.body.toggleAttribute("data-busy", on);
   }
@@ -75,7 +81,7 @@ export class StudioPanel {
     try {
       this.error("");
       await upload("/api/upload", file);
-      await this.show(await ask("/api/state"));
+      await this.refresh();
     } catch (error) {
       this.error(error.message);
     }
@@ -85,7 +91,7 @@ export class StudioPanel {
   show(state) {
     const { studio } = state;
     this.state = state;
-    fill($("hand"), state.hands.map((name) => [name, name]), studio.hand);
+    fill($("hand"), state.hands.map((name) => [name, name]), state.hand);
     fill($("object"), state.objects.map((name) => [name, name]), state.chosen);
     const rests = Array.from({ length: studio.object.rests }, (_, i) => [String(i), i ? `resting pose ${i + 1}` : "as it lies best"]);
     fill($("rest"), rests, String(studio.rest.index));
@@ -133,8 +139,7 @@ export class StudioPanel {
       if (job?.running) this.#job(job);
     } while (!job || job.running);
     this.watching = false;
-    const state = await ask("/api/state").catch(() => null);
-    if (state) await this.show(state);
+    await this.refresh();
   }
 
   #motions(motions) {

@@ -100,6 +100,7 @@ export class TrainingPanel {
     }));
     this.#actors(view.actors);
     $("ledger").replaceChildren(...Object.entries(view.ledger).map(([name, value]) => row([name, String(value)])));
+    $("events").parentElement.hidden = !view.events.length;
     $("events").replaceChildren(...view.events.map(({ time, level, text }) => {
       const item = document.createElement("li");
       item.textContent = `${new Date(1000 * time).toLocaleTimeString()} ${text}`;

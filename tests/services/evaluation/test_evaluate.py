@@ -16,9 +16,10 @@ from common.objects import procedural
 from common.objects.store import Catalogue
 from common.policy import bundle as bundles
 from services.cli.main import load
-from services.evaluation.evaluate import Evaluator, mixture
+from services.evaluation.evaluate import Evaluator
 from services.evaluation.scores import Sample, matching
 from services.evaluation.unseen import evaluate_objects, procedural_pools
+from services.evaluation.worlds import mixture
 from services.training.quickstart import untrained
 
 CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))

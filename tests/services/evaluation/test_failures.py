@@ -4,12 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from common.objects.procedural import generate_many
 from common.wire.codec import Message
 from services.evaluation.evaluate import Evaluator
-from services.evaluation.failures import cause, failure_sheet
+from services.evaluation.failures import cause, failure_sheets
 from services.training.presets import get_preset
 from services.training.quickstart import untrained
 
@@ -37,11 +36,12 @@ def test_causes_in_words(metrics, said):
     assert cause(episode([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics), 0.05) == said
 
 
-def test_failures_of_an_untrained_policy_are_drawn(tmp_path):
+def test_failures_of_an_untrained_policy_are_drawn():
     config = get_preset("quickstart")
     policy = untrained(dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,))))
     evaluator = Evaluator(policy, generate_many(2, 0, ("box",)), batch=4)
-    causes = failure_sheet(evaluator, policy, "heading", tmp_path / "heading.png", successes=0, failures=3)
-    assert len(causes) == 3 and "held" not in causes
-    with Image.open(tmp_path / "heading.png") as image:
-        assert image.width > 5 * 300 and image.height > 3 * 225
+    sample = evaluator.samples(["heading"], 3)["heading"]
+    assert not sample.values["held"].any()
+    ((name, sheet, causes),) = failure_sheets(evaluator, policy, ["heading"], successes=2, failures=2)
+    assert name == "heading" and len(causes) == 2 and "held" not in causes
+    assert sheet.shape[0] > 2 * 225 and sheet.shape[1] > 5 * 300

@@ -71,8 +71,8 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
     # The paper has 96.9, 96.4 and 95.5 %: above it, below it, and within the interval.
     assert cells["99.0 % (97.5-99.5)"] == "better" and cells["90.0 % (85.0-95.0)"] == "worse"
     assert cells["96.0 % (93.0-98.0)"] == ""
-    assert "96.9 %  0.137 rad 0.020 m" in cells and "p & q.safetensors" in cells
-    assert "300 episodes; at or above the paper's success in 2 of 3 rows" in html.unescape(text)
+    assert cells["96.9 %"] == "paper" and "0.137 rad 0.020 m" in cells and "p & q.safetensors" in cells
+    assert "300 episodes in simulation. Success is at or above the paper's in 2 of the 3 rows" in html.unescape(text)
     assert "slipped &lt;b&gt;" in text and "--policy &lt;mine&gt;" in text
     assert len(found.sources) == 2 and not found.links
     for source in found.sources:

@@ -1,0 +1,113 @@
+"""The worlds of an evaluation: the task that is played in them, who acts, and what is measured at every step."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from actors.physics import make_physics
+from actors.rollout import RolloutWorker
+from actors.taskset import TaskSet
+from common.config import PhysicsName, TaskConfig
+from common.hands import get_hand
+from common.hands.spec import Hand
+from common.objects.spec import GraspObject
+from common.policy.bundle import PolicyBundle, mean_action
+from common.task.features import Features
+from common.task.types import Array, SceneState
+
+HOLD_SECONDS = 2.0
+"""How long a grasp should last without the table, beyond the paper's quarter of a second."""
+
+
+def two_seconds(task: TaskConfig) -> int:
+    """Control steps in `HOLD_SECONDS`."""
+    return round(HOLD_SECONDS / task.control_dt)
+
+
+def protocol(task: TaskConfig, hold: int) -> TaskConfig:
+    """The task with `hold` control steps without the table, and mass and friction in the middle of their ranges."""
+    return dataclasses.replace(
+        task,
+        hold_steps=min(task.hold_steps, hold),
+        hold_steps_max=hold,
+        end_when_fallen=False,
+        mass_range=_nominal(task.mass_range),
+        friction_range=_nominal(task.friction_range),
+    )
+
+
+def mixture(task: TaskConfig, constraints: Sequence[str]) -> TaskConfig:
+    """The task whose episodes belong to these rows, each row with the same probability or more than others."""
+    asked = [constraint.split("+") for constraint in constraints]
+
+    def probability(part: str) -> float:
+        share = sum(part in parts for parts in asked) / len(asked)
+        return share if share in (0.0, 1.0) else 0.5
+
+    return dataclasses.replace(
+        task,
+        p_affordance=probability("affordance"),
+        p_pose=probability("pose"),
+        p_trajectory=probability("trajectory"),
+    )
+
+
+@contextlib.contextmanager
+def acting(
+    bundle: PolicyBundle,
+    task: TaskConfig,
+    objects: Sequence[GraspObject],
+    taskset: TaskSet,
+    *,
+    physics: PhysicsName,
+    threads: int,
+    batch: int,
+    seed: int,
+) -> Iterator[RolloutWorker]:
+    """Worlds that act by the policy's mean, all of which are traced.
+
+    Each step's probe holds forces of the links (B, L), N, and finger torques (B, F) as shares of their limits.
+
+    Args:
+      bundle: the policy.
+      task: the task.
+      objects: what is grasped.
+      taskset: constraints on them.
+      physics: engine; not `auto`.
+      threads: threads of the `native` engine.
+      batch: B, number of worlds.
+      seed: seed of the episodes.
+    """
+    layout, hand = bundle.spec.layout, get_hand(bundle.spec.hand)
+
+    def policy(acting: Any, observation: Array, key: Array) -> tuple[Array, Array]:
+        return mean_action(layout, acting, observation), observation[..., 0] * 0.0
+
+    def probe(scene: SceneState, seen: Features) -> tuple[Array, Array]:
+        force = jnp.linalg.norm(seen.force, axis=-1)
+        return force.astype(jnp.float16), torque_share(hand, scene).astype(jnp.float16)
+
+    engine = make_physics(physics, hand, task, objects, threads=threads)
+    try:
+        whole = slice(None)
+        yield RolloutWorker(
+            hand, task, engine, taskset, policy, batch=batch, seed=seed, half=False, probe=probe, traced=whole
+        )
+    finally:
+        engine.close()
+
+
+def torque_share(hand: Hand, scene: SceneState) -> Array:
+    """(B, F) |clip(kp (q_target - q) - kv q_velocity, limit)| / limit: finger torques by the hand's position servos."""
+    gains = np.array([(joint.kp, joint.kv, joint.torque_limit) for joint in hand.joints], np.float32)
+    torque = gains[:, 0] * (scene.q_target - scene.q) - gains[:, 1] * scene.q_velocity
+    return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)
+
+
+def _nominal(bounds: tuple[float, float]) -> tuple[float, float]:
+    middle = (bounds[0] + bounds[1]) / 2
+    return middle, middle
