@@ -75,7 +75,7 @@ def report(
             task = progress.add_task(text, total=total)
             return lambda done: progress.update(task, completed=done)
 
-        curves = list(_curves(run_dir)) if run_dir else []
+        curves = list(curves_of(run_dir)) if run_dir else []
         given = objects_of(objects, track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
         track("Making constraints", None)
         evaluator = Evaluator(
@@ -106,16 +106,16 @@ def report(
     return 0
 
 
-def _curves(run_dir: pathlib.Path) -> "Iterator[Picture]":
+def curves_of(run_dir: pathlib.Path) -> "Iterator[Picture]":
     """Figures of a run's recordings, if it has any."""
     from common.logs.reader import read_metrics
     from services.evaluation.report import Picture
-    from services.pictures.plots import draw, figures
+    from services.pictures.plots import draw, encoded, figures
 
     if any(run_dir.rglob("*.mcap")):
         series = read_metrics(run_dir)
         for title, panels in figures(series).values():
-            yield Picture(title, draw(title, panels, series))
+            yield Picture(title, encoded(draw(title, panels, series)))
 
 
 COMMAND = report

@@ -85,12 +85,17 @@ def save(figure: Any, stem: pathlib.Path, formats: Sequence[str]) -> list[pathli
     """Writes a figure as `<stem>.<format>` for each format; returns the files."""
     files = []
     for kind in formats:
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, dpi=130)
-        figure.set_layout_engine("none")  # the layout is found; to find it again would take as long
         files.append(stem.with_name(f"{stem.name}.{kind}"))
-        write_atomically(files[-1], buffer.getvalue())
+        write_atomically(files[-1], encoded(figure, kind))
     return files
+
+
+def encoded(figure: Any, kind: str = "png") -> bytes:
+    """A figure as the content of a file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, dpi=130)
+    figure.set_layout_engine("none")  # the layout is found; to find it again would take as long
+    return buffer.getvalue()
 
 
 def new_figure(width: float, height: float, title: str) -> Any:

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from common.logs.channels import JsonChannels
+from common.logs.writer import LogWriter
+from services.cli.report import curves_of
 from services.evaluation.report import Made, Picture, causes_in_words, write_report
 from services.evaluation.scores import PAPER, Row
 from services.pictures.sheets import save_png
@@ -79,6 +82,17 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
         kind, content = source.split(",")
         assert kind == "data:image/png;base64"
         assert Image.open(io.BytesIO(base64.b64decode(content))).size == (8, 6)
+
+
+def test_a_runs_curves_are_pictures(tmp_path):
+    assert list(curves_of(tmp_path)) == []
+    writer, channels = LogWriter(tmp_path / "logs", "log"), JsonChannels()
+    for update in range(3):
+        values = {"update": update, "values": {"episode": {"success": 0.5}}}
+        writer.write(channels.entry("/metrics/learner/0", update, values))
+    writer.close()
+    (learning,) = curves_of(tmp_path)
+    assert learning.title == "Learning" and Image.open(io.BytesIO(learning.png)).width > 300
 
 
 def test_causes_are_counted():
