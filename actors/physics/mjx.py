@@ -74,7 +74,8 @@ class MjxPhysics:
             pool.model.opt.iterations, pool.model.opt.ls_iterations, pool.model.opt.tolerance = 4, 10, 1e-5
         self._host_model = pool.model
         self._body_of_geom = np.array(pool.model.geom_bodyid)
-        self._model = self._blind = mjx.put_model(pool.model, impl=implementation)
+        self._device = jax.local_devices()[0]  # MJX takes the first one of all ranks unless it is told
+        self._model = self._blind = mjx.put_model(pool.model, device=self._device, impl=implementation)
         if implementation == "warp":
             # Warp's kernels print every overflow and iteration limit; thousands of worlds would flood the log.
             quiet = self._model.opt._impl.replace(warn_overflow=0)
@@ -96,7 +97,7 @@ class MjxPhysics:
         batch = world.object_index.shape[0]
         warp = {"naconmax": CONTACTS_PER_WORLD * batch, "njmax": CONSTRAINTS_PER_WORLD}
         sizes = warp if self.name == "warp" else {}
-        data = mjx.make_data(self._host_model, impl=self.name, **sizes)
+        data = mjx.make_data(self._host_model, device=self._device, impl=self.name, **sizes)
         data = jax.vmap(lambda q: data.replace(qpos=q))(jnp.zeros((batch, self._nq)))
         return self._place(data, self._objects, world)
 

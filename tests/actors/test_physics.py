@@ -1,6 +1,10 @@
 """Engines: contacts, resets, guards, holding a weight, and agreement with each other."""
 
 import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +23,9 @@ from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
+from common.transport.ports import free_port
 
+ROOT = pathlib.Path(__file__).parents[2]
 HAND = get_hand("human")
 TASK = TaskConfig(p_pose=0.0, p_trajectory=0.0, p_affordance=0.0)
 OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "cylinder", "mug"])]
@@ -289,3 +295,19 @@ def test_object_velocity_is_in_the_world_frame(env):
     physics._qpos[0], physics._qvel[0] = cell.data.qpos, cell.data.qvel
     np.testing.assert_allclose(physics.read(state).object_angular_velocity[0], spin, atol=1e-5)
     physics.close()
+
+
+def test_an_engine_uses_its_own_ranks_device():
+    """Two processes of one job: JAX counts the devices of both, and MJX would take the first."""
+    port, environment = free_port(), {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "tests.actors.rank_engine"]
+    ranks = [
+        subprocess.Popen([*command, str(rank), str(port), "warp"], env=environment, stdout=subprocess.PIPE, text=True)
+        for rank in range(2)
+    ]
+    try:
+        for rank, process in enumerate(ranks):
+            assert process.communicate(timeout=120.0)[0].splitlines()[-1:] == [f"[{rank}] True"]
+    finally:
+        for process in ranks:
+            process.kill()

@@ -46,3 +46,11 @@ def test_training_on_the_device_stops_and_goes_on(tmp_path):
     second = bundles.load(tmp_path / "run" / POLICY_FILE)
     assert second.version > first.version and second.epoch == first.epoch
     assert second.transitions * 3 == first.transitions * 5
+
+
+def test_two_ranks_train_on_two_gpus(tmp_path):
+    if jax.device_count() < 2:
+        pytest.skip("two ranks need two GPUs")
+    run = ["train", "--run-dir", tmp_path / "run", "--evaluation", 0, "--physics", "warp", "--ranks", 2]
+    congrasp(*run, "--preset", "human", "--environments", 256, "--objects.count", 8, "--updates", 2)
+    assert bundles.load(tmp_path / "run" / POLICY_FILE).transitions == 2 * 2 * 256 * 75
