@@ -22,7 +22,7 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
     return 0
 
 
-def query(repeat: int = 1000, concurrency: int = 1) -> int:
+def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
     """Latency of a policy server in a process of its own that serves an untrained policy, over the loopback interface.
 
     The clients take their share of the machine; the server's own processor time for an answer is printed beside.
@@ -30,6 +30,7 @@ def query(repeat: int = 1000, concurrency: int = 1) -> int:
     Args:
       repeat: Queries in all.
       concurrency: Clients at the same time.
+      states: States in one query, up to 64; each gets an answer.
     """
     import tempfile
 
@@ -47,8 +48,8 @@ def query(repeat: int = 1000, concurrency: int = 1) -> int:
             with PolicyClient(endpoint, wait=60.0) as client:
                 wait_until_ready(client)
             before = processor_seconds(server)
-            result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0)
-            result["server_cpu_ms"] = 1e3 * (processor_seconds(server) - before) / repeat
+            result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0, states=states)
+            result["server_cpu_ms"] = 1e3 * (processor_seconds(server) - before) / repeat / states
     print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
     return 0
 

@@ -12,6 +12,7 @@ def query(
     object_seed: int = 1_000_000,
     repeat: int = 1,
     concurrency: int = 1,
+    states: int = 1,
     timeout: float = 1.0,
     certs: pathlib.Path | None = None,
     health: bool = False,
@@ -25,6 +26,7 @@ def query(
       object_seed: Seed of the procedural object and of the heading.
       repeat: Queries in all.
       concurrency: Clients that ask at the same time, each with a connection of its own.
+      states: States in one query, up to 64; each gets an answer.
       timeout: Seconds that one query may take.
       certs: Folder of a client's certificate (congrasp certs).
       health: Ask only whether the server is ready; the exit code is 0 if it is, and 4 if it is not.
@@ -37,8 +39,9 @@ def query(
     from services.serving.client import PolicyClient
     from services.serving.load import example_episode, measure, one_answer
 
-    if repeat < 1 or concurrency < 1:
-        raise CongraspError(f"--repeat {repeat} and --concurrency {concurrency} must be at least 1.")
+    for name_, value in (("repeat", repeat), ("concurrency", concurrency), ("states", states)):
+        if value < 1:
+            raise CongraspError(f"--{name_} {value} must be at least 1.")
     mine = credentials(certs, "client")
     certs = mine.folder if mine else None
     if health:
@@ -48,10 +51,10 @@ def query(
     with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
         episode = example_episode(object_seed, str(client.health()["hand"]))
     with PolicyClient(connect, name, hand=episode["hand"], timeout=timeout, certs=certs) as client:
-        if repeat == 1 and not json:
+        if repeat == states == 1 and not json:
             print(one_answer(client, episode))
             return 0
-    result = measure(connect, name, episode, repeat, concurrency, timeout, certs)
+    result = measure(connect, name, episode, repeat, concurrency, timeout, certs, states)
     if json:
         print(json_module.dumps(result))
     else:
@@ -59,7 +62,7 @@ def query(
             f"p50 {result['p50_ms']:.2f} ms, p99 {result['p99_ms']:.2f} ms, {result['answers_per_s']:.0f} answers/s"
         )
         lost = f"{result['failed']:.0f} failed, {result['overloaded']:.0f} overloaded"
-        print(f"{repeat} queries from {concurrency} client(s): {latency}, {lost}")
+        print(f"{repeat} queries of {states} state(s) from {concurrency} client(s): {latency}, {lost}")
     return 0 if result["failed"] == 0 else 1
 
 

@@ -29,7 +29,11 @@ def serve(
       certs: Folder of a server's certificate (congrasp certs), for its clients and for the learner.
       insecure: Listen beyond loopback without certificates.
     """
+    import os
     import secrets
+
+    # Waking a thread costs more than it saves in one policy's inference: no pool (JAX reads it when it starts) ...
+    os.environ.setdefault("NPROC", "1")
 
     import jax
 
@@ -47,7 +51,7 @@ def serve(
         raise CongraspError(
             f"The server can follow either {policy} or {connect}.", "Give one of --policy and --connect."
         )
-    jax.config.update("jax_cpu_enable_async_dispatch", False)  # handing over costs more than one policy's inference
+    jax.config.update("jax_cpu_enable_async_dispatch", False)  # ... and no handing over
     metrics, credentials = ServerMetrics(), listening(listen, certs, "server", insecure=insecure)
     with watch.watched("server", name, run if connect else "", metrics), on_signal() as stop:
         upstream = ZenohTransport(connect=[connect], credentials=credentials) if connect else None

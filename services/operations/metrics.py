@@ -160,7 +160,7 @@ class ServerMetrics:
             buckets=[1e-3 * bound for bound in _MILLISECONDS],
         )
         self._batch = Histogram(
-            "congrasp_policy_batch", "Queries in a batch.", registry=None, buckets=[1, 2, 4, 8, 16, 32, 64, 128]
+            "congrasp_policy_batch", "States in a batch.", registry=None, buckets=[1, 2, 4, 8, 16, 32, 64, 128]
         )
         self.health: Callable[[], Mapping[str, Any]] = dict
         """Of the server, once there is one."""

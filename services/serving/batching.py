@@ -38,9 +38,10 @@ class Batcher(Generic[T, R]):
 
     Args:
       run: the function of a batch and its queueing times in seconds; it returns one result or exception for each item.
-      size: most items in one batch.
+      size: most that the items of one batch may weigh together.
       window: seconds.
       depth: most items that wait; one more is refused with `Overloaded`.
+      weigh: an item's weight, which is at most `size`.
     """
 
     def __init__(
@@ -50,8 +51,10 @@ class Batcher(Generic[T, R]):
         size: int,
         window: float,
         depth: int,
+        weigh: Callable[[T], int] = lambda item: 1,
     ):
         self._run = run
+        self._weigh = weigh
         self._size = size
         self._window = window
         self._depth = depth
@@ -135,6 +138,9 @@ class Batcher(Generic[T, R]):
             until = self._queue[0].arrival + self._window
             while len(self._queue) < self._expected and (rest := until - time.monotonic()) > 0 and not self._closed:
                 self._changed.wait(rest)
-            batch = [self._queue.popleft() for _ in range(min(self._size, len(self._queue)))]
+            batch, room = [], self._size
+            while self._queue and (weight := self._weigh(cast(T, self._queue[0].item))) <= room:
+                batch.append(self._queue.popleft())
+                room -= weight
             self._running, self._expected = True, len(batch)
             return batch

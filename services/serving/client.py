@@ -37,10 +37,15 @@ class Answer(NamedTuple):
 
 
 class _Packer:
-    """Queries as one vector, most of which stays the same for an episode."""
+    """Queries as vectors, most of which stays the same for an episode.
+
+    Attributes:
+      most: states that the server takes in one query.
+    """
 
     def __init__(self, layout: Mapping[str, Any], episode: Mapping[str, np.ndarray], fingers: int):
         self._digest, self._fields, self._fingers = layout["layout"], layout["fields"], fingers
+        self.most = int(layout.get("states", 1))
         self._episode = np.zeros(layout["size"], np.float32)
         points = self._fields["surface_points"][1]
         for name, value in episode.items():
@@ -48,16 +53,17 @@ class _Packer:
                 value = np.asarray(value)[np.arange(points) * len(value) // points]
             self._write(self._episode, name, value)
 
-    def pack(self, moment: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> Message:
-        """The episode's query at a moment."""
-        vector = self._episode.copy()
-        for name, value in moment.items():
-            self._write(vector, name, value)
-        return Message({"packed": vector}, {**meta, "layout": self._digest})
+    def pack(self, moments: Sequence[Mapping[str, np.ndarray]], meta: Mapping[str, Any]) -> Message:
+        """The episode's query at each of several moments."""
+        vectors = np.tile(self._episode, (len(moments), 1))
+        for vector, moment in zip(vectors, moments, strict=True):
+            for name, value in moment.items():
+                self._write(vector, name, value)
+        return Message({"packed": vectors}, {**meta, "layout": self._digest})
 
     def unpack(self, reply: Message) -> list[np.ndarray]:
-        """Action, finger targets and wrist targets."""
-        return np.split(reply.arrays["packed"], [self._fingers + 6, 2 * self._fingers + 6])
+        """Action, finger targets and wrist targets, of each moment."""
+        return np.split(reply.arrays["packed"], [self._fingers + 6, 2 * self._fingers + 6], 1)
 
     def _write(self, vector: np.ndarray, name: str, value: np.ndarray) -> None:
         if name not in self._fields:
@@ -159,45 +165,69 @@ class PolicyClient:
         Raises:
           TransportError: the server is away, overloaded, or refuses the query; its words say why.
         """
+        (answer,) = self._ask([state])
+        self._episode["q_target"], self._episode["u_target"] = answer.q_target, answer.u_target
+        self._time += 1
+        return answer
+
+    def act_each(self, states: Sequence[Mapping[str, np.ndarray]]) -> list[Answer]:
+        """Joint targets for each of several states, as `act` would give them now; the episode does not go on.
+
+        For planners that weigh candidates: one query for all of them costs a small part of one for each.
+
+        Args:
+          states: see `act`; 1 to 64. One may also have its own `time` in control steps, and `q_target` and `u_target`,
+            from which its targets go on.
+
+        Raises:
+          TransportError: see `act`; if one state is bad, none gets an answer.
+        """
+        if not states:
+            raise CongraspError("There is no state to act in.", "Give one or more.")
+        if self._packer is None:
+            self._ask(states[:1])
+        most = self._packer.most if self._packer else 1
+        if len(states) > most:
+            raise CongraspError(f"These are {len(states)} states.", f"The server takes {most} at a time.")
+        return self._ask(states)
+
+    def _ask(self, states: Sequence[Mapping[str, np.ndarray]]) -> list[Answer]:
         began = time.perf_counter()
-        meta = {"hand": self._hand, "constraints": self._constraints, "timeout": self._timeout}
-        moment = {"time": np.asarray(self._time, np.float32), "table": np.asarray(True), **state}
         try:
-            reply = self._ask(meta, moment)
+            reply, parts = self._exchange(states)
         except RefusedError as error:
             if self._packer is None or "layout" not in str(error):
                 raise
             self._packer = None  # another server has taken the place of the one that this layout was of
-            reply = self._ask(meta, moment)
-        if self._packer is None:
-            fingers = len(reply.arrays["q_target"])
-            self._packer = _Packer(reply.meta, self._episode, fingers)
-            action, q_target, u_target = (reply.arrays[name] for name in ("action", "q_target", "u_target"))
-        else:
-            action, q_target, u_target = self._packer.unpack(reply)
-        self._episode["q_target"], self._episode["u_target"] = q_target, u_target
-        self._time += 1
+            reply, parts = self._exchange(states)
+        version, server_ms = int(reply.meta["version"]), float(reply.meta["total_ms"])
         spent = 1e3 * (time.perf_counter() - began)
-        return Answer(
-            q_target,
-            u_target,
-            action,
-            int(reply.meta["version"]),
-            tuple(reply.meta["active"]),
-            spent,
-            float(reply.meta["total_ms"]),
-        )
+        return [
+            Answer(q_target, u_target, action, version, tuple(active), spent, server_ms)
+            for action, q_target, u_target, active in zip(*parts, reply.meta["active"], strict=True)
+        ]
 
-    def _ask(self, meta: dict[str, Any], moment: Mapping[str, np.ndarray]) -> Message:
-        """A query of names at an episode's begin, which is checked field by field; packed ones from then on."""
+    def _exchange(self, states: Sequence[Mapping[str, np.ndarray]]) -> tuple[Message, list[Any]]:
+        """A query of names at an episode's begin, which is checked field by field; packed ones from then on.
+
+        Returns:
+          The reply; the actions, finger targets and wrist targets.
+        """
+        meta = {"hand": self._hand, "constraints": self._constraints, "timeout": self._timeout}
+        now = {"time": np.asarray(self._time, np.float32), "table": np.asarray(True)}
         if self._packer is None:
-            arrays = {**self._episode, **moment}
+            arrays = {**self._episode, **now, **states[0]}
             dtypes = {name: bool if np.asarray(value).dtype == bool else np.float32 for name, value in arrays.items()}
             named = {name: np.asarray(value, dtypes[name]) for name, value in arrays.items()}
-            request = Message(named, {**meta, "layout": True})
-        else:
-            targets = {name: self._episode[name] for name in ("q_target", "u_target")}
-            request = self._packer.pack({**targets, **moment}, meta)
+            reply = self._query(Message(named, {**meta, "layout": True}))
+            self._packer = _Packer(reply.meta, self._episode, len(reply.arrays["q_target"]))
+            if len(states) == 1:
+                return reply, [[reply.arrays[name]] for name in ("action", "q_target", "u_target")]
+        now |= {name: self._episode[name] for name in ("q_target", "u_target")}
+        reply = self._query(self._packer.pack([{**now, **state} for state in states], meta))
+        return reply, self._packer.unpack(reply)
+
+    def _query(self, request: Message) -> Message:
         return self._transport.query(self._keys.act, request, timeout=self._timeout)
 
     def close(self) -> None:

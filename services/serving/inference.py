@@ -15,19 +15,19 @@ from common.policy.bundle import Acting, mean_action
 from common.task import control, observation
 from common.task.features import features
 from common.task.types import MASKS, Goal, SceneState, Surface
-from services.serving.requests import Layout, Query
+from services.serving.requests import STATES_LIMIT, Layout, Query
 
-BATCH_SIZES = (1, 8, 64)
+BATCH_SIZES = (1, 8, STATES_LIMIT)
 """Batches are padded to one of these, so that nothing compiles after the warm-up."""
 
 
 class Answer(NamedTuple):
-    """What the policy says to one query."""
+    """What the policy says to one query of n states."""
 
-    vector: np.ndarray
-    """(A + F + 6,): the policy's mean action in units of action, finger targets (rad), wrist targets (m and rad)."""
-    words: tuple[str, ...]
-    """Which constraints are active, and why."""
+    vectors: np.ndarray
+    """(n, A + F + 6): the policy's mean action in units of action, finger targets (rad), wrist targets (m and rad)."""
+    words: list[list[str]]
+    """For each state which constraints are active, and why."""
 
 
 class PolicyFunction:
@@ -49,15 +49,15 @@ class PolicyFunction:
             jax.block_until_ready(self._compiled(weights, np.zeros((size, self.layout.size), np.float32)))
 
     def __call__(self, weights: Acting, queries: Sequence[Query]) -> list[Answer | Exception]:
-        """Answers at most `BATCH_SIZES[-1]` queries; a query that cannot be answered gets its own error."""
-        count = len(queries)
-        batch = np.zeros((next(size for size in BATCH_SIZES if size >= count), self.layout.size), np.float32)
-        batch[:count] = [query.vector for query in queries]
-        vectors, notes, checks = (np.asarray(part)[:count] for part in self._compiled(weights, batch))
-        return [self._answer(*each) for each in zip(queries, vectors, notes, checks, strict=True)]
+        """Answers queries of at most `BATCH_SIZES[-1]` states; one that cannot be answered gets its own error."""
+        ends = np.cumsum([len(query.vectors) for query in queries])
+        padding = next(size for size in BATCH_SIZES if size >= ends[-1]) - ends[-1]
+        batch = np.concatenate([*(query.vectors for query in queries), np.zeros((padding, self.layout.size))])
+        found = np.split(np.asarray(self._compiled(weights, batch.astype(np.float32, copy=False))), ends)
+        return [self._answer(*each) for each in zip(queries, found[:-1], strict=True)]
 
-    def _infer(self, weights: Acting, vectors: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """For queries (B, S): answers (B, A + F + 6), the flags redirected and aligned (B, 2), and checks (B, C)."""
+    def _infer(self, weights: Acting, vectors: jax.Array) -> jax.Array:
+        """For states (B, S): answers (A + F + 6), the flags redirected and aligned, and checks (C), in one (B, ...)."""
         hand, task = self.layout.hand, self.layout.task
         fields, checks = self.layout.complete(vectors)
         flags = {name: fields[name] > 0.5 for name in ("contact_found", "table", "surface_minus", "asked")}
@@ -71,18 +71,21 @@ class PolicyFunction:
         mean = mean_action(observation.layout(hand, task), weights, observed)
         action = control.decode(hand, task.control, state, seen, resolution.goal, mean)
         notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
-        return jnp.concatenate([mean, action.q_target, action.u_target], -1), notes, checks
+        return jnp.concatenate([mean, action.q_target, action.u_target, notes, checks], -1)
 
-    def _answer(self, query: Query, vector: np.ndarray, notes: np.ndarray, checks: np.ndarray) -> Answer | Exception:
-        redirected, aligned = notes
+    def _answer(self, query: Query, found: np.ndarray) -> Answer | Exception:
+        fingers = len(self.layout.hand.joints)
+        vectors, notes, checks = np.split(found, [2 * fingers + 12, 2 * fingers + 14], 1)
+        redirected, aligned = notes.T > 0.5
         if complaint := self.layout.complaint(query, checks):
             return complaint
-        if not np.isfinite(vector).all():
+        if not np.isfinite(vectors).all():
             return CongraspError("The policy's answer to this query is not finite.", "Check the state's magnitudes.")
-        if not aligned:
+        if not aligned.all():
             return CongraspError(
                 "The constraints contradict each other: the trajectory ends nearer to O- than to O+ of the affordance.",
                 "Change the trajectory or the affordance.",
             )
         asked = {name: name in query.asked for name in ("affordance", "pose", "trajectory")}
-        return Answer(vector, tuple(explain(**asked, redirected=bool(redirected))))
+        words = {flag: explain(**asked, redirected=flag) for flag in set(redirected.tolist())}
+        return Answer(vectors, [words[flag] for flag in redirected.tolist()])

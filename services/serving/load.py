@@ -113,18 +113,23 @@ def measure(
     concurrency: int,
     timeout: float,
     certs: pathlib.Path | None = None,
+    states: int = 1,
 ) -> dict[str, float]:
-    """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is not counted."""
+    """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is not counted.
+
+    With more than one of `states` a query holds so many, and each of them counts as an answer.
+    """
     share = max(1, repeat // concurrency)
 
     def ask(_: int) -> tuple[list[float], int, int]:
-        times, failed, overloaded = [], 0, 0
+        times, failed, overloaded, state = [], 0, 0, episode["state"]
         with PolicyClient(connect, name, hand=episode["hand"], timeout=timeout, certs=certs) as client:
             client.reset(**episode["reset"])
-            client.act(episode["state"])
+            client.act(state)
             for _ in range(share):
                 try:
-                    times.append(client.act(episode["state"]).round_trip_ms)
+                    answer = client.act(state) if states == 1 else client.act_each([state] * states)[0]
+                    times.append(answer.round_trip_ms)
                 except TransportError as error:
                     overloaded += "verloaded" in str(error)
                     failed += "verloaded" not in str(error)
@@ -138,7 +143,7 @@ def measure(
     return {
         "p50_ms": float(np.percentile(times, 50)) if len(times) else float("nan"),
         "p99_ms": float(np.percentile(times, 99)) if len(times) else float("nan"),
-        "answers_per_s": len(times) / spent,
+        "answers_per_s": states * len(times) / spent,
         "failed": sum(failed for _, failed, _ in results),
         "overloaded": sum(overloaded for _, _, overloaded in results),
     }

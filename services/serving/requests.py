@@ -6,6 +6,7 @@ travels to the device as one float32 vector, since one transfer costs as much as
 
 A query may also be packed: the vector itself as its one array, and in the metadata the digest of the layout that it
 follows. Whoever asks a query of names for the `layout` gets it with the answer. Packed queries cost both ends a fourth.
+They may hold several states, a row each, all with the same constraints; the answer then has as many rows.
 """
 
 import hashlib
@@ -34,6 +35,8 @@ GOAL_FIELDS = {
     "trajectory": ("trajectory_position", "trajectory_quaternion"),
 }
 """Goal fields that each constraint needs; `heading_cross` may come along."""
+STATES_LIMIT = 64
+"""Most states in one query."""
 SURFACE_LIMIT = 4096
 """Most surface points in one query; the policy looks at `TaskConfig.surface_points` of them."""
 PACKED = "packed"
@@ -52,10 +55,10 @@ _OPTIONAL_STATE = (
 
 
 class Query(NamedTuple):
-    """A query whose fields are all there."""
+    """A query whose fields are all there, of n states."""
 
-    vector: np.ndarray
-    """(S,) float32, laid out by `Layout`; its values are checked by `Layout.complete`."""
+    vectors: np.ndarray
+    """(n, S) float32, laid out by `Layout`; its values are checked by `Layout.complete`."""
     asked: tuple[str, ...]
     """Names of the constraints that were asked for."""
 
@@ -118,17 +121,19 @@ class Layout:
             get_hand(hand)
             raise CongraspError(f"This server's policy is for the hand '{self.hand.name}', not '{hand}'.")
         asked = _asked(meta.get("constraints", ["heading"]))
-        vector = self._packed(message) if PACKED in message.arrays else self._named(message.arrays, asked)
-        vector[self._places("asked")] = [name in asked for name in CONSTRAINTS]
-        return Query(vector, asked)
+        vectors = self._packed(message) if PACKED in message.arrays else self._named(message.arrays, asked)[None]
+        vectors[:, self._places("asked")] = [name in asked for name in CONSTRAINTS]
+        return Query(vectors, asked)
 
     def _packed(self, message: Message) -> np.ndarray:
-        vector, digest = message.arrays[PACKED], message.meta.get("layout")
-        if digest != self.digest or len(message.arrays) > 1 or vector.shape != (self.size,):
+        vectors, digest = message.arrays[PACKED], message.meta.get("layout")
+        if digest != self.digest or len(message.arrays) > 1 or vectors.ndim != 2 or vectors.shape[1] != self.size:
             raise CongraspError(
                 "The packed query does not follow this server's layout.", "Ask for the layout with a query of names."
             )
-        return np.array(vector, np.float32)
+        if not 1 <= len(vectors) <= STATES_LIMIT:
+            raise CongraspError(f"The query has {len(vectors)} states.", f"Send 1 to {STATES_LIMIT} at a time.")
+        return np.array(vectors, np.float32)
 
     def _named(self, arrays: Mapping[str, Any], asked: tuple[str, ...]) -> np.ndarray:
         unknown = sorted(arrays.keys() - self.shapes.keys() | arrays.keys() & {"asked"})
@@ -157,7 +162,8 @@ class Layout:
           vectors: (B, S).
 
         Returns:
-          The fields (B, ...) by name, zero where a query is not finite, and what `complaint` looks at (B, C).
+          The fields (B, ...) by name, zero where a query is not finite, and what `complaint` looks at (B, C): whether
+          it is finite and has an affordance's two sides, as 1 or 0, and lengths that must be 1.
         """
         finite = jnp.isfinite(vectors).all(1)
         fields = self.unpack(jnp.where(finite[:, None], vectors, 0.0))
@@ -172,19 +178,23 @@ class Layout:
         return fields, jnp.stack(checks, 1)
 
     def complaint(self, query: Query, checks: np.ndarray) -> CongraspError | None:
-        """What is wrong with the values of a query, by what `complete` found (C,)."""
-        finite, sided, *lengths = checks
+        """What is wrong with the values of a query's first bad state, by what `complete` found (n, C): see there."""
+        wrong = ~(np.abs(checks - 1.0) <= _UNIT_TOLERANCE)
+        if not wrong.any():
+            return None
+        state = int(wrong.any(1).argmax())
+        which = f" of state {state}" if len(checks) > 1 else ""
+        finite, sided, *lengths = ~wrong[state]
         if not finite:
-            fields = self.unpack(query.vector[None])
+            fields = self.unpack(query.vectors[state, None])
             bad = next(name for name, value in fields.items() if not np.isfinite(value).all())
-            return CongraspError(f"The field '{bad}' is not finite.")
+            return CongraspError(f"The field '{bad}'{which} is not finite.")
         if not sided:
             text = "An affordance needs surface points on both sides."
             return CongraspError(text, "Set some of 'surface_minus'.")
-        for name, length in zip(self._directions, lengths, strict=True):
-            if abs(length - 1.0) > _UNIT_TOLERANCE:
-                return CongraspError(f"The field '{name}' has length {length:.3f}, not 1.")
-        return None
+        bad = lengths.index(False)
+        name, length = self._directions[bad], checks[state, 2 + bad]
+        return CongraspError(f"The field '{name}'{which} has length {length:.3f}, not 1.")
 
     def _surface(self, arrays: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Points and labels, brought to the number that the policy looks at."""

@@ -20,7 +20,7 @@ from common.wire.codec import Message, encode
 from services.operations.logs import say
 from services.serving.batching import Batcher, Late, Overloaded
 from services.serving.inference import BATCH_SIZES, Answer, PolicyFunction
-from services.serving.requests import PACKED, Query
+from services.serving.requests import PACKED, STATES_LIMIT, Query
 
 Source = Callable[[int], PolicyBundle | None]
 """(version that is held, -1 for none) -> a newer bundle, or None."""
@@ -65,7 +65,7 @@ class PolicyServer:
           source: where policies come from.
           timeout: seconds that a query may wait when it names no deadline.
           on_answer: given the outcome of every query (answered, refused, overloaded, late), and how long it took.
-          on_batch: given the size of every batch.
+          on_batch: given the number of states in every batch.
 
         Raises:
           CongraspError: there is no policy yet.
@@ -82,7 +82,7 @@ class PolicyServer:
         self._trouble = ""
         self._closed = threading.Event()
         self._batcher: Batcher[Query, _Answered] = Batcher(
-            self._infer, size=BATCH_SIZES[-1], window=WINDOW, depth=DEPTH
+            self._infer, weigh=lambda query: len(query.vectors), size=BATCH_SIZES[-1], window=WINDOW, depth=DEPTH
         )
         keys = Keys(run)
         transport.serve(keys.health, lambda key, request: Message({}, self.health()))
@@ -137,22 +137,22 @@ class PolicyServer:
         self._on_answer("answered" if error is None else outcome, time.monotonic() - began)
 
     def _message(self, request: Message, answered: "_Answered", seconds: float) -> Message:
-        (vector, words), held, queued, inferred = answered
+        (vectors, words), held, queued, inferred = answered
         layout = self._function.layout
         meta: dict[str, Any] = {
             "version": held.bundle.version,
             "hash": held.hash,
-            "active": list(words),
+            "active": words,
             "queue_ms": round(1e3 * queued, 3),
             "infer_ms": round(1e3 * inferred, 3),
             "total_ms": round(1e3 * seconds, 3),
         }
         if PACKED in request.arrays:
-            return Message({PACKED: vector}, meta)
+            return Message({PACKED: vectors}, meta)
         if request.meta.get("layout"):
-            meta |= {"layout": layout.digest, **layout.description()}
+            meta |= {"layout": layout.digest, "states": STATES_LIMIT, **layout.description()}
         fingers = len(layout.hand.joints)
-        parts = np.split(vector, [fingers + 6, 2 * fingers + 6])
+        parts = np.split(vectors[0], [fingers + 6, 2 * fingers + 6])
         return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
 
     @staticmethod
@@ -165,7 +165,7 @@ class PolicyServer:
 
     def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[_Answered | Exception]:
         held, began = self._held, time.monotonic()
-        self._on_batch(len(queries))
+        self._on_batch(sum(len(query.vectors) for query in queries))
         answers = self._function(held.acting, queries)
         spent = time.monotonic() - began
         return [

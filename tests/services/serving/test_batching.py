@@ -51,6 +51,16 @@ def test_what_arrives_during_a_batch_makes_the_next_one(gate):
     batcher.close()
 
 
+def test_a_batch_holds_what_weighs_no_more_than_its_size(gate):
+    batcher = Batcher(gate, size=4, window=0.0, depth=10, weigh=lambda item: item)
+    futures = [running(batcher, gate)]
+    futures += [batcher.submit(weight, 10.0) for weight in (3, 1, 2, 4, 1, 1)]
+    gate.go.set()
+    assert [future.result(10) for future in futures] == [0, 30, 10, 20, 40, 10, 10]
+    assert gate.batches == [[0], [3, 1], [2], [4], [1, 1]]
+    batcher.close()
+
+
 def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=2)
     futures = [running(batcher, gate)]

@@ -48,13 +48,13 @@ class CannedServer:
 
     def _act(self, key: str, request: Message) -> Message:
         query = self.layout.parse(request)
-        self.fields.append({name: value[0] for name, value in self.layout.unpack(query.vector[None]).items()})
+        self.fields.append({name: value[0] for name, value in self.layout.unpack(query.vectors).items()})
         self.forms.append("packed" if PACKED in request.arrays else "named")
         n = np.float32(len(self.fields))
-        meta = {"version": 3, "active": ["words"], "total_ms": 0.5}
+        meta = {"version": 3, "active": [["words"]], "total_ms": 0.5}
         targets = {"action": np.zeros(26, np.float32), "q_target": np.full(20, n), "u_target": np.full(6, -n)}
         if self.forms[-1] == "packed":
-            return Message({PACKED: np.concatenate(list(targets.values()))}, meta)
+            return Message({PACKED: np.concatenate(list(targets.values()))[None]}, meta)
         return Message(targets, {**meta, "layout": self.layout.digest, **self.layout.description()})
 
     def close(self) -> None:

@@ -37,15 +37,15 @@ def parse(constraints=("heading",), meta=None, **changes):
 
 
 def completed(query):
-    fields, checks = COMPLETE(query.vector[None])
-    if complaint := LAYOUT.complaint(query, np.asarray(checks[0])):
+    fields, checks = COMPLETE(query.vectors)
+    if complaint := LAYOUT.complaint(query, np.asarray(checks)):
         raise complaint
     return query, {name: np.asarray(value[0]) for name, value in fields.items()}
 
 
 def test_fields_land_in_their_places_and_absent_sensors_read_zero():
     sent, (query, received) = arrays(), parse()
-    assert query.vector.shape == (LAYOUT.size,)
+    assert query.vectors.shape == (1, LAYOUT.size)
     for name, value in sent.items():
         np.testing.assert_array_equal(received[name], np.asarray(value, np.float32), err_msg=name)
     for name in ("q_velocity", "object_velocity", "contact_force", "contact_found"):
@@ -116,14 +116,18 @@ def test_a_packed_query_is_the_vector_of_the_named_one():
         offset, *shape = description["fields"][name]
         vector[offset : offset + int(np.prod(shape))] = np.ravel(value)
     meta = {"constraints": ["heading"], "layout": LAYOUT.digest}
-    packed = LAYOUT.parse(Message({"packed": vector}, meta))
-    np.testing.assert_array_equal(packed.vector, named.vector)
+    packed = LAYOUT.parse(Message({"packed": vector[None]}, meta))
+    np.testing.assert_array_equal(packed.vectors, named.vectors)
     other = Layout(HAND, TaskConfig(surface_points=8, trajectory_points=4)).digest
+    for count in (0, 65):
+        with pytest.raises(CongraspError, match=f"The query has {count} states"):
+            LAYOUT.parse(Message({"packed": np.tile(vector, (count, 1))}, meta))
     for wrong in (
-        Message({"packed": vector}, {**meta, "layout": other}),
-        Message({"packed": vector[:-1]}, meta),
-        Message({"packed": vector, "q": np.zeros(20)}, meta),
-        Message({"packed": vector}, {"constraints": ["heading"]}),
+        Message({"packed": vector[None]}, {**meta, "layout": other}),
+        Message({"packed": vector}, meta),
+        Message({"packed": vector[None, :-1]}, meta),
+        Message({"packed": vector[None], "q": np.zeros(20)}, meta),
+        Message({"packed": vector[None]}, {"constraints": ["heading"]}),
     ):
         with pytest.raises(CongraspError, match="does not follow this server's layout"):
             LAYOUT.parse(wrong)
@@ -135,8 +139,8 @@ def test_a_bad_query_of_a_batch_spoils_no_other():
         for changes in ({}, {"u": np.full(6, np.nan)}, {"base_quaternion": np.zeros(4)})
     )
     queries = good, bad, good, third
-    fields, checks = COMPLETE(np.stack([query.vector for query in queries]))
-    errors = [LAYOUT.complaint(query, row) for query, row in zip(queries, np.asarray(checks), strict=True)]
+    fields, checks = COMPLETE(np.concatenate([query.vectors for query in queries]))
+    errors = [LAYOUT.complaint(query, row[None]) for query, row in zip(queries, np.asarray(checks), strict=True)]
     assert [error is not None for error in errors] == [False, True, False, True]
     assert "'u' is not finite" in str(errors[1]) and "base_quaternion" in str(errors[3])
     _, alone = parse()

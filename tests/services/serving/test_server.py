@@ -21,7 +21,7 @@ from common.wire.codec import Message
 from services.operations.metrics import ServerMetrics, exposed
 from services.serving.client import PolicyClient
 from services.serving.inference import PolicyFunction
-from services.serving.load import example_episode, measure
+from services.serving.load import example_episode
 from services.serving.server import DEPTH, PolicyServer, follow_file, follow_run
 from services.training.presets import get_preset
 from services.training.quickstart import untrained
@@ -124,18 +124,67 @@ def test_constraints_that_contradict_each_other_are_refused_alone(served):
         assert "The affordance keeps the fingers off O-." in client.act(episode["state"]).active
 
 
-def test_many_clients_and_a_swap_of_weights_without_a_failed_query(served):
+def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(served, monkeypatch):
     path, endpoint, episode = served
-    newer = dataclasses.replace(untrained(CONFIG), version=7)
-    bundles.save(newer, path)
-    result = measure(endpoint, "policy", episode, repeat=200, concurrency=4, timeout=5.0)
-    assert result["failed"] == 0 and result["overloaded"] == 0
-    with PolicyClient(endpoint) as client:
-        for _ in range(100):
+    monkeypatch.setattr("services.serving.server._FOLLOW_SECONDS", 0.001)
+    policy = untrained(CONFIG)
+    swapped = threading.Event()
+
+    def ask(_):
+        versions = []
+        with PolicyClient(endpoint, timeout=5.0) as client:
             client.reset(**episode["reset"])
-            if client.act(episode["state"]).version == 7:
-                return
-    raise AssertionError("the server never took the newer policy")
+            while not swapped.is_set():
+                versions.append(client.act(episode["state"]).version)
+            versions.append(client.act(episode["state"]).version)
+        return versions
+
+    with concurrent.futures.ThreadPoolExecutor(4) as pool, PolicyClient(endpoint) as watcher:
+        asked = pool.map(ask, range(4))
+        try:
+            for version in range(1, 101):
+                bundles.save(dataclasses.replace(policy, version=version), path)
+                deadline = time.monotonic() + 60
+                while watcher.health()["version"] != version:
+                    assert time.monotonic() < deadline, watcher.health()
+        finally:
+            swapped.set()
+        for versions in asked:
+            assert versions == sorted(versions) and versions[-1] == 100
+            assert len(set(versions)) > 10
+
+
+def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(served):
+    _, endpoint, episode = served
+    poses = [episode["state"]["q"] + 0.01 * i for i in range(11)]
+    states = [{**episode["state"], "q": pose, "q_target": pose} for pose in poses]
+    alone = []
+    with PolicyClient(endpoint, timeout=5.0) as client:
+        for state in states:
+            client.reset(**episode["reset"])
+            alone.append(client.act(state))
+        client.reset(**episode["reset"])
+        together = client.act_each(states)
+        first = client.act(states[0])
+    for one, other in zip([*together, first], [*alone, alone[0]], strict=True):
+        assert (one.version, one.active) == (other.version, other.active)
+        for name in ("action", "q_target", "u_target"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-5, err_msg=name)
+    assert np.abs(together[0].q_target - together[10].q_target).max() > 0.01
+
+
+def test_bad_lists_of_states_are_refused_in_words(served):
+    _, endpoint, episode = served
+    good, bad = episode["state"], {**episode["state"], "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])}
+    with PolicyClient(endpoint) as client:
+        client.reset(**episode["reset"])
+        with pytest.raises(TransportError, match=r"'object_quaternion' of state 2 has length 2\.000, not 1"):
+            client.act_each([good, good, bad])
+        with pytest.raises(CongraspError, match="65 states"):
+            client.act_each([good] * 65)
+        with pytest.raises(CongraspError, match="no state"):
+            client.act_each([])
+        assert len(client.act_each([good] * 64)) == 64
 
 
 def test_a_client_of_another_hand_is_refused(served):
