@@ -33,7 +33,7 @@ class Patch(NamedTuple):
     normals: np.ndarray
     """(F, 3, 3) at the corners."""
     colours: np.ndarray
-    """(F, 3, 3) sRGB at the corners."""
+    """(F, 3, 3) linear light that the surface gives back, at the corners."""
     closed: bool
     """Whether only the outside can be seen: a closed surface whose triangles wind outwards."""
 
@@ -85,7 +85,7 @@ class Raster:
             colours = _even(shape.colour, corners)
             if shape.paint_points is not None:
                 tree, of_points = cKDTree(shape.paint_points), np.asarray(shape.paint_colours)
-                colours = painted(tree, of_points, corners.reshape(-1, 3)).reshape(corners.shape).astype(np.float32)
+                colours = _linear(painted(tree, of_points, corners.reshape(-1, 3)).reshape(corners.shape))
             closed = trimesh.Trimesh(vertices, faces).is_volume
             # The shape is kept, so that nothing else can get its arrays' identities.
             self._meshes[key] = Patch(corners, smooth.corner_normals.astype(np.float32), colours, closed), shape
@@ -93,7 +93,11 @@ class Raster:
 
 
 def _even(colour: tuple[float, float, float], corners: np.ndarray) -> np.ndarray:
-    return np.broadcast_to(np.asarray(colour, np.float32), corners.shape)
+    return np.broadcast_to(_linear(np.asarray(colour)), corners.shape)
+
+
+def _linear(colour: np.ndarray) -> np.ndarray:
+    return (colour**_GAMMA).astype(np.float32)
 
 
 @functools.lru_cache(maxsize=128)
@@ -137,24 +141,18 @@ class _Frame:
             return
         corners, normals, colours = (np.concatenate(parts) for parts in list(zip(*patches, strict=True))[:3])
         closed = np.concatenate([np.full(len(patch.corners), patch.closed) for patch in patches])
-        face, sample, weights, nearness = self._cover(corners, closed)
-        seen = nearness > self._nearness[sample] * (1 + 1e-6)
-        face, sample, nearness = face[seen], sample[seen], nearness[seen]
-        weights = [weight[seen] for weight in weights]
-        order = np.argsort(nearness)  # what is written last, the nearest, stays
-        owner = np.full(len(self._nearness), -1, np.int64)
-        owner[sample[order]] = order
-        mine = owner[owner >= 0]
-        face, sample = face[mine], sample[mine]
-        here = [weight[mine, None] for weight in weights]
-
-        def between(values: np.ndarray) -> np.ndarray:
-            return here[0] * values[face, 0] + here[1] * values[face, 1] + here[2] * values[face, 2]
-
-        colour = self._lit(between(colours), between(normals), between(corners))
+        cover = self._cover(corners, closed)
+        nearness = cover.nearness()
+        nearest = self._nearness * np.float32(1 + 1e-6)
+        np.maximum.at(nearest, cover.sample, nearness)
+        seen = np.flatnonzero(nearness == nearest[cover.sample])
+        sample = cover.sample[seen]
+        values = np.concatenate([colours, normals, corners], -1, dtype=np.float32)[cover.face[cover.span[seen]]]
+        here = np.einsum("cn,ncv->nv", cover.weights(seen) / nearness[seen], values)
+        colour = self._lit(here[:, :3], here[:, 3:6], here[:, 6:])
         self.image[sample] = alpha * colour + (1 - alpha) * self.image[sample]
         if alpha >= 1:
-            self._nearness[sample] = nearness[mine]
+            self._nearness[sample] = nearness[seen]
 
     def add_disc(self, shape: Shape, above: list[Patch]) -> None:
         """Draws the upper face of an upright cylinder, and the shadow that triangles above cast on it."""
@@ -169,53 +167,52 @@ class _Frame:
         inside = np.linalg.norm(places[:, :2] - shape.position[:2], axis=-1) < shape.size[0]
         sample, places = sample[inside], places[inside]
         light = np.ones(self._width * self._height, np.float32)
-        for patch in above:
-            height = np.maximum(patch.corners[..., 2] - top, 0.0)
-            on_table = patch.corners - height[..., None] / self._key[2] * self._key
-            light[self._cover(on_table)[1]] = 1 - _SHADOW
+        if above:
+            corners = np.concatenate([patch.corners for patch in above])
+            closed = np.concatenate([np.full(len(patch.corners), patch.closed) for patch in above])
+            height = np.maximum(corners[..., 2] - top, 0.0)
+            # Of a closed surface either half casts the whole shadow.
+            light[self._cover(corners - height[..., None] / self._key[2] * self._key, closed).sample] = 1 - _SHADOW
         soft = gaussian_filter(light.reshape(self._height, self._width), _SOFT * self._height).ravel()
         normal = np.broadcast_to([0.0, 0.0, 1.0], places.shape)
-        colour = self._lit(np.broadcast_to(shape.colour, places.shape), normal, places, soft[sample], shine=0.0)
+        colour = self._lit(_even(shape.colour, places), normal, places, soft[sample], shine=0.0)
         self.image[sample] = colour
         self._nearness[sample] = 1 / ((places - self._camera.position) @ self._axes[2])
 
-    def _cover(
-        self, corners: np.ndarray, closed: np.ndarray | bool = False
-    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
-        """Samples (n,) that triangles (F, 3, 3) cover: the triangle, the sample, the corners' weights, the nearness."""
-        local = (corners - self._camera.position) @ self._axes.T
-        depth = local[..., 2]
+    def _cover(self, corners: np.ndarray, closed: np.ndarray) -> "_Cover":
+        """Samples that triangles (F, 3, 3) cover; of those that are `closed` (F,) only what faces the camera."""
+        local = np.moveaxis(corners - self._camera.position, 0, 1) @ self._axes.T
+        depth = local[..., 2]  # (3, F), as all that follows
         near = np.where(depth > _NEAR, depth, np.nan)
         x = self._width / 2 + self._focus * local[..., 0] / near - 0.5
         y = self._height / 2 - self._focus * local[..., 1] / near - 0.5
-        area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
+        area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
         shown = np.abs(area) > 1e-6  # false for what is not wholly before the camera
         # The picture's y points down: what winds outwards and faces the camera has a negative area.
         face = np.flatnonzero(shown & ~(closed & (area > 0)))
-        x, y, area, depth = x[face], y[face], area[face], depth[face]
-        left, upper = (np.ceil(v.min(1)).clip(0) for v in (x, y))
-        right = np.floor(x.max(1)).clip(max=self._width - 1)
-        lower = np.floor(y.max(1)).clip(max=self._height - 1)
-        across, down = (right - left + 1).clip(0).astype(int), (lower - upper + 1).clip(0).astype(int)
-        counts = across * down
-        which = np.repeat(np.arange(len(face)), counts)
-        number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
-        rows, columns = np.divmod(number, across[which])
-        columns, rows = (columns + left[which]).astype(np.float32), (rows + upper[which]).astype(np.float32)
-        # Weights are linear over the picture.
-        weights = []
-        inside = np.ones(len(which), bool)
-        for one, other in ((1, 2), (2, 0), (0, 1)):
-            a = (y[:, one] - y[:, other]) / area
-            b = (x[:, other] - x[:, one]) / area
-            c = (x[:, one] * y[:, other] - x[:, other] * y[:, one]) / area
-            weights.append(a[which] * columns + b[which] * rows + c[which])
-            inside &= weights[-1] >= 0
-        which = which[inside]
-        sample = (rows[inside] * self._width + columns[inside]).astype(np.int64)
-        over = [weight[inside] / depth[which, corner] for corner, weight in enumerate(weights)]
-        nearness = over[0] + over[1] + over[2]
-        return face[which], sample, [part / nearness for part in over], nearness
+        x, y, area, depth = x[:, face], y[:, face], area[face], depth[:, face]
+        # Weights are linear over the picture: a x + b y + c, each zero on the side across from its corner.
+        one, other = [1, 2, 0], [2, 0, 1]
+        a, b = (y[one] - y[other]) / area, (x[other] - x[one]) / area
+        c = (x[one] * y[other] - x[other] * y[one]) / area
+        upper, lower = np.ceil(y.min(0)).clip(0), np.floor(y.max(0)).clip(max=self._height - 1)
+        which, number = _expand(lower - upper + 1)
+        row = upper[which] + number
+        # In each of its rows a triangle covers one span.
+        slope, offset = a[:, which], b[:, which] * row + c[:, which]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bound = -offset / slope
+        level = np.where(offset < 0, np.inf, -np.inf)
+        low = np.where(slope > 0, bound, np.where(slope < 0, -np.inf, level)).max(0)
+        left = np.ceil(low.clip(0, self._width))
+        right = np.floor(np.where(slope < 0, bound, np.inf).min(0).clip(-1, self._width - 1))
+        span, step = _expand(right - left + 1)
+        start = (row * self._width + left).astype(np.int64)
+        base, slope = (offset + slope * left) / depth[:, which], slope / depth[:, which]
+        return _Cover(
+            face[which], base.astype(np.float32), slope.astype(np.float32), span, step.astype(np.float32),
+            start[span] + step,
+        )  # fmt: skip
 
     def _lit(
         self,
@@ -225,7 +222,10 @@ class _Frame:
         light: np.ndarray | float = 1.0,
         shine: float = 1.0,
     ) -> np.ndarray:
-        """(n, 3) sRGB of points (n, 3); normals are turned to the camera, so that a mesh may wind either way."""
+        """(n, 3) sRGB of points (n, 3) of linear albedo (n, 3).
+
+        Normals are turned to the camera, so that a mesh may wind either way.
+        """
         rays = place - self._camera.position.astype(np.float32)
         rays, normal = _unit(rays), _unit(normal)
         normal = np.where(_dot(normal, rays)[:, None] > 0, -normal, normal)
@@ -233,7 +233,40 @@ class _Frame:
         total = _KEY_STRENGTH * light * np.clip(normal @ self._key, 0, None)
         total += _SKY_STRENGTH * (0.6 + 0.4 * normal[:, 2]) * (0.5 + 0.5 * np.asarray(light)) + _BOUNCE
         gloss = shine * _SHINE * np.clip(_dot(normal, half), 0, None) ** 60
-        return np.clip(albedo**_GAMMA * total[:, None] + gloss[:, None], 0, 1) ** (1 / _GAMMA)
+        return np.clip(albedo * total[:, None] + gloss[:, None], 0, 1) ** (1 / _GAMMA)
+
+
+class _Cover(NamedTuple):
+    """Samples that triangles cover, in spans of S rows of them, along which weights are linear."""
+
+    face: np.ndarray
+    """(S,) triangle of each span."""
+    base: np.ndarray
+    """(3, S) weights of the corners at its first sample, over their depths."""
+    slope: np.ndarray
+    """(3, S) by how much they grow from sample to sample."""
+    span: np.ndarray
+    """(n,) of each sample."""
+    step: np.ndarray
+    """(n,) how many samples of the span are before it."""
+    sample: np.ndarray
+    """(n,) its number in the picture."""
+
+    def nearness(self) -> np.ndarray:
+        """(n,) one over the depth."""
+        return self.base.sum(0)[self.span] + self.slope.sum(0)[self.span] * self.step
+
+    def weights(self, which: np.ndarray) -> np.ndarray:
+        """(3, k) of some of the samples, over the depths."""
+        span = self.span[which]
+        return self.base[:, span] + self.slope[:, span] * self.step[which]
+
+
+def _expand(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For numbers (m,) of things that each row has: the row of each thing, and its number in the row."""
+    counts = counts.clip(0).astype(np.int64)
+    which = np.repeat(np.arange(len(counts)), counts)
+    return which, np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
