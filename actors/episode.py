@@ -1,7 +1,9 @@
 """One world's episode as a message for logs, pictures and exports."""
 
+import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,7 +14,7 @@ from common.hands.kinematics import link_poses
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.task.reward import TERMS
-from common.task.types import Goal, Surface
+from common.task.types import Array, Goal, Surface
 from common.wire.codec import Message
 
 PIECE_KINDS = ("box", "cylinder", "capsule", "ellipsoid", "mesh")
@@ -41,16 +43,11 @@ def episode_message(
     ends = np.flatnonzero(np.asarray(trace.terminal))
     steps = int(ends[0]) + 1 if len(ends) else len(np.asarray(trace.terminal))
     cut = Trace(*(np.asarray(field)[:steps] for field in trace))
-    local_position, local_quaternion = link_poses(hand, jnp.asarray(cut.q))
-    position, quaternion = rotations.compose_pose(
-        jnp.asarray(cut.wrist_position)[:, None],
-        jnp.broadcast_to(jnp.asarray(cut.wrist_quaternion)[:, None], local_quaternion.shape),
-        local_position,
-        local_quaternion,
-    )
+    # Of the whole trace, however early the episode ends: another length would be compiled anew.
+    position, quaternion = _frames(hand, trace.q, trace.wrist_position, trace.wrist_quaternion)
     arrays = {
-        "link_position": position,
-        "link_quaternion": quaternion,
+        "link_position": position[:steps],
+        "link_quaternion": quaternion[:steps],
         "object_position": cut.object_position,
         "object_quaternion": cut.object_quaternion,
         "contact_force": cut.contact_force,
@@ -70,6 +67,14 @@ def episode_message(
         {name: _plain(np.asarray(value)) for name, value in arrays.items()},
         {"hand": hand.reference, "object": obj.name, "control_dt": task.control_dt, **meta},
     )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _frames(hand: Hand, q: Array, wrist_position: Array, wrist_quaternion: Array) -> tuple[Array, Array]:
+    """The links' frames (T, L, 3), (T, L, 4) in the world."""
+    local_position, local_quaternion = link_poses(hand, q)
+    turn = jnp.broadcast_to(wrist_quaternion[:, None], local_quaternion.shape)
+    return rotations.compose_pose(wrist_position[:, None], turn, local_position, local_quaternion)
 
 
 def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:

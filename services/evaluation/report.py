@@ -8,6 +8,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from common.config import TaskConfig
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.policy.bundle import PolicyBundle, content_hash
@@ -127,6 +128,12 @@ def _embedded(picture: Picture) -> Mapping[str, Any]:
     return {"title": picture.title, "words": picture.words, "image": base64.b64encode(picture.png).decode()}
 
 
+def _trained(task: TaskConfig) -> str:
+    shares = {"an affordance": task.p_affordance, "a reference pose": task.p_pose, "a trajectory": task.p_trajectory}
+    words = [f"{name} in {100 * share:.0f} %" for name, share in shares.items()]
+    return f"headings: {task.headings}; of the episodes {', '.join(words)}"
+
+
 def _facts(policy: PolicyBundle, name: str) -> list[tuple[str, str]]:
     task, network = policy.task, policy.spec.network
     return [
@@ -134,6 +141,7 @@ def _facts(policy: PolicyBundle, name: str) -> list[tuple[str, str]]:
         ("content", content_hash(encode(policy.to_message()))),
         ("hand", policy.spec.hand),
         ("trained on", f"{policy.transitions:,} environment steps, version {policy.version}"),
+        ("constraints in training", _trained(task)),
         ("observation", f"{sum(size for _, size in policy.spec.layout)} numbers"),
         ("action", f"{policy.spec.action_size} numbers, {1 / task.control_dt:g} times a second"),
         ("network", f"{' - '.join(map(str, network.hidden))}, encoders of {network.encoder}"),

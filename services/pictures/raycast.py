@@ -1,6 +1,7 @@
 """Capsules, boxes and meshes that rays are cast at, by MuJoCo: no OpenGL, EGL or display is needed."""
 
 import dataclasses
+import functools
 from typing import Literal, NamedTuple
 
 import mujoco
@@ -131,12 +132,12 @@ class Scene:
         self._data = [mujoco.MjData(self.model) for _ in range(THREADS)]
         for data in self._data:
             mujoco.mj_kinematics(self.model, data)
-        self._smooth = {
-            i: SmoothNormals(np.asarray(s.vertices), np.asarray(s.faces))
-            for i, s in enumerate(shapes)
-            if s.kind == "mesh"
-        }
         self._paint = {i: cKDTree(s.paint_points) for i, s in enumerate(shapes) if s.paint_points is not None}
+
+    @functools.cached_property
+    def _smooth(self) -> dict[int, SmoothNormals]:
+        meshes = {i: shape for i, shape in enumerate(self.shapes) if shape.kind == "mesh"}
+        return {i: SmoothNormals(np.asarray(s.vertices), np.asarray(s.faces)) for i, s in meshes.items()}
 
     def cast(self, origin: np.ndarray, rays: np.ndarray, *, glass: bool = False, thread: int = 0) -> Hits:
         """Casts unit rays (n, 3) from `origin` (3,) at the solid shapes, or at those that are seen through."""

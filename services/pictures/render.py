@@ -20,7 +20,7 @@ from common.logs.reader import read_episodes
 from common.task.types import MASKS
 from common.wire.codec import Message
 from services.pictures.raster import Raster
-from services.pictures.raycast import Camera, Shape, between
+from services.pictures.raycast import Camera, Scene, Shape, between
 from services.pictures.shade import render_scene, visible
 from services.pictures.sheets import contact_sheet, save_video
 
@@ -185,14 +185,15 @@ def fit(points: np.ndarray, direction: np.ndarray, aspect: float) -> Camera:
 def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -> Camera:
     """A camera that holds everything that happens in the steps, from where object and touching links show most."""
     points = np.concatenate([_extent(episode, step) for step in steps])
-    looks = [episode_shapes(episode, steps[i]) for i in sorted({len(steps) // 2, len(steps) - 1})]
+    looks = [Scene(episode_shapes(episode, steps[i])) for i in sorted({len(steps) // 2, len(steps) - 1})]
     links = sum(len(link.capsules) for link in get_hand(episode.meta["hand"]).links)
 
     def score(camera: Camera) -> float:
         total = 0.0
-        for shapes in looks:
-            worth = np.array([0.2 if s.colour == SKIN else 1.0 for s in shapes[: links + 1]] + [0.5] * len(shapes))
-            seen = visible(shapes, camera, (round(72 * aspect), 72))
+        for scene in looks:
+            shown, rest = scene.shapes[: links + 1], scene.shapes[links + 1 :]
+            worth = np.array([0.2 if shape.colour == SKIN else 1.0 for shape in shown] + [0.5] * len(rest))
+            seen = visible(scene, camera, (round(72 * aspect), 72))
             total += float(worth[seen[seen >= 0]].sum() - 0.5 * (seen == links + 1).sum())
         return total
 

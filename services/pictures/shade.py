@@ -39,9 +39,9 @@ def render_scene(shapes: list[Shape], camera: Camera, size: tuple[int, int] = (6
     return _Picture(Scene(shapes), camera, *size).render()
 
 
-def visible(shapes: list[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:
+def visible(scene: Scene, camera: Camera, size: tuple[int, int]) -> np.ndarray:
     """(height, width) index of the solid shape that each pixel shows, -1 for the background; quick, without shading."""
-    picture = _Picture(Scene(shapes), camera, *size)
+    picture = _Picture(scene, camera, *size)
     return picture.scene.cast(camera.position, picture.rays).what.reshape(size[::-1])
 
 

@@ -14,7 +14,7 @@ from common.logs.channels import Entry, opaque_channel
 from common.logs.writer import LogWriter
 from common.wire.codec import encode
 from services.cli import render as command
-from services.pictures.raycast import Camera, Shape, between
+from services.pictures.raycast import Camera, Scene, Shape, between
 from services.pictures.render import (
     OBJECT,
     OBJECT_MINUS,
@@ -51,7 +51,7 @@ def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def test_a_ball_covers_its_projection() -> None:
-    seen = visible([ball()], FRONT, (200, 200)) == 0
+    seen = visible(Scene([ball()]), FRONT, (200, 200)) == 0
     # A sphere of radius r at distance d is seen under the half angle asin(r / d).
     radius = np.tan(np.arcsin(0.1)) / np.tan(np.radians(15)) * 100
     assert seen.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
@@ -61,13 +61,13 @@ def test_a_ball_covers_its_projection() -> None:
 
 def test_right_is_right_and_up_is_up() -> None:
     # Seen from +x, +y lies to the right.
-    seen = visible([ball(0.03, at=(0, 0.15, 0.15))], FRONT, (100, 100)) == 0
+    seen = visible(Scene([ball(0.03, at=(0, 0.15, 0.15))]), FRONT, (100, 100)) == 0
     rows, columns = np.nonzero(seen)
     assert rows.mean() < 40 and columns.mean() > 60
 
 
 def test_the_nearer_shape_hides_the_other() -> None:
-    seen = visible([ball(0.1), ball(0.02, BLUE, (0.3, 0, 0))], FRONT, (101, 101))
+    seen = visible(Scene([ball(0.1), ball(0.02, BLUE, (0.3, 0, 0))]), FRONT, (101, 101))
     assert seen[50, 50] == 1 and seen[35, 50] == 0 and seen[0, 0] == -1
 
 
@@ -94,7 +94,7 @@ def test_a_ball_darkens_the_ground_beneath_it() -> None:
     above = Camera(np.array([0.5, 0.0, 0.5]), np.zeros(3), 40.0)
     bare = render_scene([ground], above, (80, 80)).astype(int).sum(-1)
     shaded = render_scene([ground, ball(0.05, at=(0, 0, 0.05))], above, (80, 80)).astype(int).sum(-1)
-    floor = visible([ground, ball(0.05, at=(0, 0, 0.05))], above, (80, 80)) == 0
+    floor = visible(Scene([ground, ball(0.05, at=(0, 0, 0.05))]), above, (80, 80)) == 0
     assert (bare - shaded)[floor].max() > 100
     corner = np.zeros_like(floor)
     corner[:10, :10] = True
