@@ -3,7 +3,7 @@
 import pathlib
 
 from common.errors import CongraspError
-from common.hands import get_hand
+from common.hands import HANDS, get_hand
 
 _FOLDER = pathlib.Path(__file__).with_name("data")
 
@@ -15,8 +15,8 @@ def shipped(hand: str) -> pathlib.Path | None:
 
 
 def shipped_hands() -> list[str]:
-    """Names of the hands whose policies come with the package."""
-    return sorted(path.stem for path in _FOLDER.glob("*.safetensors"))
+    """Names of the hands whose policies come with the package, in the package's order: the human hand is the first."""
+    return [name for name in HANDS if (_FOLDER / f"{name}.safetensors").exists()]
 
 
 def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path:

@@ -35,6 +35,7 @@ def evaluate(
     seed: int = 0,
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
     pictures: pathlib.Path | None = None,
+    hand: str = "human",
 ) -> int:
     """Evaluate a policy by the paper's protocol, beside the paper's figures.
 
@@ -44,7 +45,7 @@ def evaluate(
     trajectories are made from its own grasps under headings, as the paper makes them for its hands.
 
     Args:
-      policy: A policy file (policy.safetensors of a run); by default the one that comes with the package.
+      policy: A policy file (policy.safetensors of a run); by default one that comes with the package.
       table: single: one constraint a row; composed: two; objects: the heading alone on many objects, by size, mass and
         family; noise: poses and trajectories with errors, as captured ones have; all: everything. Several may be
         named.
@@ -60,6 +61,7 @@ def evaluate(
       seed: Seed of constraints and episodes.
       json: Also write the rows to this file.
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
+      hand: Whose policy of those that come with the package.
     """
     import sys
 
@@ -77,7 +79,7 @@ def evaluate(
     for name, value, least in (("episodes", episodes, 1), ("pool", pool, 0), ("batch", batch, 0), ("seed", seed, 0)):
         if value < least:
             raise CongraspError(f"--{name} is {value}.", f"It must be at least {least}.")
-    policy = policy_file(policy)
+    policy = policy_file(policy, hand)
     loaded = bundles.load(policy)
     engine = resolve_physics(physics)
     rows = []

@@ -24,6 +24,7 @@ def report(
     physics: PhysicsName = "auto",
     pool: int = _POOL,
     seed: int = 0,
+    hand: str = "human",
 ) -> int:
     """Write one HTML file about a policy: results beside the paper's, episodes that fail and succeed, and its training.
 
@@ -31,13 +32,14 @@ def report(
     row that takes some minutes on a CPU; a first look: --episodes 16.
 
     Args:
-      source: A run's folder or a policy file; by default the policy that comes with congrasp.
+      source: A run's folder or a policy file; by default a policy that comes with congrasp.
       out: The file to write.
       objects: Objects to grasp, as 'congrasp evaluate' takes them; held-out procedural ones by default.
       episodes: Episodes in each row.
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
       pool: Number of procedural objects.
       seed: Seed of constraints and episodes.
+      hand: Whose policy of those that come with congrasp.
     """
     import os
 
@@ -65,7 +67,7 @@ def report(
         raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
     template()  # what is missing is said now, not after the evaluation
     run_dir = source if source is not None and source.is_dir() else None
-    file = run_dir / POLICY_FILE if run_dir else policy_file(source)
+    file = run_dir / POLICY_FILE if run_dir else policy_file(source, hand)
     policy, engine = bundles.load(file), resolve_physics(physics)
     names = [name for table in TABLES.values() for name in table]
     bars = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -93,7 +95,7 @@ def report(
             sheets.append(Picture(name, png_of(sheet), causes_in_words(causes)))
             advance(len(sheets))
     flags = [
-        *([f"--policy {file}"] if source else []),
+        f"--policy {file}" if source else f"--hand {hand}",
         *([f"--objects {objects}"] if objects else [f"--pool {pool}"]),
         f"--episodes {episodes} --physics {engine} --seed {seed}",
     ]

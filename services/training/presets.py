@@ -65,22 +65,29 @@ PRESETS = {
 }
 
 
-def _robot(hand: str, force_max: float) -> RunConfig:
-    """The human preset for another hand; the heavier its objects, the harder it may press."""
+def _robot(hand: str, *, force_max: float, heading_position: float, p_affordance: float) -> RunConfig:
+    """The human preset for another hand; what differs is what docs/training.md found to help it."""
     human = PRESETS["human"]
-    ramp = human.curriculum
+    first, ramp = human.task.reward, human.curriculum
+    last = dataclasses.replace(ramp.reward, force_max=force_max, heading_position=heading_position)
     return dataclasses.replace(
         human,
         name=hand,
         task=dataclasses.replace(
-            human.task, hand=hand, reward=dataclasses.replace(human.task.reward, force_max=force_max)
+            human.task,
+            hand=hand,
+            p_affordance=p_affordance,
+            reward=dataclasses.replace(first, force_max=force_max),
         ),
-        curriculum=dataclasses.replace(ramp, reward=dataclasses.replace(ramp.reward, force_max=force_max)),
+        curriculum=dataclasses.replace(ramp, reward=last),
     )
 
 
 # At 1.4 times the size an object weighs 2.7 times as much, at 1.1 times 1.3 times.
-PRESETS |= {"allegro": _robot("allegro", 8.0), "sharpa": _robot("sharpa", 6.0)}
+PRESETS |= {
+    "allegro": _robot("allegro", force_max=12.0, heading_position=25.0, p_affordance=0.8),
+    "sharpa": _robot("sharpa", force_max=4.5, heading_position=16.0, p_affordance=0.7),
+}
 
 
 def easier(config: RunConfig) -> list[str]:

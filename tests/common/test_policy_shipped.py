@@ -8,7 +8,7 @@ import pytest
 from common.errors import CongraspError
 from common.policy import bundle as bundles
 from common.policy import shipped as module
-from common.policy.shipped import policy_file, shipped
+from common.policy.shipped import policy_file, shipped, shipped_hands
 
 ROOT = pathlib.Path(module.__file__).resolve().parents[2]
 
@@ -30,5 +30,7 @@ def test_what_is_shipped_is_installed_and_can_be_loaded():
     data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     patterns = [pathlib.Path("common/policy", pattern) for pattern in data["common.policy"]]
     assert [module._FOLDER.relative_to(ROOT) / "*.safetensors"] == patterns
-    for path in module._FOLDER.glob("*.safetensors"):
-        assert bundles.load(path).spec.hand == path.stem
+    assert shipped_hands() == ["human", "allegro", "sharpa"]
+    assert {path.stem for path in module._FOLDER.glob("*.safetensors")} == set(shipped_hands())
+    for hand in shipped_hands():
+        assert bundles.load(policy_file(None, hand)).spec.hand == hand
