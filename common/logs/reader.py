@@ -41,6 +41,8 @@ def log_files(path: pathlib.Path) -> list[pathlib.Path]:
     Raises:
       CongraspError: there are none.
     """
+    if not path.exists():
+        raise CongraspError(f"There is no file or folder {path}.", "Name a run's folder or an MCAP file.")
     if path.is_file():
         return [path]
     found = sorted([*path.rglob("*.mcap"), *path.rglob(f"*.mcap{PART}")], key=lambda file: (file.name, file))

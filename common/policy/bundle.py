@@ -173,11 +173,12 @@ def load(path: pathlib.Path) -> PolicyBundle:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise CongraspError(f"The policy {path} cannot be read: {error.strerror}.") from None
+        remedy = "Name a policy file (policy.safetensors in a run's folder)."
+        raise CongraspError(f"The policy {path} cannot be read: {error.strerror}.", remedy) from None
     try:
         message = decode(data)
     except CongraspError as error:
-        raise CongraspError(f"The policy {path} is damaged: {error}") from None
+        raise CongraspError(f"The policy {path} is damaged, or no policy at all: {error}") from None
     return PolicyBundle.from_message(message, str(path))
 
 

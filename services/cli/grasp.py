@@ -69,6 +69,8 @@ def grasp(
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
     if tries < 1:
         raise CongraspError(f"--tries is {tries}.", "It must be at least 1.")
+    if out.exists() and not out.is_dir():
+        raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
     console = Console(highlight=False)
     file = policy_file(policy, hand)
     loaded = bundles.load(file)

@@ -1,6 +1,7 @@
 """`congrasp COMMAND …`: finds the command's module, runs it, and turns errors into one line and an exit code."""
 
 import contextlib
+import difflib
 import errno
 import functools
 import importlib
@@ -96,7 +97,9 @@ def run(arguments: list[str]) -> int:
         print(importlib.metadata.version("congrasp"))
         return 0
     if name not in COMMANDS:
-        raise CongraspError(f"There is no command '{name}'.", f"Choose one of: {', '.join(COMMANDS)}.")
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        meant = f"Did you mean '{near[0]}'?" if near else f"Choose one of: {', '.join(COMMANDS)}."
+        raise CongraspError(f"There is no command '{name}'.", meant)
     _prepare_environment()
     with on_signal(interrupt=True) as stop:
         try:
@@ -162,7 +165,7 @@ def usage() -> str:
         "Dexterous grasping under constraints: distributed training and a live policy.\n\n"
         f"{rows}\n\n"
         "Options of every command: --help, and --debug for the trace of an error.\n"
-        "First steps: 'congrasp train --preset quickstart', then 'congrasp plot runs/…'.\n"
+        "First steps: 'congrasp grasp mug.obj' for a mesh of yours, 'congrasp view', 'congrasp train'.\n"
     )
 
 

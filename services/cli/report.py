@@ -68,6 +68,8 @@ def report(
     template()  # what is missing is said now, not after the evaluation
     run_dir = source if source is not None and source.is_dir() else None
     file = run_dir / POLICY_FILE if run_dir else policy_file(source, hand)
+    if run_dir and not file.is_file():
+        raise CongraspError(f"The folder {run_dir} holds no {POLICY_FILE}.", "Name a run's folder, or a policy file.")
     policy, engine = bundles.load(file), resolve_physics(physics)
     names = [name for table in TABLES.values() for name in table]
     bars = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

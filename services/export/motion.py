@@ -42,6 +42,8 @@ def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -
         raise CongraspError(f"There is no {path}.", "Name a motion (.npz), a recording (.mcap) or a run's folder.")
     if path.suffix == ".npz":
         return load_motion(path)
+    if path.is_file() and path.suffix != ".mcap":
+        raise CongraspError(f"{path} holds no motion.", "Name a grasp.npz, a recording (.mcap) or a run's folder.")
     return motion_of_episode(pick_episode(path, index, success=success))
 
 

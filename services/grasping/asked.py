@@ -149,6 +149,8 @@ def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
                 )
         inside = np.isin(obj.labels, [obj.part_names.index(part) for part in names])
         return np.where(inside, 0.0, 1.0)
+    if not path.is_file():
+        raise CongraspError(f"{name}: there is no file {path}.", "Check the path.")
     try:
         geometry: Any = trimesh.load_scene(path, process=False).to_geometry()
         points = np.asarray(geometry.vertices, float)

@@ -248,6 +248,8 @@ def test_what_is_no_recording_is_said_in_words(tmp_path: pathlib.Path) -> None:
         read_metrics(tmp_path)
     with pytest.raises(CongraspError, match="cannot be read"):
         list(read_records(tmp_path / "absent.mcap"))
+    with pytest.raises(CongraspError, match=r"no file or folder .*absent\. Name a run"):
+        log_files(tmp_path / "absent")
     (tmp_path / "file").write_text("")
     with pytest.raises(CongraspError, match="cannot be made"):
         LogWriter(tmp_path / "file" / "logs", "log")

@@ -61,7 +61,7 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
     np.testing.assert_array_equal(asked(block, affordance="near half").minus, block.labels == 1)
     with pytest.raises(CongraspError, match=r"has no part 'handle'\. Its parts are: near half, far half"):
         asked(block, affordance="handle")
-    with pytest.raises(CongraspError, match=r"none\.ply cannot be read"):
+    with pytest.raises(CongraspError, match=r"there is no file .*none\.ply"):
         asked(block, affordance=str(tmp_path / "none.ply"))
     trimesh.creation.box(SIDES).export(tmp_path / "metres.ply")
     with pytest.raises(CongraspError, match=r"Nothing of .*metres\.ply' lies on the surface of 'block'"):
