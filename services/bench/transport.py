@@ -1,4 +1,4 @@
-"""What the wire carries: rollouts into one learner beside bare PUSH/PULL sockets, and weights out to its actors.
+"""What the wire carries: rollouts into one learner beside bare Zenoh and bare PUSH/PULL sockets, and weights out of it.
 
 Everything but the policy and the physics is the real thing: the hub with its checks, admission and journals, and links
 with theirs, in processes of their own over the loopback interface.
@@ -12,9 +12,13 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+import zenoh
+from zenoh import CongestionControl
+from zenoh.handlers import FifoChannel
 
 from actors.link import ActorLink, RunFinished
 from common.errors import CongraspError
@@ -36,13 +40,11 @@ _START = 30.0  # seconds that processes may take to start
 _INTERVAL = 0.25  # seconds between two versions of the weights
 
 
-def measure_ingest(senders: int, seconds: float, repeats: int) -> tuple[float, float]:
-    """MB/s into a learner, and between bare sockets: medians of `repeats` alternating measurements."""
-    ours, bare = [], []
-    for _ in range(repeats):
-        ours.append(_through_the_hub(senders, seconds))
-        bare.append(_through_sockets(senders, seconds))
-    return statistics.median(ours), statistics.median(bare)
+def measure_ingest(senders: int, seconds: float, repeats: int) -> list[float]:
+    """MB/s into a learner, by bare Zenoh queries and by bare sockets: medians of `repeats` alternating measurements."""
+    ways = _through_the_hub, _through_queries, _through_sockets
+    rates = [[way(senders, seconds) for way in ways] for _ in range(repeats)]
+    return [statistics.median(each) for each in zip(*rates, strict=True)]
 
 
 def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]:
@@ -138,6 +140,25 @@ def _through_the_hub(senders: int, seconds: float) -> float:
         return rate
 
 
+def _through_queries(senders: int, seconds: float) -> float:
+    endpoint = f"tcp/127.0.0.1:{free_port(1)}"
+    with _session("peer", listen=endpoint) as session:
+        queryable = session.declare_queryable(_RUN, FifoChannel(8))
+
+        def receive() -> int:
+            query = queryable.handler.try_recv()
+            if query is None:
+                time.sleep(0.0002)
+                return 0
+            with query:
+                size = len(query.payload.to_bytes()) if query.payload else 0
+                query.reply(_RUN, b"accepted")
+            return size
+
+        with _processes(senders, _ask, endpoint, pathlib.Path()):
+            return _rate(receive, seconds)
+
+
 def _through_sockets(senders: int, seconds: float) -> float:
     zmq = _zmq()
     with zmq.Context() as context, context.socket(zmq.PULL) as socket:
@@ -206,6 +227,29 @@ def _upload(endpoint: str, folder: pathlib.Path, number: int) -> None:
         while True:
             if ticket := link.acquire_ticket(1.0):
                 link.upload(Message(message.arrays, {**message.meta, "version": ticket.version}), ticket)
+
+
+def _ask(endpoint: str, _: pathlib.Path, number: int) -> None:
+    """Two threads, as an actor has, each with one query on its way."""
+    data = encode(_rollout())
+
+    def send() -> None:
+        while True:
+            for _reply in session.get(_RUN, FifoChannel(4), payload=data, congestion_control=CongestionControl.BLOCK):
+                pass
+
+    with _session("client", connect=endpoint) as session, ThreadPoolExecutor(2) as pool:
+        for sending in [pool.submit(send) for _ in range(2)]:
+            sending.result()
+
+
+def _session(mode: str, **endpoints: str) -> zenoh.Session:
+    settings: dict[str, Any] = {f"{way}/endpoints": [endpoint] for way, endpoint in endpoints.items()}
+    settings |= {"mode": mode, "scouting/multicast/enabled": False, "transport/shared_memory/enabled": False}
+    config = zenoh.Config()
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    return zenoh.open(config)
 
 
 def _push(address: str, _: pathlib.Path, number: int) -> None:

@@ -105,7 +105,7 @@ def security(repeats: int = 5) -> int:
 
 
 def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: int = 4, versions: int = 100) -> int:
-    """Rollouts of 8 MB into one learner, beside bare PUSH/PULL sockets (pyzmq); and 4 MB of weights to its actors.
+    """Rollouts of 8 MB into one learner, beside bare Zenoh and bare PUSH/PULL (pyzmq); 4 MB of weights to its actors.
 
     Args:
       senders: Actor processes that send rollouts.
@@ -116,9 +116,10 @@ def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: 
     """
     from services.bench.transport import measure_ingest, measure_weights
 
-    ours, bare = measure_ingest(senders, seconds, repeats)
+    ours, queries, bare = measure_ingest(senders, seconds, repeats)
     print(
-        f"rollouts of 8 MB: {ours:.0f} MB/s into the learner, {bare:.0f} MB/s bare (ratio {ours / bare:.2f})",
+        f"rollouts of 8 MB: {ours:.0f} MB/s into the learner, {queries:.0f} MB/s as bare Zenoh queries, "
+        f"{bare:.0f} MB/s by PUSH/PULL (ratios {ours / queries:.2f} and {ours / bare:.2f})",
         flush=True,
     )
     delays = measure_weights(actors, versions, 4.0)
