@@ -1,5 +1,6 @@
 """The policy as one compiled function from a batch of flat queries to joint targets."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -50,11 +51,12 @@ class PolicyFunction:
 
     def __call__(self, weights: Acting, queries: Sequence[Query]) -> list[Answer | Exception]:
         """Answers queries of at most `BATCH_SIZES[-1]` states; one that cannot be answered gets its own error."""
-        ends = np.cumsum([len(query.vectors) for query in queries])
-        padding = next(size for size in BATCH_SIZES if size >= ends[-1]) - ends[-1]
-        batch = np.concatenate([*(query.vectors for query in queries), np.zeros((padding, self.layout.size))])
-        found = np.split(np.asarray(self._compiled(weights, batch.astype(np.float32, copy=False))), ends)
-        return [self._answer(*each) for each in zip(queries, found[:-1], strict=True)]
+        ends = list(itertools.accumulate(len(query.vectors) for query in queries))
+        batch = np.zeros((next(size for size in BATCH_SIZES if size >= ends[-1]), self.layout.size), np.float32)
+        np.concatenate([query.vectors for query in queries], out=batch[: ends[-1]])
+        found = np.asarray(self._compiled(weights, batch))
+        starts = [0, *ends[:-1]]
+        return [self._answer(query, found[a:b]) for query, a, b in zip(queries, starts, ends, strict=True)]
 
     def _infer(self, weights: Acting, vectors: jax.Array) -> jax.Array:
         """For states (B, S): answers (A + F + 6), the flags redirected and aligned, and checks (C), in one (B, ...)."""
@@ -74,9 +76,8 @@ class PolicyFunction:
         return jnp.concatenate([mean, action.q_target, action.u_target, notes, checks], -1)
 
     def _answer(self, query: Query, found: np.ndarray) -> Answer | Exception:
-        fingers = len(self.layout.hand.joints)
-        vectors, notes, checks = np.split(found, [2 * fingers + 12, 2 * fingers + 14], 1)
-        redirected, aligned = notes.T > 0.5
+        size = 2 * len(self.layout.hand.joints) + 12
+        vectors, redirected, aligned, checks = found[:, :size], found[:, size], found[:, size + 1], found[:, size + 2 :]
         if complaint := self.layout.complaint(query, checks):
             return complaint
         if not np.isfinite(vectors).all():
@@ -87,5 +88,6 @@ class PolicyFunction:
                 "Change the trajectory or the affordance.",
             )
         asked = {name: name in query.asked for name in ("affordance", "pose", "trajectory")}
-        words = {flag: explain(**asked, redirected=flag) for flag in set(redirected.tolist())}
-        return Answer(vectors, [words[flag] for flag in redirected.tolist()])
+        flags = redirected.tolist()
+        words = {flag: explain(**asked, redirected=flag > 0) for flag in set(flags)}
+        return Answer(vectors, [words[flag] for flag in flags])
