@@ -1,7 +1,6 @@
 """`congrasp evaluate`: a policy by the paper's protocol."""
 
 import pathlib
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -12,14 +11,13 @@ from common.errors import CongraspError
 if TYPE_CHECKING:
     from actors.taskset import TaskSet
     from common.objects.spec import GraspObject
+    from services.cli.progress import Track
 
 Split = Literal["all", "training", "held-out"]
 Table = Literal["single", "composed", "objects", "noise", "all"]
 _POOL = 64
 _PICTURED = 4
 _MOST = 50_000
-Track = Callable[[str, int | None], Callable[[int], None]]
-"""(what is done, its total if known) -> what to call with the amount done."""
 
 
 def evaluate(
@@ -66,12 +64,12 @@ def evaluate(
     import sys
 
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     from actors.physics import resolve_physics
     from common.objects.pool import HELD_OUT_SEED
     from common.policy import bundle as bundles
     from common.policy.shipped import policy_file
+    from services.cli.progress import tracked
     from services.evaluation.noise import LEVELS
     from services.evaluation.scores import TABLES, tables_of, write_json
     from services.grasping.objects import objects_of
@@ -83,13 +81,7 @@ def evaluate(
     loaded = bundles.load(policy)
     engine = resolve_physics(physics)
     rows = []
-    bars = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*bars, console=Console(stderr=True), transient=True) as progress:
-
-        def track(text: str, total: int | None) -> Callable[[int], None]:
-            task = progress.add_task(text, total=total)
-            return lambda done: progress.update(task, completed=done)
-
+    with tracked() as track:
         given = objects_of(objects, track) if objects else None
         settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed}
         taskset = None
@@ -158,7 +150,7 @@ def _evaluator(
     taskset: "TaskSet | None",
     pool: int,
     settings: dict[str, Any],
-    track: Track,
+    track: "Track",
 ) -> Any:
     import os
 
@@ -184,7 +176,7 @@ def _object_rows(
     pool: int,
     episodes: int,
     settings: dict[str, Any],
-    track: Track,
+    track: "Track",
 ) -> list[Any]:
     import os
 

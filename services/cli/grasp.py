@@ -58,10 +58,10 @@ def grasp(
     """
     from rich.console import Console
     from rich.markup import escape
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     from common.policy import bundle as bundles
     from common.policy.shipped import policy_file
+    from services.cli.progress import bars
     from services.grasping.grasp import Grasper
     from services.grasping.jobs import SHEET, Result, Settings, find_jobs, run_job, save_summary
 
@@ -100,8 +100,7 @@ def grasp(
     for result in results[:]:
         results.remove(result)
         say(result)
-    bars = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*bars, console=Console(stderr=True), transient=True) as bar:
+    with bars() as bar:
         whole = bar.add_task("Objects", total=len(jobs), visible=len(jobs) > 1)
         part = bar.add_task("Starting", total=None)
         for job in jobs:

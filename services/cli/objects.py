@@ -10,7 +10,6 @@ import numpy as np
 import tyro
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from common.constraints.headings import above, clear_table, feasible, sample_headings
@@ -22,6 +21,7 @@ from common.objects.sources import SUFFIXES, find_sources
 from common.objects.spec import GraspObject
 from common.objects.store import Catalogue
 from services.cli.objects_affordance import ObjectsAffordance
+from services.cli.progress import bars
 
 _console = Console(highlight=False)
 
@@ -45,7 +45,7 @@ class ObjectsGenerate:
             raise CongraspError(f"--count is {self.count}.", "Ask for at least one object.")
         catalogue = Catalogue(self.out)
         families = family_turns(self.count, self.seed, self.families)
-        with _progress() as progress:
+        with bars(_console) as progress:
             task = progress.add_task("Generating", total=self.count)
             for i, family in enumerate(families):
                 catalogue.add(generate(self.seed + i, family))
@@ -80,7 +80,7 @@ class ObjectsImport:
             except CongraspError as error:
                 failures += _complain(error)
         catalogue = Catalogue(self.out)
-        with _progress() as progress:
+        with bars(_console) as progress:
             task = progress.add_task("Importing", total=len(sources))
             for source in sources:
                 progress.update(task, description=f"Importing {escape(source.name)}")
@@ -222,17 +222,6 @@ def find_object(text: str, folder: str = "objects") -> GraspObject:
             "Name an object of the folder, an object file, a mesh, or FAMILY:SEED such as mug:7.",
         )
     return Catalogue(folder).get(text)
-
-
-def _progress() -> Progress:
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    return Progress(*columns, console=_console, transient=True)
 
 
 def _complain(error: CongraspError) -> int:

@@ -1,7 +1,7 @@
 """`congrasp report`: a policy's report and model card."""
 
 import pathlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -10,6 +10,7 @@ from common.config import PhysicsName
 from common.errors import CongraspError
 
 if TYPE_CHECKING:
+    from services.cli.progress import tracked
     from services.evaluation.report import Picture
 
 _POOL = 64
@@ -43,9 +44,6 @@ def report(
     """
     import os
 
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
     from actors.physics import resolve_physics
     from common.config import ObjectsConfig
     from common.objects.pool import HELD_OUT_SEED, load_pool
@@ -72,13 +70,7 @@ def report(
         raise CongraspError(f"The folder {run_dir} holds no {POLICY_FILE}.", "Name a run's folder, or a policy file.")
     policy, engine = bundles.load(file), resolve_physics(physics)
     names = [name for table in TABLES.values() for name in table]
-    bars = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*bars, console=Console(stderr=True), transient=True) as progress:
-
-        def track(text: str, total: int | None) -> Callable[[int], None]:
-            task = progress.add_task(text, total=total)
-            return lambda done: progress.update(task, completed=done)
-
+    with tracked() as track:
         curves = list(curves_of(run_dir)) if run_dir else []
         given = objects_of(objects, track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
         track("Making constraints", None)
