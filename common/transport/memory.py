@@ -19,6 +19,8 @@ from common.transport.keys import matches
 from common.wire.codec import Message
 
 _log = logging.getLogger(__name__)
+_GRACE = 5.0
+"""Seconds for which `close` waits for handlers that still work."""
 
 
 class _Question(NamedTuple):
@@ -66,6 +68,7 @@ class MemoryTransport:
         self._subscriptions: list[Subscription] = []
         self._tokens: list[str] = []
         self._watchers: list[_Watcher] = []
+        self._threads: list[threading.Thread] = []
         self._closed = False
 
     def serve(
@@ -85,8 +88,7 @@ class MemoryTransport:
             self._hub.servers.append(server)
         self._servers.append(server)
         for _ in range(workers):
-            arguments = server, handler, turnstile or (lambda _: None)
-            threading.Thread(target=_serve, args=arguments, daemon=True, name=f"memory-{key}").start()
+            self._start(f"memory-{key}", _serve, server, handler, turnstile or (lambda _: None))
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
@@ -144,10 +146,13 @@ class MemoryTransport:
                 if matches(key_expression, key):
                     watcher.changes.put((key, True))
         self._watchers.append(watcher)
-        threading.Thread(target=_watch, args=(watcher, on_change), daemon=True, name="memory-alive").start()
+        self._start("memory-alive", _watch, watcher, on_change)
 
     def close(self) -> None:
-        """See `Transport.close`."""
+        """See `Transport.close`.
+
+        Waits for its threads: one that lets go of a device's array while the interpreter ends kills the process.
+        """
         if self._closed:
             return
         self._closed = True
@@ -166,6 +171,10 @@ class MemoryTransport:
             _refuse_waiting(server)
         for subscription in self._subscriptions:
             subscription.close()
+        deadline = time.monotonic() + _GRACE
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, deadline - time.monotonic()))
 
     def __enter__(self) -> Self:
         return self
@@ -176,6 +185,11 @@ class MemoryTransport:
     def _check_open(self) -> None:
         if self._closed:
             raise TransportError("The transport is closed.")
+
+    def _start(self, name: str, target: Callable[..., None], *arguments: object) -> None:
+        thread = threading.Thread(target=target, args=arguments, daemon=True, name=name)
+        self._threads.append(thread)
+        thread.start()
 
 
 def _refuse_waiting(server: _Server) -> None:

@@ -59,7 +59,7 @@ class Evaluator:
           batch: worlds that run side by side; 0 chooses by the engine.
           threads: threads of the `native` engine.
           seed: seed of constraints and episodes.
-          task: where it is not to be the bundle's; mass and friction are in the middle of their ranges.
+          task: where it is not to be the bundle's; mass and friction are nominal (`protocol`).
           hold_steps: control steps without the table; the task's, which count for success, if not given.
           taskset: constraints to draw from, of these objects in this order
             (`services.grasping.constraint_sets.taskset_of`); made from the seed if not given.

@@ -29,14 +29,18 @@ def two_seconds(task: TaskConfig) -> int:
 
 
 def protocol(task: TaskConfig, hold: int) -> TaskConfig:
-    """The task with `hold` control steps without the table, and mass and friction in the middle of their ranges."""
+    """The task with `hold` control steps without the table, and objects of their own mass and of friction 1.
+
+    So rates compare between policies, whatever ranges they were trained with.
+    """
+    nominal = TaskConfig()
     return dataclasses.replace(
         task,
         hold_steps=min(task.hold_steps, hold),
         hold_steps_max=hold,
         end_when_fallen=False,
-        mass_range=_nominal(task.mass_range),
-        friction_range=_nominal(task.friction_range),
+        mass_range=nominal.mass_range,
+        friction_range=nominal.friction_range,
     )
 
 
@@ -106,8 +110,3 @@ def torque_share(hand: Hand, scene: SceneState) -> Array:
     gains = np.array([(joint.kp, joint.kv, joint.torque_limit) for joint in hand.joints], np.float32)
     torque = gains[:, 0] * (scene.q_target - scene.q) - gains[:, 1] * scene.q_velocity
     return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)
-
-
-def _nominal(bounds: tuple[float, float]) -> tuple[float, float]:
-    middle = (bounds[0] + bounds[1]) / 2
-    return middle, middle

@@ -184,6 +184,25 @@ def test_query_after_the_server_closed_fails_at_once(pair):
     server.publish(KEYS.announcement, Message())
 
 
+def test_closing_waits_for_handlers_that_still_work(pair):
+    server, client = pair
+    began, ended = threading.Event(), threading.Event()
+
+    def handler(key, message):
+        began.set()
+        time.sleep(0.3)
+        ended.set()
+        return message
+
+    server.serve(KEYS.act, handler)
+    asker = threading.Thread(target=client.query, args=(KEYS.act, Message()), kwargs={"timeout": 5}, daemon=True)
+    asker.start()
+    assert began.wait(5)
+    server.close()
+    assert ended.is_set()
+    asker.join(10)
+
+
 def test_subscription_keeps_the_newest_and_counts_the_rest(pair):
     server, client = pair
     subscription = client.subscribe(KEYS.logs, depth=4)

@@ -31,7 +31,7 @@ def main() -> None:
     rank, count, port, run_dir, goal, mode = sys.argv[1:]
     ranks = Ranks.join(int(rank), int(count), f"127.0.0.1:{port}")
     broker = MemoryHub()
-    MadeUpActor(MemoryTransport(broker), f"actor-{rank}", seed=int(rank))
+    actor = MadeUpActor(MemoryTransport(broker), f"actor-{rank}", seed=int(rank))
     with MemoryTransport(broker) as transport:
         last = run_learner(
             pathlib.Path(run_dir),
@@ -43,6 +43,9 @@ def main() -> None:
             on_update=lambda values: print("update", int(values["update"]), flush=True),
             on_event=lambda level, text: print(level, text, flush=True),
         )
+    # A thread that is inside JAX when the interpreter ends takes the process down with it.
+    actor.stop.set()
+    actor.join(30.0)
     print("bundle", zlib.crc32(encode(last.to_message())), last.transitions, flush=True)
 
 

@@ -135,6 +135,6 @@ def test_numbers_out_of_range_are_refused(policy, arguments):
 
 def test_nominal_mass_and_friction(monkeypatch):
     monkeypatch.setattr("services.evaluation.evaluate.build_taskset", lambda *arguments: None)
-    ranged = dataclasses.replace(CONFIG.task, mass_range=(0.5, 1.5), friction_range=(0.6, 1.0))
+    ranged = dataclasses.replace(CONFIG.task, mass_range=(0.8, 1.5), friction_range=(0.6, 1.0))
     task = Evaluator(untrained(CONFIG), OBJECTS, task=ranged).task
-    assert task.mass_range == (1.0, 1.0) and task.friction_range == (0.8, 0.8)
+    assert task.mass_range == (1.0, 1.0) and task.friction_range == (1.0, 1.0)
