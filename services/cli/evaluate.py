@@ -34,6 +34,7 @@ def evaluate(
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
     pictures: pathlib.Path | None = None,
     hand: str = "human",
+    friction: float = 1.0,
 ) -> int:
     """Evaluate a policy by the paper's protocol, beside the paper's figures.
 
@@ -60,6 +61,8 @@ def evaluate(
       json: Also write the rows to this file.
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
       hand: Whose policy of those that come with the package.
+      friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
+        simulates 3.
     """
     import sys
 
@@ -77,13 +80,15 @@ def evaluate(
     for name, value, least in (("episodes", episodes, 1), ("pool", pool, 0), ("batch", batch, 0), ("seed", seed, 0)):
         if value < least:
             raise CongraspError(f"--{name} is {value}.", f"It must be at least {least}.")
+    if not 0.05 <= friction <= 10.0:
+        raise CongraspError(f"--friction is {friction:g}.", "It must lie between 0.05 and 10.")
     policy = policy_file(policy, hand)
     loaded = bundles.load(policy)
     engine = resolve_physics(physics)
     rows = []
     with tracked() as track:
         given = objects_of(objects, track) if objects else None
-        settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed}
+        settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
         taskset = None
         if constraints is not None:
             given, taskset = _captured(constraints, split, given, objects)
@@ -101,7 +106,8 @@ def evaluate(
             rows += _object_rows(loaded, given, pool or min(episodes, _MOST), episodes, settings, track)
     source = str(objects) if objects else "held-out procedural objects"
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 160)
-    for shown in tables_of(rows, f"{policy.name}, version {loaded.version}, on {source}, {engine}"):
+    title = f"{policy.name}, version {loaded.version}, on {source}, {engine}, friction {friction:g}"
+    for shown in tables_of(rows, title):
         console.print(shown)
     if json is not None:
         about = {

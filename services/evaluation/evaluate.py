@@ -24,7 +24,7 @@ from common.task.types import Surface
 from common.wire.codec import Message
 from services.evaluation.noise import LEVELS, Noise, disturbed
 from services.evaluation.scores import Row, Sample, active_mask, joined, matching, summarise
-from services.evaluation.worlds import acting, mixture, protocol, two_seconds
+from services.evaluation.worlds import NOMINAL_FRICTION, acting, mixture, protocol, two_seconds
 
 _BATCH = {"native": 64, "warp": 4096, "jax": 256}
 _PATIENCE = 100
@@ -47,6 +47,7 @@ class Evaluator:
         threads: int = 2,
         seed: int = 0,
         task: TaskConfig | None = None,
+        friction: float = NOMINAL_FRICTION,
         hold_steps: int | None = None,
         taskset: TaskSet | None = None,
     ):
@@ -59,7 +60,8 @@ class Evaluator:
           batch: worlds that run side by side; 0 chooses by the engine.
           threads: threads of the `native` engine.
           seed: seed of constraints and episodes.
-          task: where it is not to be the bundle's; mass and friction are nominal (`protocol`).
+          task: where it is not to be the bundle's; see `protocol` for what stays of it.
+          friction: sliding friction between hand and object.
           hold_steps: control steps without the table; the task's, which count for success, if not given.
           taskset: constraints to draw from, of these objects in this order
             (`services.grasping.constraint_sets.taskset_of`); made from the seed if not given.
@@ -67,7 +69,7 @@ class Evaluator:
         base = task or bundle.task
         hold = hold_steps or base.hold_steps
         self.bundle = bundle
-        self.task = protocol(base, hold)
+        self.task = protocol(base, hold, friction)
         self._hold = hold
         self._hand = get_hand(bundle.spec.hand)
         self.objects = sized(self._hand, self.task, objects)

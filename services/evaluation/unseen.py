@@ -48,6 +48,7 @@ def evaluate_objects(
     batch: int,
     threads: int,
     seed: int,
+    friction: float,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Row]:
     """Rows of the heading constraint: all objects, then by size, mass and family.
@@ -60,6 +61,7 @@ def evaluate_objects(
       batch: worlds that run side by side; 0 chooses by the engine.
       threads: threads of the `native` engine.
       seed: seed of constraints and episodes.
+      friction: sliding friction between hand and object.
       progress: is told how many episodes there are.
     """
     evaluator = Evaluator(
@@ -69,6 +71,7 @@ def evaluate_objects(
         batch=batch,
         threads=threads,
         seed=seed,
+        friction=friction,
         hold_steps=two_seconds(bundle.task),
     )
     samples: list[Sample] = []

@@ -21,6 +21,8 @@ from common.task.types import Array, SceneState
 
 HOLD_SECONDS = 2.0
 """How long a grasp should last without the table, beyond the paper's quarter of a second."""
+NOMINAL_FRICTION = 1.0
+"""Sliding friction between hand and object, of evaluations that name no other."""
 
 
 def two_seconds(task: TaskConfig) -> int:
@@ -28,19 +30,18 @@ def two_seconds(task: TaskConfig) -> int:
     return round(HOLD_SECONDS / task.control_dt)
 
 
-def protocol(task: TaskConfig, hold: int) -> TaskConfig:
-    """The task with `hold` control steps without the table, and objects of their own mass and of friction 1.
+def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) -> TaskConfig:
+    """The task with `hold` control steps without the table, and objects of their own mass and of one sliding friction.
 
     So rates compare between policies, whatever ranges they were trained with.
     """
-    nominal = TaskConfig()
     return dataclasses.replace(
         task,
         hold_steps=min(task.hold_steps, hold),
         hold_steps_max=hold,
         end_when_fallen=False,
-        mass_range=nominal.mass_range,
-        friction_range=nominal.friction_range,
+        mass_range=(1.0, 1.0),
+        friction_range=(friction, friction),
     )
 
 

@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 
-import jax
 import pytest
 
 from common.policy import bundle as bundles
@@ -13,10 +12,15 @@ from learner.run_directory import POLICY_FILE
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(600)]
 
 
-@pytest.fixture(autouse=True)
-def gpu():
-    if jax.default_backend() != "gpu":
+@pytest.fixture(scope="module", autouse=True)
+def gpus():
+    """Their number, counted by another process: this one would take their memory."""
+    count = "import jax; print(jax.device_count() if jax.default_backend() == 'gpu' else 0)"
+    done = subprocess.run([sys.executable, "-c", count], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    if not int(done.stdout):
         pytest.skip("JAX sees no NVIDIA GPU here")
+    return int(done.stdout)
 
 
 def congrasp(*arguments):
@@ -48,8 +52,8 @@ def test_training_on_the_device_stops_and_goes_on(tmp_path):
     assert second.transitions * 3 == first.transitions * 5
 
 
-def test_two_ranks_train_on_two_gpus(tmp_path):
-    if jax.device_count() < 2:
+def test_two_ranks_train_on_two_gpus(tmp_path, gpus):
+    if gpus < 2:
         pytest.skip("two ranks need two GPUs")
     run = ["train", "--run-dir", tmp_path / "run", "--evaluation", 0, "--physics", "warp", "--ranks", 2]
     congrasp(*run, "--preset", "human", "--environments", 256, "--objects.count", 8, "--updates", 2)

@@ -71,7 +71,7 @@ def test_every_pool_of_objects_gets_its_share_of_the_episodes(monkeypatch):
     monkeypatch.setattr(Evaluator, "samples_of_pools", samples_of_pools)
     monkeypatch.setattr("services.evaluation.evaluate.build_taskset", lambda *arguments: built.append(arguments))
     pools = procedural_pools(6, 1_000_000, largest=3)
-    settings = {"physics": "native", "batch": 0, "threads": 1, "seed": 0, "progress": told.append}
+    settings = {"physics": "native", "batch": 0, "threads": 1, "seed": 0, "friction": 1.0, "progress": told.append}
     whole, *groups = evaluate_objects(untrained(CONFIG), pools, 15, **settings)
     assert told == [15, 30] and len(built) == 1
     assert (whole.episodes, whole.objects, whole.success) == (30, 6, 1.0)
@@ -127,9 +127,9 @@ def test_a_pool_that_never_allows_a_constraint_is_an_error(evaluator, monkeypatc
         evaluator.episode("trajectory+affordance")
 
 
-@pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--pool", "-1"]])
+@pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--pool", "-1"], ["--friction", "nan"]])
 def test_numbers_out_of_range_are_refused(policy, arguments):
-    with pytest.raises(CongraspError, match="at least"):
+    with pytest.raises(CongraspError, match="must"):
         load("evaluate")(["--policy", str(policy), *arguments])()
 
 
@@ -138,3 +138,4 @@ def test_nominal_mass_and_friction(monkeypatch):
     ranged = dataclasses.replace(CONFIG.task, mass_range=(0.8, 1.5), friction_range=(0.6, 1.0))
     task = Evaluator(untrained(CONFIG), OBJECTS, task=ranged).task
     assert task.mass_range == (1.0, 1.0) and task.friction_range == (1.0, 1.0)
+    assert Evaluator(untrained(CONFIG), OBJECTS, task=ranged, friction=3.0).task.friction_range == (3.0, 3.0)
