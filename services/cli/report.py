@@ -10,7 +10,6 @@ from common.config import PhysicsName
 from common.errors import CongraspError
 
 if TYPE_CHECKING:
-    from services.cli.progress import tracked
     from services.evaluation.report import Picture
 
 _POOL = 64
@@ -50,6 +49,7 @@ def report(
     from common.policy import bundle as bundles
     from common.policy.shipped import policy_file
     from learner.run_directory import POLICY_FILE
+    from services.cli.progress import tracked
     from services.evaluation.evaluate import Evaluator
     from services.evaluation.failures import failure_sheets
     from services.evaluation.report import Made, Picture, causes_in_words, template, write_report

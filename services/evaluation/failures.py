@@ -26,19 +26,26 @@ def cause(episode: Message, drop_height: float) -> str:
         return "pushed away before the table went"
     if not metrics["links_at_removal"]:
         return "not touched when the table went"
-    without_table = ~np.asarray(episode.arrays["table"], bool)
-    height = np.asarray(episode.arrays["object_position"])[without_table, 2]
-    fell = int(np.argmax(height < height[0] - drop_height))
-    return f"slipped {fell * episode.meta['control_dt']:.2f} s after the table went"
+    removal = int(np.argmin(episode.arrays["table"]))
+    seconds = (fall(episode, drop_height) - removal) * episode.meta["control_dt"]
+    return f"slipped {seconds:.2f} s after the table went"
+
+
+def fall(episode: Message, drop_height: float) -> int:
+    """The step at which the object is `drop_height` (m) below where it was when the table went; the last if none is."""
+    removal = int(np.argmin(episode.arrays["table"]))
+    height = np.asarray(episode.arrays["object_position"])[:, 2]
+    below = np.flatnonzero(height[removal:] < height[removal] - drop_height)
+    return removal + int(below[0]) if len(below) else len(height) - 1
 
 
 def failure_sheets(
     evaluator: Evaluator, policy: PolicyBundle, constraints: Sequence[str], successes: int, failures: int
 ) -> Iterator[tuple[str, np.ndarray, Sequence[str]]]:
-    """Draws episodes of rows, failures first.
+    """Draws episodes of rows to the moment at which the object has fallen, or to the end, failures first.
 
     Args:
-      evaluator: of the policy; episodes that it evaluated are not evaluated anew.
+      evaluator: of the policy; where it kept episodes, none are evaluated anew.
       policy: for the titles.
       constraints: names of the rows.
       successes: how many of each to show.
@@ -55,7 +62,8 @@ def failure_sheets(
         labels: list[str] = []
         causes = [cause(episode, evaluator.task.drop_height) for episode in episodes]
         for episode, what in zip(episodes, causes, strict=True):
-            pictures, words = episode_strip(episode, _MOMENTS, _SIZE, episode.meta["object"], f": {what}", quick=True)
+            until, first = fall(episode, evaluator.task.drop_height), episode.meta["object"]
+            pictures, words = episode_strip(episode, _MOMENTS, _SIZE, first, f": {what}", until=until, quick=True)
             images += pictures
             labels += words
         who = f"{policy.spec.hand_name} hand, version {policy.version}"

@@ -276,7 +276,14 @@ def episode_sheet(
 
 
 def episode_strip(
-    episode: Message, moments: int, size: tuple[int, int], first: str, last: str, *, quick: bool = False
+    episode: Message,
+    moments: int,
+    size: tuple[int, int],
+    first: str,
+    last: str,
+    *,
+    until: int | None = None,
+    quick: bool = False,
 ) -> tuple[list[np.ndarray], list[str]]:
     """A contact sheet's row: pictures of an episode's key moments, and their labels.
 
@@ -286,9 +293,11 @@ def episode_strip(
       size: width and height of each, pixels.
       first: label of the first picture.
       last: what to say after the time of the last one.
+      until: step of the last one; the episode's last if not given.
       quick: plainer light, many times faster.
     """
-    steps = key_steps(np.asarray(episode.arrays["table"], bool), moments)
+    table = np.asarray(episode.arrays["table"], bool)
+    steps = key_steps(table if until is None else table[: until + 1], moments)
     seconds = [f"{episode.meta['control_dt'] * step:.2f} s" for step in steps]
     return list(render_episode_frames(episode, steps, size, quick=quick)), [
         first,
