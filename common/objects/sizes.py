@@ -1,6 +1,9 @@
 """Sizes: what the numbers of a mesh file mean in metres, and how long that is in words."""
 
+from collections.abc import Sequence
 from typing import Literal
+
+import numpy as np
 
 from common.errors import CongraspError
 
@@ -75,7 +78,7 @@ def length(metres: float) -> str:
     return f"{metres / 1000:.3g} km"
 
 
-def size_in_words(sides: tuple[float, ...]) -> str:
+def size_in_words(sides: Sequence[float] | np.ndarray) -> str:
     """Three sides in metres, and a thing about as long."""
     longest = max(sides)
     thing = next((name for limit, name in _THINGS if longest < limit), "an arm")

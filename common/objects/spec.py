@@ -101,4 +101,6 @@ class GraspObject:
             points=factor * self.points,
             rest_poses=self.rest_poses * np.array([factor] * 3 + [1.0] * 4),
             visual_vertices=factor * self.visual_vertices,
+            origin=longer(self.origin),
+            file_scale=factor * self.file_scale,
         )

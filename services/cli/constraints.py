@@ -63,13 +63,14 @@ class ConstraintsGenerate:
         with _console.status("Preparing objects") as status:
             objects = [obj for text in self.objects for obj in _find(text, self.folder)]
             objects += generate_many(self.count, self.first_seed, self.families)
-            status.update(f"Making the constraints of {len(objects)} objects")
+            status.update("Making constraints")
             task, taskset = TaskConfig(hand=hand.name), None
             if self.references == "policy":
                 taskset = self._grasped(objects, lambda done: status.update(f"Grasping: {done} batches of episodes"))
             for constraints in make_sets(hand, task, objects, self.seed, taskset):
                 save(constraints, self.out)
-        _console.print(f"The constraint sets of {len(objects)} objects are in {escape(str(self.out))}.")
+        what = "The constraint set of 1 object is" if len(objects) == 1 else f"The sets of {len(objects)} objects are"
+        _console.print(f"{what} in {escape(str(self.out))}.", soft_wrap=True)
         return 0
 
     def _grasped(self, objects: list[GraspObject], progress: Callable[[int], None]) -> Any:
@@ -118,7 +119,7 @@ class ConstraintsShow:
             from services.pictures.sheets import save_png
 
             save_png(self.png, constraint_sheet(constraints, rest - 1, self.seed))
-            _console.print(f"The picture is {escape(str(self.png))}.")
+            _console.print(f"The picture is {escape(str(self.png))}.", soft_wrap=True)
         return 0
 
 

@@ -112,13 +112,12 @@ def grasp(
             bar.advance(whole)
     grasper.close()
     if jobs:
-        save_summary(out, results)
+        save_summary(out, grasper.hand.name, results)
     held = sum(bool(result.facts.get("success")) for result in results)
     failed = [result for result in results if result.error]
     if len(results) > 1:
-        console.print(
-            f"{held} of {len(results)} objects are held; {len(failed)} could not be used. {out / SHEET} shows them."
-        )
+        words = f"{held} of {len(results)} objects are held; {len(failed)} could not be used."
+        console.print(f"{words} {escape(str(out / SHEET))} shows them.", soft_wrap=True)
     if len(jobs) > len(failed):
         console.print(f"Everything is in {escape(str(out))}.", soft_wrap=True)
     return BAD_INPUT if failed else NOT_HELD if held < len(results) else 0

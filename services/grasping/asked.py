@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.logs.motion import GraspMotion, load_motion
+from common.objects.sizes import size_in_words
 from common.objects.spec import GraspObject
 from common.wire.codec import Message
 from services.grasping import constraint_sets
@@ -90,8 +91,8 @@ def read_asked(
         above=heading == ABOVE,
         position=_numbers(at, 3, "--at") - origin if at else None,
         minus=_minus(obj, affordance, avoid) if affordance or avoid else None,
-        pose=_pose(pose, hand, origin) if pose else None,
-        trajectory=_trajectory(trajectory, hand, origin, waypoints) if trajectory else None,
+        pose=_pose(pose, hand, obj, origin) if pose else None,
+        trajectory=_trajectory(trajectory, hand, obj, origin, waypoints) if trajectory else None,
     )
 
 
@@ -166,7 +167,7 @@ def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
     return cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0]
 
 
-def _pose(text: str, hand: Hand, origin: np.ndarray) -> Reference:
+def _pose(text: str, hand: Hand, obj: GraspObject, origin: np.ndarray) -> Reference:
     path, index = _numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand)
@@ -174,7 +175,7 @@ def _pose(text: str, hand: Hand, origin: np.ndarray) -> Reference:
         position, quaternion = _wrist_on_object(motion, last)
         return Reference(motion.joint_position[last], position[last], quaternion[last])
     if path.name.endswith(constraint_sets.SUFFIX):
-        arrays = _set_of(path, hand, index).arrays
+        arrays = _set_of(path, hand, obj, index).arrays
         return Reference(*(arrays[f"pose/{name}"][0, index] for name in ("q", "position", "quaternion")))
     given = _json(path, "--pose", ("joints", "position", "quaternion"))
     joints, names = given["joints"], [joint.name for joint in hand.joints]
@@ -188,7 +189,9 @@ def _pose(text: str, hand: Hand, origin: np.ndarray) -> Reference:
     return Reference(np.clip(q, hand.lower, hand.upper), position, turn)
 
 
-def _trajectory(text: str, hand: Hand, origin: np.ndarray, waypoints: int) -> tuple[np.ndarray, np.ndarray]:
+def _trajectory(
+    text: str, hand: Hand, obj: GraspObject, origin: np.ndarray, waypoints: int
+) -> tuple[np.ndarray, np.ndarray]:
     path, index = _numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand)
@@ -196,7 +199,7 @@ def _trajectory(text: str, hand: Hand, origin: np.ndarray, waypoints: int) -> tu
         last = _removal(motion) + 1
         return _resampled(position[:last], quaternion[:last], waypoints, str(path))
     if path.name.endswith(constraint_sets.SUFFIX):
-        arrays = _set_of(path, hand, index).arrays
+        arrays = _set_of(path, hand, obj, index).arrays
         position, quaternion = (arrays[f"trajectory/{name}"][0, index] for name in ("position", "quaternion"))
         return _resampled(position, quaternion, waypoints, str(path))
     if path.suffix.lower() == ".csv":
@@ -240,10 +243,18 @@ def _wrist_on_object(motion: GraspMotion, moment: int) -> tuple[np.ndarray, np.n
     return turn.apply(motion.wrist_position - motion.object_position[moment]), (turn * wrist).as_quat(scalar_first=True)
 
 
-def _set_of(path: pathlib.Path, hand: Hand, index: int) -> Message:
+def _set_of(path: pathlib.Path, hand: Hand, obj: GraspObject, index: int) -> Message:
     constraints = constraint_sets.load(path)
     if constraints.meta["hand"] != hand.name:
         raise CongraspError(f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'.")
+    own, wanted = (np.ptp(x, axis=0) for x in (obj.visual_vertices, constraints.arrays["visual/vertices"]))
+    if not np.allclose(own, wanted, rtol=0.02, atol=1e-3):
+        scale = float(constraints.meta["object_scale"])
+        its = f"It is for objects {scale:g} times as large, as the {hand.name} hand is trained: add --scale {scale:g}."
+        raise CongraspError(
+            f"{path} is for an object of {size_in_words(wanted)}; '{obj.name}' has {size_in_words(own)}.",
+            "Name the set of this object." if scale == 1.0 else its,
+        )
     count = constraints.arrays["pose/q"].shape[1]
     if index >= count:
         raise CongraspError(f"{path} has no number {index}.", f"Its poses and trajectories are 0 to {count - 1}.")

@@ -270,6 +270,10 @@ def load_for(folder: pathlib.Path, objects: Sequence[GraspObject]) -> tuple[list
     return chosen, sets
 
 
+def _scale_in_words(scale: float) -> str:
+    return "" if scale == 1.0 else f", {scale:g} times as large, for this hand"
+
+
 def describe(constraints: Message) -> dict[str, str]:
     """What a set holds, in words."""
     arrays, meta = constraints.arrays, constraints.meta
@@ -278,7 +282,7 @@ def describe(constraints: Message) -> dict[str, str]:
     length = np.linalg.norm(np.diff(waypoints, axis=2), axis=-1).sum(-1)
     rows = {
         "hand": f"{meta['hand']}, {len(meta['finger_joints'])} finger joints",
-        "object": f"{meta['object']} ({meta['object_digest']})",
+        "object": f"{meta['object']} ({meta['object_digest']}){_scale_in_words(meta['object_scale'])}",
         "O-": f"{arrays['surface/minus'].mean():.0%} of {len(arrays['surface/points'])} surface points",
         "headings": f"{allowed.shape[2]} for each of: {', '.join(meta['variants'])}",
         "reference poses": f"{poses.shape[2]} for each",

@@ -91,6 +91,7 @@ class Grasp:
         """Result, tries and errors, for tables and files."""
         return {
             "object": self.motion.object,
+            "hand": self.motion.hand,
             "success": self.success,
             "held_quarter_second": self.motion.success,
             "tries": self.tries,

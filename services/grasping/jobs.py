@@ -43,8 +43,8 @@ class Job:
         return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
 
     def load(self, options: ImportOptions) -> GraspObject:
-        """The object."""
-        return import_source(self.source, options)[0] if self.source else store.load(self.path)
+        """The object; of an object file the scale is all that the options change."""
+        return import_source(self.source, options)[0] if self.source else store.load(self.path).scaled(options.scale)
 
 
 class Settings(NamedTuple):
@@ -135,7 +135,7 @@ def run_job(job: Job, grasper: Grasper, settings: Settings, progress: Progress) 
         about = {
             "key": key,
             "file": str(job.path),
-            "size": size_in_words(tuple(np.ptp(obj.visual_vertices, axis=0).tolist())),
+            "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
             "mass": obj.mass,
             "notes": list(obj.notes),
             "rules": list(found.words),
@@ -152,17 +152,18 @@ def _content(text: str) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else text
 
 
-def save_summary(out: pathlib.Path, results: Sequence[Result]) -> None:
-    """Writes the results as JSON, and the last moments of all grasps as one picture."""
+def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> None:
+    """Writes the results of a hand as JSON, and the last moments of all grasps as one picture."""
     held = sum(bool(result.facts.get("success")) for result in results)
     rows = [{"name": r.name, "error": r.error} if r.error else {"name": r.name, **r.facts} for r in results]
-    summary = {"objects": len(rows), "succeeded": held, "results": rows}
+    summary = {"hand": hand, "objects": len(rows), "succeeded": held, "results": rows}
     write_atomically(out / SUMMARY, json.dumps(summary, indent=2).encode())
     drawn = [result for result in results if (out / result.name / THUMBNAIL).exists() and not result.error]
     if drawn:
         images = [np.asarray(Image.open(out / result.name / THUMBNAIL).convert("RGB")) for result in drawn]
         labels = [
-            f"{r.name}: {'held' if r.facts['success'] else 'NOT HELD'}, {r.facts['tries_held']} tries" for r in drawn
+            f"{r.name}: {'held' if r.facts['success'] else 'NOT HELD'}, {r.facts['tries_held']} of {r.facts['tries']}"
+            for r in drawn
         ]
-        title = f"{held} of {len(rows)} objects held for two seconds without the table"
+        title = f"{hand} hand: {held} of {len(rows)} objects held for two seconds without the table"
         save_png(out / SHEET, contact_sheet(images, labels, columns=min(_COLUMNS, len(drawn)), title=title))

@@ -51,7 +51,8 @@ def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -
         (rest.apply(obj.visual_vertices), obj.visual_faces, OBJECT)
     ]
     pieces = enumerate(map(tessellate, obj.pieces))
-    parts[f"its {len(obj.pieces)} convex pieces, which physics uses"] = [
+    count = len(obj.pieces)
+    parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [
         (rest.apply(vertices), faces, _COLOURS[i % len(_COLOURS)]) for i, (vertices, faces) in pieces
     ]
     raster = Raster()
@@ -59,7 +60,8 @@ def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -
     for shapes in (_beside(hand, bodies) for bodies in parts.values()):
         points = np.concatenate([shape_points(shape) for shape in shapes])
         images.append(raster.draw(shapes, fit(points, np.array(_VIEW), _SIZE[0] / _SIZE[1]), _SIZE))
-    return contact_sheet(images, list(parts), columns=len(parts), title="  |  ".join([obj.name, *obj.notes]))
+    title = f"{obj.name} beside the {hand.name} hand at true scale"
+    return contact_sheet(images, list(parts), columns=len(parts), title="  |  ".join([title, *obj.notes]))
 
 
 def mesh_of_file(source: Source) -> trimesh.Trimesh | None:

@@ -1,5 +1,6 @@
 """What the user of the studio asks for, without any browser: object, constraints, and what the priority rules do."""
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -81,7 +82,7 @@ class Studio:
 
     def __init__(self, hand: Hand, task: TaskConfig, obj: GraspObject):
         """Begins with an object, and a heading that the table leaves room for."""
-        self.hand, self.task = hand, task
+        self.hand, self.task = hand, dataclasses.replace(task, object_scale=1.0)  # objects as large as they are
         self.painted = 0
         self.take(obj)
 

@@ -1,5 +1,7 @@
 """Allegro and Sharpa against the makers' figures, and what every hand must be able to do."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -199,12 +201,14 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
 
 
 def test_scaled_objects_keep_their_density():
-    obj = procedural.generate(3, "mug")
+    obj = dataclasses.replace(procedural.generate(3, "mug"), origin=(0.1, 0.0, -0.2), file_scale=0.01)
     larger = obj.scaled(1.4)
     assert larger.mass == pytest.approx(1.4**3 * obj.mass)
     np.testing.assert_allclose(larger.inertia, 1.4**5 * obj.inertia)
     for name in ("points", "visual_vertices"):
         np.testing.assert_allclose(getattr(larger, name), 1.4 * getattr(obj, name))
+    np.testing.assert_allclose(larger.origin, (0.14, 0.0, -0.28))
+    assert larger.file_scale == pytest.approx(0.014)
     np.testing.assert_allclose(larger.rest_poses[:, :3], 1.4 * obj.rest_poses[:, :3])
     np.testing.assert_array_equal(larger.rest_poses[:, 3:], obj.rest_poses[:, 3:])
     for a, b in zip(larger.pieces, obj.pieces, strict=True):

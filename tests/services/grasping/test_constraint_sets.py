@@ -10,8 +10,10 @@ from common.constraints.headings import Headings, clear_table, feasible
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural, store
+from common.wire.codec import Message
 from services.cli.main import load
 from services.grasping import constraint_sets
+from services.grasping.asked import read_asked
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
@@ -104,3 +106,15 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
         load("constraints")(["generate"])()
     with pytest.raises(CongraspError, match="no object 'nothing'"):
         load("constraints")(["generate", "nothing", *folder])()
+
+
+def test_a_reference_is_refused_for_another_object_or_size(sets, file, tmp_path):
+    mug, box = OBJECTS
+    pose = read_asked(mug, HAND, 15, pose=f"{file}:3").pose
+    np.testing.assert_array_equal(pose.q, sets[0].arrays["pose/q"][0, 3])
+    with pytest.raises(CongraspError, match=r"is for an object of .* cm, .*; 'box_0' has .*Name the set of this"):
+        read_asked(box, HAND, 15, trajectory=str(file))
+    larger = Message(sets[0].arrays, {**sets[0].meta, "object_scale": 1.4})
+    file = constraint_sets.save(larger, tmp_path)
+    with pytest.raises(CongraspError, match=r"1\.4 times as large, as the human hand is trained: add --scale 1\.4"):
+        read_asked(mug.scaled(1 / 1.4), HAND, 15, pose=str(file))

@@ -116,6 +116,13 @@ def test_what_training_would_draw_can_be_suggested(studio: Studio) -> None:
     assert studio.trouble == "" and studio.request.constraints == ("trajectory",)
 
 
+def test_suggestions_are_for_the_object_as_it_is_shown(studio: Studio) -> None:
+    larger = Studio(studio.hand, dataclasses.replace(studio.task, object_scale=1.4), MUG)
+    for one in (studio, larger):
+        one.suggest("heading")
+    np.testing.assert_array_equal(larger.arrow.position, studio.arrow.position)
+
+
 @pytest.mark.parametrize(
     ("do", "says"),
     [
