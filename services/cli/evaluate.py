@@ -75,6 +75,7 @@ def evaluate(
     from services.cli.progress import tracked
     from services.evaluation.noise import LEVELS
     from services.evaluation.scores import TABLES, tables_of, write_json
+    from services.evaluation.worlds import objects_in_words
     from services.grasping.objects import objects_of
 
     for name, value, least in (("episodes", episodes, 1), ("pool", pool, 0), ("batch", batch, 0), ("seed", seed, 0)):
@@ -97,14 +98,15 @@ def evaluate(
         noisy: list[Any] = []
         if names:
             evaluator = _evaluator(loaded, given, taskset, pool or _POOL, settings, track)
-            rows += evaluator.rows(names, episodes, track("Episodes", len(names) * episodes))
+            advance = track("Episodes", len(names) * episodes)
+            rows += evaluator.rows(names, episodes, advance, keep=pictures is not None)
         if "noise" in table or "all" in table:
             evaluator = evaluator or _evaluator(loaded, given, taskset, pool or _POOL, settings, track)
             noisy = evaluator.rows_under_noise(track("Episodes under noise", len(LEVELS) * episodes), episodes)
             rows += noisy
         if "objects" in table or "all" in table:
             rows += _object_rows(loaded, given, pool or min(episodes, _MOST), episodes, settings, track)
-    source = str(objects) if objects else "held-out procedural objects"
+    source = objects_in_words(loaded, objects)
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 160)
     title = f"{policy.name}, version {loaded.version}, on {source}, {engine}, friction {friction:g}"
     for shown in tables_of(rows, title):

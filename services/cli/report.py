@@ -54,7 +54,7 @@ def report(
     from services.evaluation.failures import failure_sheets
     from services.evaluation.report import Made, Picture, causes_in_words, template, write_report
     from services.evaluation.scores import TABLES
-    from services.evaluation.worlds import two_seconds
+    from services.evaluation.worlds import objects_in_words, two_seconds
     from services.grasping.objects import objects_of
     from services.pictures.sheets import png_of
 
@@ -82,7 +82,7 @@ def report(
             seed=seed,
             hold_steps=two_seconds(policy.task),
         )
-        rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes))
+        rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
         advance = track("Pictures", len(names))
         sheets = []
         for name, sheet, causes in failure_sheets(evaluator, policy, names, _PICTURED, _PICTURED):
@@ -95,8 +95,8 @@ def report(
     ]
     command = f"congrasp evaluate --table single composed {' '.join(flags)}"
     made = Made(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
-    where = str(objects) if objects else "held-out procedural objects"
-    conditions = f"{episodes} episodes a row on {len(given)} objects ({where}), engine {engine}, seed {seed}"
+    which = f"{len(given)} objects ({objects_in_words(policy, objects)})"
+    conditions = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
     write_report(out, policy, file.name, rows, conditions, sheets, curves, made)
     print(f"The report is in {out}: open it in a browser.")
     return 0

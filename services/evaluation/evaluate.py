@@ -80,7 +80,12 @@ class Evaluator:
         self._kept: dict[str, dict[bool, list[Message]]] = {}
 
     def samples(
-        self, constraints: Sequence[str], episodes: int, progress: Callable[[int], None] = lambda done: None
+        self,
+        constraints: Sequence[str],
+        episodes: int,
+        progress: Callable[[int], None] = lambda done: None,
+        *,
+        keep: bool = False,
     ) -> dict[str, Sample]:
         """Episodes for every row, in one run: an episode counts for the row whose constraints were all it had.
 
@@ -88,14 +93,16 @@ class Evaluator:
           constraints: names of rows.
           episodes: for each row.
           progress: is told how many episodes of all rows there are.
+          keep: keep some of them for `examples`, for which every step of all worlds has to be in memory.
 
         Raises:
           CongraspError: no object of the pool allows a row's constraints, or too few resting poses do.
         """
-        with self._worker(mixture(self.task, constraints), episodes) as worker:
+        with self._worker(mixture(self.task, constraints), episodes, traced=keep) as worker:
             self._refer(worker, constraints)
-            self._kept |= {constraint: {False: [], True: []} for constraint in constraints}
-            return self._gather(worker, constraints, episodes, progress, keep=True)
+            if keep:
+                self._kept |= {constraint: {False: [], True: []} for constraint in constraints}
+            return self._gather(worker, constraints, episodes, progress, keep)
 
     def samples_of_pools(
         self,
@@ -222,10 +229,15 @@ class Evaluator:
         return {name: joined(parts) for name, parts in found.items()}
 
     def rows(
-        self, constraints: Sequence[str], episodes: int, progress: Callable[[int], None] = lambda done: None
+        self,
+        constraints: Sequence[str],
+        episodes: int,
+        progress: Callable[[int], None] = lambda done: None,
+        *,
+        keep: bool = False,
     ) -> list[Row]:
         """One row for each set of constraints; see `samples`."""
-        samples = self.samples(constraints, episodes, progress)
+        samples = self.samples(constraints, episodes, progress, keep=keep)
         return [self.row(name, sample) for name, sample in samples.items()]
 
     def row(self, constraint: str, sample: Sample, group: str = "") -> Row:
@@ -242,13 +254,13 @@ class Evaluator:
     def examples(self, constraint: str, successes: int, failures: int, most: int = 300) -> list[Message]:
         """Episodes of a row to look at, failures first; the object must be held to the end of the hold to succeed.
 
-        They are some of those that `samples` evaluated last, or of `most` that are evaluated now.
+        They are some of those that `samples` kept last, or of `most` that are evaluated now.
 
         Raises:
           CongraspError: the pool does not allow these constraints.
         """
         if constraint not in self._kept:
-            self.samples([constraint], most)
+            self.samples([constraint], most, keep=True)
         kept = self._kept[constraint]
         return [*kept[False][:failures], *kept[True][:successes]]
 
@@ -259,7 +271,7 @@ class Evaluator:
           CongraspError: the pool does not allow these constraints.
         """
         self._check_available(constraint)
-        with self._worker(mixture(self.task, [constraint]), 1) as worker:
+        with self._worker(mixture(self.task, [constraint]), 1, traced=True) as worker:
             for _ in range(_PATIENCE * tries):
                 sample, message = self._batch_of_episodes(worker)
                 if not matching(sample.values, constraint)[0]:
@@ -299,7 +311,9 @@ class Evaluator:
                 "An affordance needs labelled parts, poses and trajectories need room above the table.",
             )
 
-    def _worker(self, task: TaskConfig, episodes: int) -> contextlib.AbstractContextManager[RolloutWorker]:
+    def _worker(
+        self, task: TaskConfig, episodes: int, traced: bool = False
+    ) -> contextlib.AbstractContextManager[RolloutWorker]:
         """Acting worlds, not many more than `episodes` of each row need."""
         rows = 2 ** sum(p not in (0.0, 1.0) for p in (task.p_affordance, task.p_pose, task.p_trajectory))
         return acting(
@@ -311,6 +325,7 @@ class Evaluator:
             threads=self._threads,
             batch=min(self._batch, 1 << (episodes * rows - 1).bit_length()),
             seed=self._seed,
+            traced=slice(None) if traced else slice(0),
         )
 
     def _begin(self, worker: RolloutWorker) -> EnvironmentState:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import pathlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from actors.taskset import TaskSet
 from common.config import PhysicsName, TaskConfig
 from common.hands import get_hand
 from common.hands.spec import Hand
+from common.objects.pool import object_scale
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, mean_action
 from common.task.features import Features
@@ -61,6 +63,13 @@ def mixture(task: TaskConfig, constraints: Sequence[str]) -> TaskConfig:
     )
 
 
+def objects_in_words(bundle: PolicyBundle, folder: pathlib.Path | None) -> str:
+    """What is grasped, and how much longer it is made for the policy's hand."""
+    scale = object_scale(get_hand(bundle.spec.hand), bundle.task)
+    source = str(folder) if folder else "held-out procedural objects"
+    return source if scale == 1.0 else f"{source}, lengths x {scale:g} for the {bundle.spec.hand_name} hand"
+
+
 @contextlib.contextmanager
 def acting(
     bundle: PolicyBundle,
@@ -72,8 +81,9 @@ def acting(
     threads: int,
     batch: int,
     seed: int,
+    traced: slice,
 ) -> Iterator[RolloutWorker]:
-    """Worlds that act by the policy's mean, all of which are traced.
+    """Worlds that act by the policy's mean.
 
     Each step's probe holds forces of the links (B, L), N, and finger torques (B, F) as shares of their limits.
 
@@ -86,6 +96,7 @@ def acting(
       threads: threads of the `native` engine.
       batch: B, number of worlds.
       seed: seed of the episodes.
+      traced: worlds of which a trace is kept.
     """
     layout, hand = bundle.spec.layout, get_hand(bundle.spec.hand)
 
@@ -98,9 +109,8 @@ def acting(
 
     engine = make_physics(physics, hand, task, objects, threads=threads)
     try:
-        whole = slice(None)
         yield RolloutWorker(
-            hand, task, engine, taskset, policy, batch=batch, seed=seed, half=False, probe=probe, traced=whole
+            hand, task, engine, taskset, policy, batch=batch, seed=seed, half=False, probe=probe, traced=traced
         )
     finally:
         engine.close()

@@ -40,7 +40,7 @@ def test_failures_of_an_untrained_policy_are_drawn():
     config = get_preset("quickstart")
     policy = untrained(dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,))))
     evaluator = Evaluator(policy, generate_many(2, 0, ("box",)), batch=4)
-    sample = evaluator.samples(["heading"], 3)["heading"]
+    sample = evaluator.samples(["heading"], 3, keep=True)["heading"]
     assert not sample.values["held"].any()
     ((name, sheet, causes),) = failure_sheets(evaluator, policy, ["heading"], successes=2, failures=2)
     assert name == "heading" and len(causes) == 2 and "held" not in causes
