@@ -38,13 +38,15 @@ class ConstraintsImport:
     mano: pathlib.Path | None = None
     """Your MANO_RIGHT.pkl, or CONGRASP_MANO; dexycb needs it, and grab and oakink are more exact with it."""
     hand: str = "human"
-    """Hand of the sets; any other than human gets the captured headings and affordance, and poses of its own."""
+    """Hand of the sets. Human finger angles fit no other hand: it follows the captured wrist by its own grasp axes,
+    with the captured headings and affordance, and closes its fingers around the object at the end."""
     headings: Literal["sampled", "demonstrated"] = "sampled"
     """sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps."""
     affordance: Literal["auto", "parts", "contacts", "none"] = "auto"
     """What O+ is: parts that fingers touch; whatever they touch; or everything. auto: parts where they are labelled."""
     beyond: float = 0.1
-    """Radians by which a captured joint may exceed its limits; it is then moved to the limit."""
+    """Radians by which a captured joint may exceed the human hand's limits; it is then moved to the limit. For another
+    hand it does not count."""
     out: pathlib.Path = pathlib.Path("constraints")
     """Folder for the sets, and for import.json, which says what became of each sequence."""
     objects: pathlib.Path = pathlib.Path("objects")
@@ -83,7 +85,7 @@ class ConstraintsImport:
         about = {"format": self.format, "path": str(self.path), "hand": hand.name, **dataclasses.asdict(options)}
         rows = {**about, "kept": report.kept, "dropped": report.dropped}
         write_atomically(self.out / REPORT, json.dumps(rows, indent=2).encode())
-        _say(report, len(sets), self.out, self.objects)
+        _say(report, hand.name, len(sets), self.out, self.objects)
         return 0 if report.kept else 2
 
     def _sequences(self) -> Any:
@@ -95,7 +97,7 @@ class ConstraintsImport:
         return module.read(self.path, Meshes(self.meshes), read_mano(own) if own else None)
 
 
-def _say(report: Any, sets: int, out: pathlib.Path, objects: pathlib.Path) -> None:
+def _say(report: Any, hand: str, sets: int, out: pathlib.Path, objects: pathlib.Path) -> None:
     kept, dropped = report.kept, report.dropped
     _console.print(f"{len(kept)} of {len(kept) + len(dropped)} sequences kept.")
     if dropped:
@@ -103,14 +105,21 @@ def _say(report: Any, sets: int, out: pathlib.Path, objects: pathlib.Path) -> No
         for rule, count, example in report.rules():
             table.add_row(str(count), rule, escape(example))
         _console.print(table)
-    if kept:
+    if kept and hand != "human":
+        _console.print(
+            f"A human's finger angles do not fit the hand '{hand}' and were dropped. Heading, affordance and wrist "
+            "trajectory were kept; its fingers close around the object where the trajectory ends.",
+            soft_wrap=True,
+        )
+    elif kept:
         worst = max(kept, key=lambda row: row["residual_rad"])
         mean = sum(row["residual_rad"] for row in kept) / len(kept)
-        above = sum(row["clear_of_table"] for row in kept)
         _console.print(
             f"Finger angles leave {mean:.3f} rad a bone on average, {worst['residual_rad']:.3f} rad at most "
             f"({escape(worst['sequence'])})."
         )
+    if kept:
+        above = sum(row["clear_of_table"] for row in kept)
         _console.print(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")
     _console.print(
         f"{sets} constraint sets are in {escape(str(out))}, their objects in {escape(str(objects))}; "

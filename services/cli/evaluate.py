@@ -96,8 +96,10 @@ def evaluate(
         names = [name for key in TABLES if key in table or "all" in table for name in TABLES[key]]
         evaluator: Any = None
         noisy: list[Any] = []
+        left_out: list[CongraspError] = []
         if names:
             evaluator = _evaluator(loaded, given, taskset, pool or _POOL, settings, track)
+            names, left_out = allowed_rows(evaluator, names)
             advance = track("Episodes", len(names) * episodes)
             rows += evaluator.rows(names, episodes, advance, keep=pictures is not None)
         if "noise" in table or "all" in table:
@@ -111,6 +113,8 @@ def evaluate(
     title = f"{policy.name}, version {loaded.version}, on {source}, {engine}, friction {friction:g}"
     for shown in tables_of(rows, title):
         console.print(shown)
+    for error in left_out:
+        console.print(f"Left out: {error}", markup=False, soft_wrap=True)
     if json is not None:
         about = {
             "policy": {"file": policy.name, "version": loaded.version, "transitions": loaded.transitions},
@@ -136,6 +140,24 @@ def evaluate(
             save_png(pictures / f"{name}.png", sheet)
             console.print(f"Episodes of '{name}' are drawn in {pictures}.", soft_wrap=True)
     return 0
+
+
+def allowed_rows(evaluator: Any, names: list[str]) -> tuple[list[str], list[CongraspError]]:
+    """The rows that some object allows, and why others are left out; captured objects may have no labelled parts.
+
+    Raises:
+      CongraspError: no row is left.
+    """
+    allowed, errors = [], []
+    for name in names:
+        try:
+            evaluator.check_available(name)
+            allowed.append(name)
+        except CongraspError as error:
+            errors.append(error)
+    if not allowed:
+        raise errors[0]
+    return allowed, errors
 
 
 def _captured(

@@ -129,6 +129,24 @@ class Evaluator:
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
 
+    def check_available(self, constraint: str) -> None:
+        """Passes if some object of the pool allows a row's constraints.
+
+        Raises:
+          CongraspError: none does.
+        """
+        affordance, *pose, trajectory = active_mask(constraint)
+        allowed = np.ones(self._taskset.has_affordance.shape, bool)
+        if affordance:
+            allowed &= np.asarray(self._taskset.has_affordance)
+        if trajectory or any(pose):
+            allowed &= np.asarray(self._taskset.pose_valid)[:, int(affordance)].any(-1)
+        if not allowed.any():
+            raise CongraspError(
+                f"None of the {len(self.objects)} objects allows the constraint '{constraint}'.",
+                "An affordance needs labelled parts, poses and trajectories need room above the table.",
+            )
+
     def references(self, share: float, progress: Callable[[int], None] = lambda done: None) -> TaskSet:
         """The task set with reference poses and trajectories from the policy's own grasps under headings.
 
@@ -203,7 +221,7 @@ class Evaluator:
         keep: bool = False,
     ) -> dict[str, Sample]:
         for constraint in constraints:
-            self._check_available(constraint)
+            self.check_available(constraint)
         found: dict[str, list[Sample]] = {constraint: [] for constraint in constraints}
         counts = dict.fromkeys(constraints, 0)
         seen, limit = 0, _PATIENCE * (episodes + self._batch)
@@ -270,7 +288,7 @@ class Evaluator:
         Raises:
           CongraspError: the pool does not allow these constraints.
         """
-        self._check_available(constraint)
+        self.check_available(constraint)
         with self._worker(mixture(self.task, [constraint]), 1, traced=True) as worker:
             for _ in range(_PATIENCE * tries):
                 sample, message = self._batch_of_episodes(worker)
@@ -297,19 +315,6 @@ class Evaluator:
                 "metrics": metrics,
             },
         )
-
-    def _check_available(self, constraint: str) -> None:
-        affordance, *pose, trajectory = active_mask(constraint)
-        allowed = np.ones(self._taskset.has_affordance.shape, bool)
-        if affordance:
-            allowed &= np.asarray(self._taskset.has_affordance)
-        if trajectory or any(pose):
-            allowed &= np.asarray(self._taskset.pose_valid)[:, int(affordance)].any(-1)
-        if not allowed.any():
-            raise CongraspError(
-                f"None of the {len(self.objects)} objects allows the constraint '{constraint}'.",
-                "An affordance needs labelled parts, poses and trajectories need room above the table.",
-            )
 
     def _worker(
         self, task: TaskConfig, episodes: int, traced: bool = False

@@ -9,14 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
-from actors.taskset import HEADINGS, TaskSet, build_taskset, clear_of_table, headings_of
+from actors.taskset import HEADINGS, TaskSet, clear_of_table, headings_of
 from common.config import TaskConfig
 from common.constraints.headings import Headings
 from common.errors import CongraspError
 from common.hands.human import HUMAN
-from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
 from common.objects import store
 from common.objects.affordance import near_points, relabelled, two_parts
@@ -26,9 +24,9 @@ from common.objects.spec import GraspObject
 from common.wire.codec import Message
 from services.grasping.constraint_sets import set_of
 from services.importers.extract import BEYOND, Demonstration, Surface, extract
-from services.importers.fit import joint_positions
 from services.importers.objects import load_object
 from services.importers.sequence import Dropped, Sequence
+from services.importers.transfer import demonstrated_headings, transferred
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
 _TOUCHED = 0.03
@@ -46,7 +44,7 @@ class Options:
     affordance: Affordance = "auto"
     """parts: O+ are the labelled parts that fingers touch; contacts: what fingers touch; auto: parts if labelled."""
     beyond: float = BEYOND
-    """Radians by which a captured joint may exceed its limits; it is then moved to the limit."""
+    """Radians by which a captured joint may exceed its limits; it is then moved to the limit. For `human` alone."""
     waypoints: int = 15
     seed: int = 0
     """Of headings, and of the split into training and held-out."""
@@ -89,7 +87,7 @@ def import_sets(
 
     Args:
       sequences: from an importer.
-      hand: whose finger angles the reference poses are; a hand that no human pose fits gets headings and affordance.
+      hand: whose constraints these are; any but the human one follows the demonstrations by its grasp axes.
       options: see there.
       source: name of the data set.
       progress: is told each sequence's name.
@@ -100,13 +98,14 @@ def import_sets(
     report = Report()
     shapes: dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError] = {}
     groups: dict[str, _Group] = {}
+    beyond = options.beyond if hand is HUMAN else np.inf
     for item in sequences:
         try:
             if isinstance(item, Dropped):
                 raise item
             progress(item.name)
             obj, surface = _shape(item, shapes)
-            demonstration = extract(item, obj, surface, options.waypoints, options.beyond)
+            demonstration = extract(item, obj, surface, options.waypoints, beyond)
             labelled = _labelled(item, obj, demonstration, options.affordance)
             groups.setdefault(labelled.name, _Group(labelled)).demonstrations.append(demonstration)
         except Dropped as dropped:
@@ -206,36 +205,32 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
     """The object, and its constraint set in the size in which the hand grasps it."""
     task = TaskConfig(hand=hand.name, trajectory_points=options.waypoints)
     obj, demonstrations, seed = group.obj, group.demonstrations, (options.seed, number)
-    factor = object_scale(hand, task)
-    fitting = obj.scaled(factor)
-    given = _headings(demonstrations) if options.headings == "demonstrated" else None
-    if hand is not HUMAN:
-        given = given and given._replace(position=np.float32(factor) * given.position)
-        taskset = build_taskset(hand, task, [fitting], options.seed, [given])
-        row = TaskSet(*(np.asarray(field)[0] for field in taskset))
+    scale = object_scale(hand, task)
+    fitting = obj.scaled(scale)
+    given = None
+    if options.headings == "demonstrated":
+        given = Headings(*(np.resize(x, (HEADINGS, 3)) for x in demonstrated_headings(demonstrations, scale)))
+    fields = headings_of(task, fitting, seed, given, scale)
+    if hand is HUMAN:
+        posed = tuple(np.stack([getattr(d, x) for d in demonstrations]) for x in ("q", "position", "quaternion"))
     else:
-        fields = headings_of(task, obj, seed, given)
-        position, quaternion = (
-            np.stack([getattr(d, name) for d in demonstrations]).astype(np.float32)
-            for name in ("position", "quaternion")
-        )
-        clear = np.asarray(
-            clear_of_table(hand, quaternion[:, -1], position, np.stack([fields["rest"]] * len(position)))
-        )
-        nearer = _ends_nearer_to_plus(position[:, -1], fields["points"], fields["minus"])
-        row = TaskSet(
-            **{name: value for name, value in fields.items() if not name.startswith("chosen")},
-            pose_q=_twice(np.stack([d.q for d in demonstrations]).astype(np.float32)),
-            pose_position=_twice(position[:, -1]),
-            pose_quaternion=_twice(quaternion[:, -1]),
-            trajectory_position=_twice(position),
-            trajectory_quaternion=_twice(quaternion),
-            pose_valid=np.stack([clear.T, (clear & nearer[:, None]).T]),
-        )
+        posed = transferred(hand, demonstrations, fitting, scale)
+    q, position, quaternion = (values.astype(np.float32) for values in posed)
+    clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, np.stack([fields["rest"]] * len(position))))
+    nearer = _ends_nearer_to_plus(position[:, -1], fields["points"], fields["minus"])
+    row = TaskSet(
+        **{name: value for name, value in fields.items() if not name.startswith("chosen")},
+        pose_q=_twice(q),
+        pose_position=_twice(position[:, -1]),
+        pose_quaternion=_twice(quaternion[:, -1]),
+        trajectory_position=_twice(position),
+        trajectory_quaternion=_twice(quaternion),
+        pose_valid=np.stack([clear.T, (clear & nearer[:, None]).T]),
+    )
     about = {
         "source": source,
         "demonstrations": [demonstration.name for demonstration in demonstrations],
-        "object_scale": factor,
+        "object_scale": scale,
         "object_digest": store.digest(obj),
     }
     return obj, set_of(hand, row, fitting, options.seed, about)
@@ -250,21 +245,6 @@ def _ends_nearer_to_plus(wrist: np.ndarray, points: np.ndarray, minus: np.ndarra
     """(M,) bool: wrist positions (M, 3) that agree with the affordance (`common.constraints.priority`)."""
     away = np.linalg.norm(points[None] - wrist[:, None], axis=-1)
     return away[:, ~minus].min(-1, initial=np.inf) < away[:, minus].min(-1, initial=np.inf)
-
-
-def _headings(demonstrations: list[Demonstration]) -> Headings:
-    """The headings of the captured grasps: hand centre, heading axis and cross-finger axis at the reference poses."""
-    frame = grasp_frame(HUMAN)
-    rows = []
-    for demonstration in demonstrations:
-        tips = joint_positions(HUMAN, demonstration.q)[:, 3]
-        center = (tips[0] + tips[1:].mean(0)) / 2
-        turn = Rotation.from_quat(demonstration.quaternion[-1], scalar_first=True)
-        rows.append(
-            [turn.apply(center) + demonstration.position[-1], turn.apply(frame.heading), turn.apply(frame.cross)]
-        )
-    chosen = np.resize(np.array(rows, np.float32), (HEADINGS, 3, 3))
-    return Headings(chosen[:, 0], chosen[:, 1], chosen[:, 2])
 
 
 def _name(text: str) -> str:

@@ -263,8 +263,11 @@ def _resampled(path: np.ndarray, turns: Rotation, waypoints: int) -> tuple[np.nd
     length, path, turns = length[keep], path[keep], turns[keep]
     wanted = np.linspace(length[0], length[-1], waypoints)
     position = np.stack([np.interp(wanted, length, axis) for axis in path.T], -1)
-    quaternion = Slerp(length, turns)(wanted).as_quat(scalar_first=True)
-    for k in range(1, waypoints):
-        if quaternion[k] @ quaternion[k - 1] < 0:
-            quaternion[k] *= -1
-    return position, quaternion
+    return position, continuous(Slerp(length, turns)(wanted))
+
+
+def continuous(turns: Rotation) -> np.ndarray:
+    """(K, 4) quaternions w x y z of rotations along a path, without a change of sign between neighbours."""
+    quaternion = turns.as_quat(scalar_first=True)
+    signs = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
+    return quaternion * np.cumprod([1.0, *signs])[:, None]

@@ -73,8 +73,8 @@ def _fingers(hand: Hand) -> tuple[_Finger, ...]:
 
 
 def joint_positions(hand: Hand, q: np.ndarray) -> np.ndarray:
-    """(5, 4, 3) joints and tips of `FINGERS` in the hand's wrist frame, at finger angles q (F,)."""
-    return np.stack([_points(finger, q[finger.first :][: len(finger.axes)]) for finger in _fingers(hand)])
+    """(..., 5, 4, 3) joints and tips of `FINGERS` in the hand's wrist frame, m, at finger angles q (..., F)."""
+    return np.stack([_points(f, q[..., f.first : f.first + len(f.axes)]) for f in _fingers(hand)], -3)
 
 
 def fit(hand: Hand, joints: np.ndarray) -> Fit:
@@ -108,16 +108,15 @@ def _directions(points: np.ndarray) -> np.ndarray:
 
 
 def _points(finger: _Finger, angles: np.ndarray) -> np.ndarray:
-    """(4, 3) a finger's joints and tip, by the product of exponentials."""
-    turn, shift, moved = np.eye(3), np.zeros(3), 0
-    placed = []
+    """(..., 4, 3) a finger's joints and tip at its angles (..., n), by the product of exponentials."""
+    vectors = (angles[..., None] * finger.axes).reshape(-1, 3)
+    turns = Rotation.from_rotvec(vectors).as_matrix().reshape(*angles.shape, 3, 3)
+    turn, shift = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3)), np.zeros((*angles.shape[:-1], 3))
+    placed, moved = [], 0
     for carrier, point in zip(finger.carriers, finger.points, strict=True):
-        for axis, anchor, angle in zip(
-            finger.axes[moved:carrier], finger.anchors[moved:carrier], angles[moved:carrier], strict=True
-        ):
-            own = Rotation.from_rotvec(angle * axis).as_matrix()
-            shift = shift + turn @ (anchor - own @ anchor)
-            turn = turn @ own
+        for j in range(moved, carrier):
+            shift = shift + (turn @ (finger.anchors[j] - turns[..., j, :, :] @ finger.anchors[j])[..., None])[..., 0]
+            turn = turn @ turns[..., j, :, :]
         moved = carrier
         placed.append(turn @ point + shift)
-    return np.array(placed)
+    return np.stack(placed, -2)

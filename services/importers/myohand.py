@@ -85,7 +85,7 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
         mesh=meshes.find(name, object_name),
         wrist_position=position,
         wrist_rotation=rotation.as_matrix(),
-        joints=np.stack([joint_positions(HUMAN, q) for q in robot[:, 9:]]),
+        joints=joint_positions(HUMAN, robot[:, 9:]),
         object_position=pose[:, :3] + _OBJECT,
         object_rotation=Rotation.from_quat(pose[:, 3:], scalar_first=True).as_matrix(),
         present=present,
