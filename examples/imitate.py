@@ -1,6 +1,6 @@
-"""Moves a human demonstration to another hand: its heading and affordance drive that hand's own policy.
+"""Moves a human demonstration to other hands: its heading and affordance drive each hand's own policy.
 
-    python examples/imitate.py MyoHand_hammer_use1.npz --meshes objects --hand human --out imitated
+    python examples/imitate.py MyoHand_hammer_use1.npz --meshes object_sim --affordance contacts --hand allegro sharpa
 
 From the demonstration come the way the hand approached, the point between the fingers, and what of the object it
 touched; finger angles and the wrist's path, which belong to the human hand, do not count.
@@ -17,11 +17,15 @@ import tyro
 from common.hands import get_hand
 from common.hands.mano import read_mano
 from common.logs.motion import save_motion
+from common.objects.spec import GraspObject
+from common.wire.codec import Message
 from services.grasping.grasp import grasp
 from services.importers.build import Options, import_sets
 from services.importers.objects import Meshes
-from services.pictures.render import episode_sheet
-from services.pictures.sheets import save_png
+from services.pictures.render import episode_strip
+from services.pictures.sheets import contact_sheet, save_png
+
+_MOMENTS = 4
 
 
 @dataclasses.dataclass
@@ -38,46 +42,60 @@ class Arguments:
     """Your MANO_RIGHT.pkl, where the data set needs it."""
     affordance: Literal["auto", "contacts", "none"] = "auto"
     """What may be touched: labelled parts that the demonstration touched, or whatever is near to where it touched."""
-    hand: str = "human"
-    """Hand that imitates; objects are scaled for it."""
+    hand: tuple[str, ...] = ("allegro", "sharpa")
+    """Hands that imitate; objects are scaled for each."""
     policy: pathlib.Path | None = None
-    """Its policy file, if none comes with the package."""
+    """Policy file of the one hand, if none comes with the package."""
     out: pathlib.Path = pathlib.Path("imitated")
-    """Folder for the results."""
+    """Folder for the results: of each object the picture, and a motion of each hand."""
 
 
 def main(arguments: Arguments) -> None:
-    """Extracts heading and affordance, grasps with the other hand, and writes motion and picture."""
-    hand = get_hand(arguments.hand)
-    reader = importlib.import_module(f"services.importers.{arguments.format}")
+    """Extracts heading and affordance, grasps with each hand, and writes motions and a picture of each object."""
     model = read_mano(arguments.mano) if arguments.mano else None
-    sequences = reader.read(arguments.demonstration, Meshes(arguments.meshes), model)
-    options = Options(headings="demonstrated", affordance=arguments.affordance, beyond=np.pi)
-    objects, sets, report = import_sets(sequences, hand, options, arguments.format)
-    for row in report.dropped:
-        print(f"dropped: {row['sequence']}: {row['reason']}")
-    for obj, constraints in zip(objects, sets, strict=True):
-        fitting = obj.scaled(constraints.meta["object_scale"])
-        heading = constraints.arrays["heading/direction"][0, 0]
-        at = constraints.arrays["heading/position"][0, 0] - fitting.origin
-        done = grasp(
-            fitting,
-            heading=" ".join(map(str, heading)),
-            at=" ".join(map(str, at)),
-            affordance=",".join(np.array(obj.part_names)[obj.graspable]) if not obj.graspable.all() else "",
-            hand=arguments.hand,
-            policy=arguments.policy,
-        )
-        folder = arguments.out / obj.name
-        folder.mkdir(parents=True, exist_ok=True)
-        save_motion(folder / "grasp.npz", done.motion)
-        save_png(folder / "grasp.png", episode_sheet(done.episode))
-        error = done.motion.metrics
-        print(
-            f"{obj.name}, {hand.name} hand: {'held' if done.success else 'not held'} ({done.held} of {done.tries} "
-            f"tries); heading off by {error['heading_rad']:.2f} rad and {100 * error['heading_m']:.1f} cm, "
-            f"{error['affordance_ratio']:.0%} of the contacts outside of what the demonstration touched."
-        )
+    pictures: dict[str, tuple[list[np.ndarray], list[str]]] = {}
+    for name in arguments.hand:
+        reader = importlib.import_module(f"services.importers.{arguments.format}")
+        sequences = reader.read(arguments.demonstration, Meshes(arguments.meshes), model)
+        options = Options(headings="demonstrated", affordance=arguments.affordance, beyond=np.pi)
+        objects, sets, report = import_sets(sequences, get_hand(name), options, arguments.format)
+        for row in report.dropped:
+            print(f"dropped: {row['sequence']}: {row['reason']}")
+        for obj, constraints in zip(objects, sets, strict=True):
+            episode = imitate(arguments, name, obj, constraints)
+            result = "held" if episode.meta["success"] else "not held"
+            images, labels = pictures.setdefault(obj.name, ([], []))
+            new = episode_strip(episode, _MOMENTS, (360, 270), f"{name}: 0.00 s", f", {result}")
+            images += new[0]
+            labels += new[1]
+    for name, (images, labels) in pictures.items():
+        title = f"{name}: heading and affordance of a human demonstration"
+        save_png(arguments.out / f"{name}.png", contact_sheet(images, labels, columns=_MOMENTS, title=title))
+
+
+def imitate(arguments: Arguments, hand: str, obj: GraspObject, constraints: Message) -> Message:
+    """Grasps an object as its constraint set's first demonstration did; returns the episode."""
+    fitting = obj.scaled(constraints.meta["object_scale"])
+    done = grasp(
+        fitting,
+        heading=_words(constraints.arrays["heading/direction"][0, 0]),
+        at=_words(constraints.arrays["heading/position"][0, 0] - fitting.origin),
+        affordance=",".join(np.array(obj.part_names)[obj.graspable]) if not obj.graspable.all() else "",
+        hand=hand,
+        policy=arguments.policy,
+    )
+    save_motion(arguments.out / f"{obj.name}-{hand}.npz", done.motion)
+    error = done.motion.metrics
+    print(
+        f"{obj.name}, {hand} hand: {'held' if done.success else 'not held'} ({done.held} of {done.tries} tries); "
+        f"heading off by {error['heading_rad']:.2f} rad and {100 * error['heading_m']:.1f} cm, "
+        f"{error['affordance_ratio']:.0%} of the contacts outside of what the demonstration touched."
+    )
+    return done.episode
+
+
+def _words(vector: np.ndarray) -> str:
+    return " ".join(map(str, vector))
 
 
 if __name__ == "__main__":

@@ -13,11 +13,13 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
+from common.hands import get_hand
 from common.logs.motion import save_motion
 from services.cli.objects import find_object
 from services.grasping.grasp import grasp
 from services.grasping.wrist_paths import read_wrist_path
 from services.importers.extract import Surface, approach
+from services.importers.transfer import followed
 from services.pictures.render import episode_sheet
 from services.pictures.sheets import save_png
 
@@ -41,7 +43,7 @@ class Arguments:
     back: str = "+z"
     """Axis of that joint towards the back of the hand."""
     hand: str = "human"
-    """Hand whose shipped policy is taken."""
+    """Hand whose shipped policy is taken; any but the human one follows the wrist by its own grasp axes."""
     policy: pathlib.Path | None = None
     """A policy file instead."""
     out: pathlib.Path = pathlib.Path("completed")
@@ -52,9 +54,9 @@ def main(arguments: Arguments) -> None:
     """Cuts the path, grasps, and writes motion and picture."""
     obj = find_object(arguments.mesh)
     path = read_wrist_path(arguments.motion, joint=arguments.joint, fingers=arguments.fingers, back=arguments.back)
+    position, rotation = followed(get_hand(arguments.hand), path.position, path.rotation)
     turn = Rotation.from_quat(arguments.object_turn, scalar_first=True).inv()
-    in_file = turn.apply(path.position - arguments.object_at)
-    rotation = turn * path.rotation
+    in_file, rotation = turn.apply(position - arguments.object_at), turn * rotation
     far = Surface(obj).distance(in_file + obj.origin)
     frame = int(far.argmin())
     seen = np.ones(len(far), bool)

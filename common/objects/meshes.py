@@ -68,7 +68,7 @@ def import_source(source: Source, options: ImportOptions) -> tuple[GraspObject, 
     Raises:
       CongraspError: see `import_paths`.
     """
-    _check_options(options)
+    check_options(options)
     key = _cache_key(source, options)
     cached = _cache_folder(options) / f"{key}{store.SUFFIX}"
     if cached.is_file():
@@ -83,7 +83,8 @@ def import_source(source: Source, options: ImportOptions) -> tuple[GraspObject, 
     return obj, notes
 
 
-def _check_options(options: ImportOptions) -> None:
+def check_options(options: ImportOptions) -> None:
+    """Raises a CongraspError for numbers that are not positive."""
     for name in ("scale", "density", "time_limit", "max_pieces"):
         if not getattr(options, name) > 0:
             raise CongraspError(f"--{name.replace('_', '-')} is {getattr(options, name)}.", "It must be positive.")

@@ -122,7 +122,7 @@ def _say(report: Any, hand: str, sets: int, out: pathlib.Path, objects: pathlib.
         above = sum(row["clear_of_table"] for row in kept)
         _console.print(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")
     _console.print(
-        f"{sets} constraint sets are in {escape(str(out))}, their objects in {escape(str(objects))}; "
+        f"Constraint sets ({sets}) are in {escape(str(out))}, their objects in {escape(str(objects))}; "
         f"{escape(str(out / REPORT))} says what became of each sequence.",
         soft_wrap=True,
     )

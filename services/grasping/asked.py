@@ -168,7 +168,7 @@ def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
 
 
 def _pose(text: str, hand: Hand, obj: GraspObject, origin: np.ndarray) -> Reference:
-    path, index = _numbered(text)
+    path, index = numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand)
         last = _removal(motion)
@@ -192,7 +192,7 @@ def _pose(text: str, hand: Hand, obj: GraspObject, origin: np.ndarray) -> Refere
 def _trajectory(
     text: str, hand: Hand, obj: GraspObject, origin: np.ndarray, waypoints: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    path, index = _numbered(text)
+    path, index = numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand)
         position, quaternion = _wrist_on_object(motion, 0)
@@ -218,8 +218,8 @@ def _trajectory(
     return _resampled(position - origin, quaternion, waypoints, str(path))
 
 
-def _numbered(text: str) -> tuple[pathlib.Path, int]:
-    """FILE or FILE:NUMBER."""
+def numbered(text: str) -> tuple[pathlib.Path, int]:
+    """The file and the number in FILE or FILE:NUMBER; 0 without."""
     name, colon, number = text.rpartition(":")
     return (pathlib.Path(name), int(number)) if colon and number.isdigit() else (pathlib.Path(text), 0)
 

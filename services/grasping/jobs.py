@@ -13,11 +13,11 @@ from PIL import Image
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.objects import store
-from common.objects.meshes import ImportOptions, import_source
+from common.objects.meshes import ImportOptions, check_options, import_source
 from common.objects.sizes import size_in_words
 from common.objects.sources import Source, find_sources
 from common.objects.spec import GraspObject
-from services.grasping.asked import read_asked
+from services.grasping.asked import numbered, read_asked
 from services.grasping.files import OBJECT, THUMBNAIL, VIDEO, finished, key_of, save_grasp
 from services.grasping.grasp import Grasper, Progress
 from services.pictures.import_sheet import import_sheet, mesh_of_file
@@ -44,6 +44,7 @@ class Job:
 
     def load(self, options: ImportOptions) -> GraspObject:
         """The object; of an object file the scale is all that the options change."""
+        check_options(options)
         return import_source(self.source, options)[0] if self.source else store.load(self.path).scaled(options.scale)
 
 
@@ -148,8 +149,8 @@ def run_job(job: Job, grasper: Grasper, settings: Settings, progress: Progress) 
 
 def _content(text: str) -> str:
     """What a constraint says: its file's content, where it names one."""
-    path = pathlib.Path(text)
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else text
+    path, number = numbered(text)
+    return f"{hashlib.sha256(path.read_bytes()).hexdigest()}:{number}" if path.is_file() else text
 
 
 def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> None:

@@ -57,7 +57,7 @@ def transferred(
     rows = np.resize(np.arange(len(demonstrations)), (-(-len(demonstrations) // _AT_ONCE), _AT_ONCE))
     parts = [closed_poses(hand, *surface, *(field[some] for field in headings)) for some in rows]
     q, end = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(demonstrations)] for i in (0, 1))
-    onto = Rotation.from_matrix(_axes(HUMAN) @ _axes(hand).T)  # the hand's wrist frame to the human one
+    onto = _onto_human(hand)
     positions, quaternions = [], []
     for demonstration, center, last in zip(demonstrations, _centers(demonstrations), end, strict=True):
         human = Rotation.from_quat(demonstration.quaternion, scalar_first=True)
@@ -69,10 +69,27 @@ def transferred(
     return q, np.array(positions), np.array(quaternions)
 
 
+def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.ndarray, Rotation]:
+    """The wrist's path of a hand whose open grasp moves as that of a human hand; where there are no fingers to go by.
+
+    Args:
+      hand: any hand.
+      position: (T, 3) m, of the human wrist.
+      rotation: T orientations of its frame, that of the `human` hand.
+    """
+    turn = rotation * _onto_human(hand)
+    return position + rotation.apply(grasp_frame(HUMAN).center) - turn.apply(grasp_frame(hand).center), turn
+
+
 def _centers(demonstrations: Sequence[Demonstration]) -> np.ndarray:
     """(M, 3) m, the human hand's centre in its wrist frame: between the thumb's tip and the mean of the others."""
     tips = joint_positions(HUMAN, np.stack([d.q for d in demonstrations]))[:, :, 3]
     return (tips[:, 0] + tips[:, 1:].mean(1)) / 2
+
+
+def _onto_human(hand: Hand) -> Rotation:
+    """From the hand's wrist frame to the human one, with the grasp axes on one another."""
+    return Rotation.from_matrix(_axes(HUMAN) @ _axes(hand).T)
 
 
 def _axes(hand: Hand) -> np.ndarray:
