@@ -184,8 +184,29 @@ def load_motion(path: pathlib.Path) -> GraspMotion:
             raise CongraspError(f"{path} has format {meta['format']}, not {FORMAT}.", remedy)
         facts = {name: meta[name] for name in _FACTS}
         facts["constraints"] = tuple(facts["constraints"])
+        _check_shapes(arrays)
         return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS})
     except OSError as error:
         raise CongraspError(f"The motion {path} cannot be read: {error.strerror or error}.", remedy) from None
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise CongraspError(f"{path} is not a grasp motion ({error}).", remedy) from None
+        why = error if zipfile.is_zipfile(path) else "it is no NPZ file, or was cut"
+        raise CongraspError(f"{path} is not a grasp motion ({why}).", remedy) from None
+
+
+def _check_shapes(arrays: dict[str, np.ndarray]) -> None:
+    """A ValueError where an array has another shape than its meaning says, or none, or a face names no vertex."""
+    sizes: dict[str, int] = {}
+    for name, meaning in _ARRAYS.items():
+        words = meaning[1 : meaning.index(")")]
+        letters, shape = words.replace(",", " ").split(), arrays[name].shape
+        if 0 in shape:
+            raise ValueError(f"{name} is empty")
+        if len(letters) == len(shape):
+            for letter, size in zip(letters, shape, strict=True):
+                sizes.setdefault(letter, int(letter) if letter.isdigit() else size)
+        wanted = [sizes.get(letter) for letter in letters]
+        if wanted != list(shape):
+            raise ValueError(f"{name} has shape {shape}, where ({words}) is {tuple(wanted)}")
+    faces = arrays["object_faces"]
+    if faces.min() < 0 or faces.max() >= sizes["V"]:
+        raise ValueError("object_faces names vertices that are not there")

@@ -63,6 +63,9 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
     """
     if len(motions) > 1 and kind not in SEVERAL:
         raise CongraspError(f"A {kind} file holds one motion, and {len(motions)} were named.", "Name one at a time.")
+    if (suffix := FORMATS[kind]) and path.suffix.lower() != suffix:
+        name = path / f"grasp{suffix}" if path.is_dir() else f"{path}{suffix}"
+        raise CongraspError(f"The name of a {kind} file ends in {suffix}, and {path} does not.", f"Use --out {name}")
     if path.is_dir():
         raise CongraspError(f"The folder {path} is there already.", "Remove it or name another with --out.")
     for motion in motions:

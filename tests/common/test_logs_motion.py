@@ -1,5 +1,6 @@
 """Grasp motions as NPZ files."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -65,11 +66,27 @@ def test_what_is_no_motion_is_named(tmp_path):
     with pytest.raises(CongraspError, match="cannot be read: No such file"):
         load_motion(path)
     path.write_bytes(b"PK nothing")
-    with pytest.raises(CongraspError, match="not a grasp motion"):
+    with pytest.raises(CongraspError, match=r"not a grasp motion \(it is no NPZ file, or was cut\)"):
         load_motion(path)
     np.savez(path, a=np.zeros(3))
     with pytest.raises(CongraspError, match="not a grasp motion"):
         load_motion(path)
     np.savez(path, meta=np.array({"a": 1}, object))
     with pytest.raises(CongraspError, match="not a grasp motion"):
+        load_motion(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "complaint"),
+    [
+        ("time", lambda x: x[:3], r"table has shape \(12,\), where \(T,\) is \(3,\)"),
+        ("object_vertices", lambda x: x[:0], "object_vertices is empty"),
+        ("object_faces", lambda x: x + 1000, "names vertices that are not there"),
+        ("wrist_quaternion", lambda x: x[:, :3], r"wrist_quaternion has shape \(12, 3\), where \(T, 4\) is \(12, 4\)"),
+    ],
+)
+def test_arrays_of_the_wrong_shape_are_named(tmp_path, name, change, complaint):
+    motion = motion_of_episode(episode())
+    save_motion(path := tmp_path / "a.npz", dataclasses.replace(motion, **{name: change(getattr(motion, name))}))
+    with pytest.raises(CongraspError, match=complaint):
         load_motion(path)

@@ -60,7 +60,7 @@ def test_metrics_of_episodes_are_documented():
 
 @pytest.mark.timeout(600)
 def test_the_commands_of_the_tutorials_run(tmp_path):
-    """A stranger's first ten minutes, in an empty folder; what takes minutes is marked as text, and episodes are few."""
+    """A stranger's first ten minutes, in an empty folder; what takes minutes is marked as text there."""
     pages = [ROOT / "docs" / "tutorials" / f"{name}.md" for name in ("my-object", "constraints", "comparison")]
     (python,) = blocks(pages[0], "python")
     binaries = pathlib.Path(sys.executable).parent

@@ -259,6 +259,8 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     for arguments, words in (
         (["mug.npz", "logs", "--to", "glb"], "one motion, and 2 were named"),
         (["mug.npz", "--to", "lerobot"], "is there already"),
+        (["mug.npz", "--to", "usd", "--out", "x.glb"], "ends in .usda, and x.glb does not"),
+        (["mug.npz", "--out", "logs"], "Use --out logs/grasp.glb"),
         (["nothing.npz"], "There is no nothing.npz"),
         (["logs", "--index", "4"], "holds 1 episodes"),
         ([], "No motion was named"),
