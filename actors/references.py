@@ -39,14 +39,18 @@ class Grasps(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("hand", "task"))
 def renew(hand: Hand, task: TaskConfig, taskset: TaskSet, grasps: Grasps, key: Array) -> TaskSet:
-    """The task set with each grasp in the place of a random reference pose of its object and variant."""
+    """The task set with each grasp in the place of a random reference pose of its object and variant.
+
+    Places whose pose no resting pose allows are taken first.
+    """
     slot_key, path_key = jax.random.split(key)
-    objects, poses = taskset.pose_q.shape[0], taskset.pose_q.shape[2]
+    objects = taskset.pose_q.shape[0]
     fresh = Poses(grasps.q, grasps.position, grasps.quaternion)
     path, turns, valid = make_references(
         hand, fresh, taskset.rest[grasps.object_index], path_key, task.trajectory_points
     )
-    slot = jax.random.randint(slot_key, grasps.found.shape, 0, poses)
+    unused = ~taskset.pose_valid[grasps.object_index, grasps.variant].any(1)
+    slot = jnp.argmax(unused + jax.random.uniform(slot_key, unused.shape), -1)
     place = grasps.object_index, grasps.variant, slot
     # Of several grasps for one place the last is taken, in all arrays: a scatter would mix them on a GPU.
     number = jnp.arange(slot.size)

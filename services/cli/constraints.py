@@ -15,8 +15,6 @@ from common.objects.spec import GraspObject
 from services.cli.constraints_import import ConstraintsImport
 
 _console = Console(highlight=False)
-_FILLED = 0.9
-"""Share of the places for reference poses that a policy's grasps should fill."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,15 +64,15 @@ class ConstraintsGenerate:
             status.update("Making constraints")
             task, taskset = TaskConfig(hand=hand.name), None
             if self.references == "policy":
-                taskset = self._grasped(objects, lambda done: status.update(f"Grasping: {done} batches of episodes"))
+                taskset = self._grasped(objects, lambda text: status.update(f"Grasping: {text}"))
             for constraints in make_sets(hand, task, objects, self.seed, taskset):
                 save(constraints, self.out)
         what = "The constraint set of 1 object is" if len(objects) == 1 else f"The sets of {len(objects)} objects are"
         _console.print(f"{what} in {escape(str(self.out))}.", soft_wrap=True)
         return 0
 
-    def _grasped(self, objects: list[GraspObject], progress: Callable[[int], None]) -> Any:
-        """The task set with references from a policy's grasps."""
+    def _grasped(self, objects: list[GraspObject], progress: Callable[[str], None]) -> Any:
+        """The task set with references from a policy's grasps; says how many there are."""
         import os
 
         from common.policy import bundle as bundles
@@ -85,7 +83,16 @@ class ConstraintsGenerate:
         if bundle.spec.hand != self.hand:
             raise CongraspError(f"The policy is for the hand '{bundle.spec.hand}'.", f"Set --hand {bundle.spec.hand}.")
         evaluator = Evaluator(bundle, objects, threads=os.cpu_count() or 1, seed=self.seed)
-        return evaluator.references(_FILLED, progress)
+        said = ""
+
+        def tell(filled: int, places: int) -> None:
+            nonlocal said
+            said = f"{filled} of {places} places for reference poses are filled"
+            progress(said)
+
+        taskset = evaluator.references(tell)
+        _console.print(f"{said}.")
+        return taskset
 
 
 @dataclasses.dataclass(frozen=True)

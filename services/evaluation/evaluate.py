@@ -28,6 +28,7 @@ from services.evaluation.worlds import NOMINAL_FRICTION, acting, mixture, protoc
 
 _BATCH = {"native": 64, "warp": 4096, "jax": 256}
 _PATIENCE = 100
+_TRIES = 40
 _REFERENCES = 4
 """References that an object needs, on average."""
 _KEPT = 8
@@ -147,22 +148,27 @@ class Evaluator:
                 "An affordance needs labelled parts, poses and trajectories need room above the table.",
             )
 
-    def references(self, share: float, progress: Callable[[int], None] = lambda done: None) -> TaskSet:
+    def references(self, progress: Callable[[int, int], None] = lambda filled, places: None) -> TaskSet:
         """The task set with reference poses and trajectories from the policy's own grasps under headings.
 
+        It grasps until every place is filled, or until `_TRIES` episodes a region of an object filled no further one.
+
         Args:
-          share: of the places for references on the whole surface that should be filled.
-          progress: is told how many batches of episodes there are.
+          progress: is told how many places are filled, and how many there are: those on the whole surface of every
+            object, and on O+ where that can be approached.
         """
         with self._worker(mixture(self.task, ["heading", "affordance"]), self._batch) as worker:
+            regions = np.stack([np.ones(len(self.objects), bool), np.asarray(self._taskset.has_affordance).any(-1)], -1)
+            places = int(regions.sum()) * self._taskset.pose_q.shape[2]
             worker.forget_references()
-            for batch in range(_PATIENCE):
+            filled = idle = 0
+            while filled < places and idle < _TRIES * regions.sum():
                 worker.restart()
                 worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
                 worker.renew_references()
-                progress(batch + 1)
-                if np.asarray(worker.taskset.pose_valid)[:, 0].any(1).mean() >= share:
-                    break
+                before, filled = filled, int(np.any(worker.taskset.pose_valid, axis=2)[regions].sum())
+                idle = 0 if filled > before else idle + self._batch
+                progress(filled, places)
             return TaskSet(*(np.asarray(field) for field in worker.taskset))
 
     def rows_under_noise(self, progress: Callable[[int], None], episodes: int) -> list[Row]:

@@ -83,6 +83,10 @@ def test_a_grasp_replaces_one_reference_of_its_object_and_variant(taskset):
     )
     # A grasp from straight above is possible where the object is not turned.
     flat = taskset._replace(rest=taskset.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
+    used = flat._replace(pose_valid=jnp.ones_like(flat.pose_valid).at[1, 1, :, 7].set(False))
+    new = renew(HAND, TASK, used, grasps, jax.random.key(1))
+    assert np.flatnonzero((new.pose_q != used.pose_q).any(-1)[1, 1]).tolist() == [7]  # where there was none to use
+    flat = flat._replace(pose_valid=jnp.ones_like(flat.pose_valid))
     new = renew(HAND, TASK, flat, grasps, jax.random.key(1))
     changed = np.asarray((new.pose_q != flat.pose_q).any(-1))
     assert changed[1, 1].sum() == 1 and changed.sum() == 1

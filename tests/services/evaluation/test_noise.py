@@ -77,26 +77,30 @@ def test_the_same_references_are_disturbed_in_every_row(taskset, monkeypatch, tm
             np.testing.assert_array_equal(getattr(seen, name), getattr(expected, name))
 
 
-def test_references_are_renewed_until_their_places_are_filled(taskset, monkeypatch):
+@pytest.mark.parametrize("most", [20, 5])
+def test_references_are_renewed_until_their_places_are_filled_or_none_is_added(taskset, monkeypatch, most):
     config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
-    evaluator = Evaluator(untrained(config), OBJECTS, taskset=taskset)
-    worker, told = mock.Mock(taskset=taskset), []
+    flat = taskset._replace(has_affordance=np.array([[True], [False]]).repeat(taskset.rest.shape[1], 1))
+    evaluator = Evaluator(untrained(config), OBJECTS, taskset=flat)
+    worker, told = mock.Mock(taskset=flat), []
 
     def forget():
-        worker.taskset = taskset._replace(pose_valid=np.zeros_like(taskset.pose_valid))
+        worker.taskset = flat._replace(pose_valid=np.zeros_like(flat.pose_valid))
 
     def renew():
         valid = np.array(worker.taskset.pose_valid)
-        valid[:, 0, 0, valid[0, 0].any(0).sum()] = True
-        worker.taskset = taskset._replace(pose_valid=valid)
+        valid[:, :, 0, min(valid[0, 0].any(0).sum(), most - 1)] = True
+        worker.taskset = flat._replace(pose_valid=valid)
 
     worker.forget_references.side_effect, worker.renew_references.side_effect = forget, renew
     monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
-    made = evaluator.references(0.5, told.append)
-    assert told == list(range(1, 11)) and made.pose_valid[:, 0].any(1).sum() == 20  # ten of twenty on two objects
+    made = evaluator.references(lambda *counts: told.append(counts))
+    # Two whole surfaces and one O+; 40 episodes for each of the three, 64 a batch, are two batches.
+    idle = [(15, 60)] * 2 if most < 20 else []
+    assert told == [(3 * (i + 1), 60) for i in range(most)] + idle
     sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 0, made)
-    assert [int(one.arrays["pose/allowed"][0].any(0).sum()) for one in sets] == [10, 10]
-    np.testing.assert_array_equal(sets[0].arrays["pose/q"], taskset.pose_q[0])
+    assert [int(one.arrays["pose/allowed"][0].any(0).sum()) for one in sets] == [most, most]
+    np.testing.assert_array_equal(sets[0].arrays["pose/q"], flat.pose_q[0])
 
 
 def test_curves_show_every_kind_of_noise(tmp_path):
