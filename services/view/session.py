@@ -117,7 +117,7 @@ class Session:
             "/api/job": lambda query: self._jobs.state(),
             "/api/hand": lambda query: hand_message(query.get("name", self._hand)),
             "/api/object": lambda query: self.mesh(),
-            "/api/paint": lambda query: Message({"minus": self._studio.shown_minus.copy()}, {}),
+            "/api/paint": lambda query: Message({"minus": self._studio.canvas.shown}, {}),
             "/api/motion": lambda query: for_page(self.motion(query.get("id", ""))),
             "/api/export": lambda query: self.export(query.get("id", ""), query.get("kind", "")),
             "/api/training": lambda query: self.training(query.get("names", "")),
@@ -151,7 +151,7 @@ class Session:
     def mesh(self) -> Message:
         """The object's mesh that is painted on."""
         with self._lock:
-            vertices, faces = self._studio.shown
+            vertices, faces = self._studio.canvas.vertices, self._studio.canvas.faces
             return Message({"vertices": vertices, "faces": faces}, {"name": self._studio.obj.name})
 
     def motion(self, key: str) -> Message:

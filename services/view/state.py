@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import trimesh
-from scipy.spatial import cKDTree
 
 from actors.environment import initial_wrist
 from common import rotations
@@ -25,11 +23,10 @@ from common.task.types import MASKS, Goal, Surface, first
 from common.wire.codec import Message
 from services.grasping.constraint_sets import make_sets
 from services.grasping.grasp import with_minus
+from services.view.canvas import Canvas
 
 OPTIONAL = ("affordance", "pose", "trajectory")
 """Constraints that can be asked for; the heading always is."""
-_EDGE = 0.006  # longest edge of the mesh that is painted on, m
-_MOST_FACES = 12_000  # beyond which a mesh is not cut finer
 _LEAST_PATH = 0.03  # m
 
 
@@ -74,26 +71,19 @@ class Studio:
       rest: index of its resting pose.
       asked: names of the optional constraints that are switched on.
       arrow: the heading.
-      minus: (512,) bool, surface points that are painted as O-.
-      shown: vertices (V, 3) and faces (E, 3) of the mesh that is painted on, fine enough to show it.
-      shown_minus: (V,) bool.
-      painted: grows with every change of the paint.
+      canvas: the object's surface, with what is painted on it as O-.
     """
 
     def __init__(self, hand: Hand, task: TaskConfig, obj: GraspObject):
         """Begins with an object, and a heading that the table leaves room for."""
         self.hand, self.task = hand, dataclasses.replace(task, object_scale=1.0)  # objects as large as they are
-        self.painted = 0
         self.take(obj)
 
     def take(self, obj: GraspObject) -> None:
         """Another object: what was asked of the one before is gone."""
         self.obj, self.rest = obj, 0
         self.asked: set[str] = set()
-        self.shown = _finer(obj.visual_vertices, obj.visual_faces)
-        self.minus = np.zeros(len(obj.points), bool)
-        self.shown_minus = np.zeros(len(self.shown[0]), bool)
-        self.painted += 1
+        self.canvas = Canvas(obj)
         self.pose: Poses | None = None
         self.path: Path | None = None
         self._sets: tuple[bytes, Message] | None = None
@@ -111,8 +101,8 @@ class Studio:
         """Switches an optional constraint; what it needs and is not there yet is suggested."""
         if constraint not in OPTIONAL:
             raise CongraspError(f"There is no constraint '{constraint}'.", f"Choose from: {', '.join(OPTIONAL)}.")
-        if on and constraint == "affordance" and not self.minus.any():
-            self._paint_parts()
+        if on and constraint == "affordance" and not self.canvas.minus.any():
+            self.canvas.take_parts()
         if on and constraint == "pose" and self.pose is None:
             self.close_hand()
         if on and constraint == "trajectory" and self.path is None:
@@ -151,19 +141,12 @@ class Studio:
 
         Paint asks for the affordance; without any it is asked for no longer.
         """
-        strokes = np.asarray(points, float)
-        if strokes.ndim != 2 or strokes.shape[1:] != (3,) or not np.isfinite(strokes).all() or len(strokes) > 2000:
-            raise CongraspError("A brush stroke must be at most 2000 points of three numbers.")
-        if not 0.001 <= radius <= 0.2:
-            raise CongraspError(f"The brush has a radius of {radius} m.", "Choose 1 mm to 20 cm.")
-        for target, labels in ((self.obj.points, self.minus), (self.shown[0], self.shown_minus)):
-            squared = ((target[:, None] - strokes[None]) ** 2).sum(-1).min(-1, initial=np.inf)
-            labels[squared <= radius**2] = minus
+        self.canvas.brush(points, radius, minus)
         self._repainted()
 
     def fill(self, minus: bool) -> None:
         """Paints everything in one colour."""
-        self.minus[:], self.shown_minus[:] = minus, minus
+        self.canvas.fill(minus)
         self._repainted()
 
     def close_hand(self) -> None:
@@ -203,7 +186,7 @@ class Studio:
         if constraint not in self._next:
             raise CongraspError(f"Nothing can be suggested for '{constraint}'.", "Choose heading, pose or trajectory.")
         sets = self._constraint_sets().arrays
-        variant = int("affordance" in self.asked and bool(self.minus.any()))
+        variant = int("affordance" in self.asked and bool(self.canvas.minus.any()))
         allowed = sets["heading/allowed" if constraint == "heading" else "pose/allowed"][variant, self.rest]
         found = np.flatnonzero(allowed)
         if not len(found):
@@ -226,7 +209,7 @@ class Studio:
     @property
     def labelled(self) -> GraspObject:
         """The object with the painted regions as its parts."""
-        return with_minus(self.obj, self.minus)
+        return with_minus(self.obj, self.canvas.minus)
 
     @property
     def request(self) -> Asked:
@@ -245,7 +228,7 @@ class Studio:
         """What the priority rules make of it, without batch axes."""
         flags = (np.array([name in self.asked]) for name in OPTIONAL)
         goal = Goal(*(np.asarray(value, np.float32)[None] for value in self._goal()))
-        surface = Surface(np.asarray(self.obj.points, np.float32)[None], self.minus[None])
+        surface = Surface(np.asarray(self.obj.points, np.float32)[None], self.canvas.minus[None])
         found = _resolve(self.hand, surface, Request(goal, *flags))
         return Resolution(first(found.goal), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0])
 
@@ -258,8 +241,8 @@ class Studio:
     @property
     def trouble(self) -> str:
         """Why this cannot be asked for, and what to do; empty if it can."""
-        if "affordance" in self.asked and (self.minus.all() or not self.minus.any()):
-            what = "Everything is" if self.minus.any() else "Nothing is"
+        if "affordance" in self.asked and (self.canvas.minus.all() or not self.canvas.minus.any()):
+            what = "Everything is" if self.canvas.minus.any() else "Nothing is"
             return f"{what} painted as not to be touched. Paint a part of the object with the brush."
         found = self.resolution
         if not found.aligned:
@@ -283,7 +266,7 @@ class Studio:
                 "name": self.obj.name,
                 "size_cm": [round(100 * float(side), 1) for side in size],
                 "mass_g": round(1000 * self.obj.mass),
-                "faces": len(self.shown[1]),
+                "faces": len(self.canvas.faces),
                 "rests": len(self.obj.rest_poses),
             },
             "rest": {"index": self.rest, **_pose(self.obj.rest_poses[self.rest])},
@@ -300,20 +283,12 @@ class Studio:
             "start": self._start(goal),
             "pose": None if self.pose is None else self._ghost(self.pose),
             "path": None if self.path is None else np.asarray(self.path.position).tolist(),
-            "painted": self.painted,
-            "minus": round(float(self.minus.mean()), 3),
+            "painted": self.canvas.version,
+            "minus": round(float(self.canvas.minus.mean()), 3),
         }
 
     def _repainted(self) -> None:
-        self.painted += 1
-        (self.asked.add if self.minus.any() else self.asked.discard)("affordance")
-
-    def _paint_parts(self) -> None:
-        """The paint that an object came with: its non-graspable parts."""
-        self.minus = self.obj.non_graspable_points.copy()
-        nearest = cKDTree(self.obj.points).query(self.shown[0])[1]
-        self.shown_minus = self.minus[nearest]
-        self.painted += 1
+        (self.asked.add if self.canvas.minus.any() else self.asked.discard)("affordance")
 
     def _goal(self) -> Goal:
         waypoints = self.task.trajectory_points
@@ -336,7 +311,7 @@ class Studio:
         return {"position": np.asarray(position).tolist(), "quaternion": np.asarray(quaternion).tolist()}
 
     def _constraint_sets(self) -> Message:
-        key = self.minus.tobytes()
+        key = self.canvas.minus.tobytes()
         if self._sets is None or self._sets[0] != key:
             self._sets = key, make_sets(self.hand, self.task, [self.labelled], seed=0)[0]
         return self._sets[1]
@@ -377,19 +352,6 @@ def _links(hand: Hand, q: jax.Array, position: jax.Array, quaternion: jax.Array)
     local = kinematics.link_poses(hand, q)
     turn = jnp.broadcast_to(quaternion, local[1].shape)
     return rotations.compose_pose(jnp.broadcast_to(position, local[0].shape), turn, *local)
-
-
-def _finer(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface, cut until its edges are short or it has many faces, so that paint has somewhere to be."""
-    edge = _EDGE
-    area = float(trimesh.Trimesh(vertices, faces, process=False).area)
-    edge = max(edge, 2.2 * float(np.sqrt(area / _MOST_FACES)))
-    if len(faces) >= _MOST_FACES:
-        return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
-    fine, cut = trimesh.remesh.subdivide_to_size(vertices, faces, edge, max_iter=12)[:2]
-    merged = trimesh.Trimesh(fine, cut, process=False)
-    merged.merge_vertices()
-    return np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32)
 
 
 def _vector(what: str, value: Any) -> np.ndarray:

@@ -50,19 +50,19 @@ def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: St
     center = MUG.points[0]
     studio.paint([center], 0.02, minus=True)
     far = np.linalg.norm(MUG.points - center, axis=-1)
-    np.testing.assert_array_equal(studio.minus, far <= 0.02)
-    shown = np.linalg.norm(studio.shown[0] - center, axis=-1)
-    np.testing.assert_array_equal(studio.shown_minus, shown <= 0.02)
+    np.testing.assert_array_equal(studio.canvas.minus, far <= 0.02)
+    shown = np.linalg.norm(studio.canvas.vertices - center, axis=-1)
+    np.testing.assert_array_equal(studio.canvas.shown, shown <= 0.02)
     assert studio.asked == {"affordance"} and masks(studio)["affordance"]
-    np.testing.assert_array_equal(studio.request.obj.non_graspable_points, studio.minus)
+    np.testing.assert_array_equal(studio.request.obj.non_graspable_points, studio.canvas.minus)
     studio.paint([center], 0.03, minus=False)
-    assert not studio.minus.any() and studio.asked == set()
+    assert not studio.canvas.minus.any() and studio.asked == set()
 
 
 def test_without_paint_the_affordance_takes_the_parts_that_the_object_came_with(studio: Studio) -> None:
     studio.ask("affordance", True)
-    np.testing.assert_array_equal(studio.minus, MUG.non_graspable_points)
-    assert 0 < studio.shown_minus.mean() < 1
+    np.testing.assert_array_equal(studio.canvas.minus, MUG.non_graspable_points)
+    assert 0 < studio.canvas.shown.mean() < 1
 
 
 def test_the_rules_are_told_in_words_and_masks(studio: Studio) -> None:

@@ -1,0 +1,70 @@
+"""An object's surface as the studio paints it: what must not be touched, and a mesh fine enough to show it."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from common.errors import CongraspError
+from common.objects.spec import GraspObject
+
+_EDGE = 0.006  # longest edge of the mesh that is painted on, m
+_MOST_FACES = 12_000  # beyond which a mesh is not cut finer
+_versions = itertools.count(1)
+
+
+class Canvas:
+    """The paint on one object, none at first.
+
+    Attributes:
+      minus: (512,) bool, surface points that are painted as O-.
+      vertices, faces: (V, 3), (E, 3) of the mesh that is painted on.
+      shown: (V,) bool, vertices that are painted.
+      version: changes with the paint, and is another for every canvas.
+    """
+
+    def __init__(self, obj: GraspObject):
+        """Cuts the object's mesh finer."""
+        self._obj = obj
+        self.vertices, self.faces = _finer(obj.visual_vertices, obj.visual_faces)
+        self._set(np.zeros(len(obj.points), bool), np.zeros(len(self.vertices), bool))
+
+    def brush(self, points: Any, radius: float, minus: bool) -> None:
+        """Paints what is within `radius` (m) of points (N, 3), or takes the paint away."""
+        strokes = np.asarray(points, float)
+        if strokes.ndim != 2 or strokes.shape[1:] != (3,) or not np.isfinite(strokes).all() or len(strokes) > 2000:
+            raise CongraspError("A brush stroke must be at most 2000 points of three numbers.")
+        if not 0.001 <= radius <= 0.2:
+            raise CongraspError(f"The brush has a radius of {radius} m.", "Choose 1 mm to 20 cm.")
+
+        def brushed(places: np.ndarray, before: np.ndarray) -> np.ndarray:
+            squared = ((places[:, None] - strokes[None]) ** 2).sum(-1).min(-1, initial=np.inf)
+            return np.where(squared <= radius**2, minus, before)
+
+        self._set(brushed(self._obj.points, self.minus), brushed(self.vertices, self.shown))
+
+    def fill(self, minus: bool) -> None:
+        """Paints everything in one colour."""
+        self._set(np.full_like(self.minus, minus), np.full_like(self.shown, minus))
+
+    def take_parts(self) -> None:
+        """The paint that an object came with: its non-graspable parts."""
+        minus = self._obj.non_graspable_points
+        self._set(minus, minus[cKDTree(self._obj.points).query(self.vertices)[1]])
+
+    def _set(self, minus: np.ndarray, shown: np.ndarray) -> None:
+        self.minus, self.shown, self.version = minus, shown, next(_versions)
+
+
+def _finer(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface, cut until its edges are short or it has many faces, so that paint has somewhere to be."""
+    if len(faces) >= _MOST_FACES:
+        return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
+    area = float(trimesh.Trimesh(vertices, faces, process=False).area)
+    edge = max(_EDGE, 2.2 * float(np.sqrt(area / _MOST_FACES)))
+    fine, cut = trimesh.remesh.subdivide_to_size(vertices, faces, edge, max_iter=12)[:2]
+    merged = trimesh.Trimesh(fine, cut, process=False)
+    merged.merge_vertices()
+    return np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32)
