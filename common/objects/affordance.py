@@ -20,6 +20,7 @@ from common.objects.spec import GraspObject
 LEAST_SHARE = 0.10
 """Least share of the surface that O+ must have (paper, section Constraint Setup)."""
 _ON_PART = 0.003  # m; a surface point this near to a part's mesh belongs to the part
+_SAME_BOX = 0.1  # share of an object's length by which the bounding box of its painted file may be off
 _COLOUR_TOLERANCE = 60  # largest distance of two colours in RGB that count as one
 
 
@@ -74,7 +75,13 @@ def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> n
     """(512,) bool: surface points x with normal . x >= offset (m), in the object frame."""
     length = float(np.linalg.norm(normal))
     if not np.isfinite(length) or length < 1e-9:
-        raise CongraspError(f"The direction {tuple(normal)} has no length.", "Give three numbers.")
+        raise CongraspError(f"The direction {tuple(normal)} has no length.", "Give three finite numbers, not all zero.")
+    farthest = float(np.linalg.norm(obj.points, axis=-1).max())
+    if not abs(offset) <= farthest:
+        raise CongraspError(
+            f"The plane at {offset:g} m misses '{obj.name}', which reaches {farthest:.3f} m from its centre of mass.",
+            "Give the distance from there in metres.",
+        )
     return obj.points @ (np.asarray(normal, float) / length) >= offset
 
 
@@ -107,8 +114,10 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
       colour: red, green and blue, 0 to 255.
 
     Raises:
-      CongraspError: the file has no coloured vertices, or none of this colour.
+      CongraspError: the file has no coloured vertices, none of this colour, or shows something else than the object.
     """
+    if not path.is_file():
+        raise CongraspError(f"There is no file {path}.", "Check the path.")
     try:
         mesh: Any = trimesh.load(path, process=False)
     except Exception as error:  # the readers raise whatever they stumble over
@@ -120,13 +129,29 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
         colours = mesh.colors if len(mesh.colors) else None
     if colours is None:
         raise CongraspError(f"{path} has no coloured vertices.", "Paint them and export as PLY with colours.")
-    rgb = np.asarray(colours)[:, :3].astype(int)
+    vertices = np.asarray(mesh.vertices, float) * obj.file_scale + obj.origin
+    finite = np.isfinite(vertices).all(-1)
+    vertices, rgb = vertices[finite], np.asarray(colours)[finite, :3].astype(int)
+    _check_box(obj, path, vertices)
     same = np.linalg.norm(rgb - np.array(colour), axis=-1) <= _COLOUR_TOLERANCE
     if not same.any():
         seen = ", ".join("#{:02x}{:02x}{:02x}".format(*row) for row in _commonest(rgb))
         given = "#{:02x}{:02x}{:02x}".format(*colour)
         raise CongraspError(f"No vertex of {path} has the colour {given}.", f"Its colours are {seen}.")
-    return same[cKDTree(np.asarray(mesh.vertices) * obj.file_scale + obj.origin).query(obj.points)[1]]
+    return same[cKDTree(vertices).query(obj.points)[1]]
+
+
+def _check_box(obj: GraspObject, path: pathlib.Path, vertices: np.ndarray) -> None:
+    """Raises a CongraspError if vertices (n, 3), m, object frame, do not span what the object does."""
+    if not len(vertices):
+        raise CongraspError(f"{path} has no vertex of finite numbers.", "Export it again.")
+    own, other = (np.stack([x.min(0), x.max(0)]) for x in (obj.visual_vertices, vertices))
+    off = float(np.abs(own - other).max())
+    if off > _SAME_BOX * np.ptp(own, axis=0).max():
+        raise CongraspError(
+            f"{path} does not show '{obj.name}': its bounding box is off by {100 * off:.3g} cm.",
+            "It must be in the frame and unit of the object's own file.",
+        )
 
 
 def near_points(obj: GraspObject, points: np.ndarray, radius: float) -> np.ndarray:

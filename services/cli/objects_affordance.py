@@ -32,7 +32,7 @@ class ObjectsAffordance:
     """A PLY file of the object with coloured vertices, in the same frame and unit."""
     colour: str = "green"
     """Of what may be grasped in the painted file: red, green, blue, yellow, or #rrggbb."""
-    half_space: tuple[float, float, float, float] | None = None
+    half_space: tuple[float, ...] = ()
     """Three numbers of a direction and one in metres: what lies farther than that along the direction may be grasped.
     In the object's frame, whose origin is its centre of mass."""
     invert: bool = False
@@ -44,12 +44,19 @@ class ObjectsAffordance:
 
     def run(self) -> int:
         """Runs the command; returns its exit code."""
+        import numpy as np
+
         from services.cli.objects import find_object
 
-        given = [value for value in (self.part_mesh, self.painted, self.half_space) if value is not None]
+        given = [value for value in (self.part_mesh, self.painted, self.half_space or None) if value is not None]
         if len(given) != 1:
             raise CongraspError(
                 "It must be clear what may be grasped.", "Set one of --part-mesh, --painted and --half-space."
+            )
+        if len(self.half_space) not in (0, 4):
+            raise CongraspError(
+                f"--half-space has {len(self.half_space)} numbers, not four.",
+                "Write a direction and a distance in metres, such as 0 0 1 0.02.",
             )
         obj = find_object(self.object, self.folder)
         if self.part_mesh is not None:
@@ -57,8 +64,12 @@ class ObjectsAffordance:
         elif self.painted is not None:
             plus = affordance.painted(obj, self.painted, _colour(self.colour))
         else:
-            assert self.half_space is not None
             plus = affordance.in_half_space(obj, self.half_space[:3], self.half_space[3])
+        if np.all(plus != self.invert):
+            raise CongraspError(
+                f"All of the surface of '{obj.name}' could be grasped, so that nothing is divided.",
+                "Choose a smaller part.",
+            )
         labelled = affordance.two_parts(obj, plus != self.invert, self.name)
         file = Catalogue(self.folder).add(labelled)
         share = 1 - labelled.non_graspable_points.mean()

@@ -60,6 +60,27 @@ def test_what_cannot_be_an_affordance_is_refused(box, folder):
     trimesh.creation.box([10, 10, 10]).apply_translation([500, 0, 0]).export(folder / "elsewhere.stl")
     with pytest.raises(CongraspError, match="cm from the surface"):
         on_part_mesh(box, folder / "elsewhere.stl")
+    for offset in (20.0, float("nan")):
+        with pytest.raises(CongraspError, match=r"misses 'box', which reaches 0\.0\d+ m .* in metres"):
+            in_half_space(box, (0, 0, 1), offset)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda vertices: vertices / 1000, "does not show 'box'"),
+        (lambda vertices: vertices + np.array([300, 0, 0]), "off by 30 cm"),
+        (lambda vertices: vertices * np.nan, "no vertex of finite numbers"),
+    ],
+)
+def test_a_painted_file_must_show_the_object(box, folder, tmp_path, change, complaint):
+    mesh = trimesh.load(folder / "painted.ply", process=False)
+    colours = mesh.visual.vertex_colors
+    trimesh.PointCloud(change(np.asarray(mesh.vertices)), colors=colours).export(tmp_path / "other.ply")
+    with pytest.raises(CongraspError, match=complaint):
+        painted(box, tmp_path / "other.ply", (0, 255, 0))
+    with pytest.raises(CongraspError, match="There is no file"):
+        painted(box, tmp_path / "none.ply", (0, 255, 0))
 
 
 def test_the_command_stores_the_new_object(box, folder, tmp_path, capsys):
@@ -76,3 +97,7 @@ def test_the_command_stores_the_new_object(box, folder, tmp_path, capsys):
         load("objects")([*run])()
     with pytest.raises(CongraspError, match="--colour is 'pink'"):
         load("objects")([*run, "--painted", str(folder / "painted.ply"), "--colour", "pink"])()
+    with pytest.raises(CongraspError, match="has 3 numbers, not four"):
+        load("objects")([*run, "--half-space", "0", "0", "1"])()
+    with pytest.raises(CongraspError, match="nothing is divided"):
+        load("objects")([*run, "--half-space", "0", "0", "1", "-0.062"])()
