@@ -8,6 +8,7 @@ import contextlib
 import json
 import os
 import pathlib
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -81,6 +82,14 @@ class Checkpoints:
                 f"Point {self._directory / _LATEST} at an older one to go on from there.",
             ) from None
         return restore(arrays, template, str(path)), json.loads(arrays[_META].tobytes())
+
+
+def checksum(tree: Any) -> int:
+    """CRC-32 of all that a checkpoint of the tree holds."""
+    crc = 0
+    for array in flatten(jax.device_get(tree)).values():
+        crc = zlib.crc32(np.ascontiguousarray(array).tobytes(), crc)
+    return crc
 
 
 def flatten(tree: Any) -> dict[str, np.ndarray]:

@@ -6,12 +6,10 @@ take configuration, state and versions from it, and write only journals and what
 
 import contextlib
 import dataclasses
-import os
 import pathlib
 import secrets
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -31,11 +29,11 @@ from common.wire.codec import Message, encode
 from common.wire.messages import RolloutForm
 from learner import update as updates
 from learner.audit import AuditLog
-from learner.checkpoint import Checkpoints, flatten, restore
+from learner.checkpoint import Checkpoints, checksum, flatten, restore
 from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
 from learner.ranks import Ranks, ended_by
-from learner.run_directory import CONFIG_FILE, INITIAL_FILE, POLICY_FILE, VERSION_FILE, open_run
+from learner.run_directory import CONFIG_FILE, INITIAL_FILE, POLICY_FILE, note_version, open_run, published_version
 from learner.staleness import Ledger, StalenessManager
 from learner.statistics import Pace, overall, summary
 from learner.update import NonFiniteUpdate, TrainState
@@ -306,28 +304,19 @@ class _Learner:
 
     def _publish(self) -> None:
         if self._ranks.rank == 0:
-            self._note_version()
+            try:
+                note_version(self._run_dir, self.version)
+            except CongraspError as error:
+                self._event("error", str(error))
         self._hub.publish_weights(self.bundle().to_message(), self.version)
         if self._ranks.rank:
             return
         meta = {"version": self.version, "epoch": self._epoch, "schema": self._spec.schema}
         self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
 
-    def _note_version(self) -> None:
-        # Overwritten in place, which needs no space on a disk that is full, and not flushed: this must survive the
-        # process, and a power cut costs no more than a version.
-        try:
-            with open(os.open(self._run_dir / VERSION_FILE, os.O_WRONLY | os.O_CREAT, 0o644), "wb", 0) as file:
-                file.write(f"{self.version:020d}\n".encode())
-        except OSError as error:
-            self._event("error", f"{self._run_dir / VERSION_FILE} could not be written: {error.strerror}.")
-
     def _skip_lost_versions(self, version: int) -> int:
         """Versions that were published after the checkpoint's died with the process; they are not given out again."""
-        try:
-            published = int((self._run_dir / VERSION_FILE).read_text())
-        except (OSError, ValueError):
-            return 0
+        published = published_version(self._run_dir)
         if published <= version:
             return 0
         self._event("warning", f"{published - version} update(s) after the checkpoint were lost.")
@@ -354,7 +343,7 @@ class _Learner:
     def _save(self) -> None:
         """A checkpoint, which rank 0 writes; all ranks call this, and their replicas are compared."""
         durable = self._hub.durable()
-        state = _checksum(self._state) if self._ranks.count > 1 else 0
+        state = checksum(self._state) if self._ranks.count > 1 else 0
         everyone = self._ranks.exchange({"hub": durable, "state": state}).meta["entries"]
         if odd := [rank for rank, entry in enumerate(everyone) if entry["state"] != everyone[0]["state"]]:
             raise ReplicasDiffer(
@@ -405,11 +394,3 @@ def _durable(hubs: list[dict[str, Any]], rank: int) -> dict[str, Any] | None:
     if not hubs or rank < len(hubs):
         return hubs[rank] if hubs else None
     return {**hubs[0], "ledger": dataclasses.asdict(Ledger()), "forgotten_missing": 0, "marks": []}
-
-
-def _checksum(state: TrainState) -> int:
-    """CRC-32 of all that a checkpoint holds."""
-    crc = 0
-    for array in flatten(jax.device_get(state)).values():
-        crc = zlib.crc32(np.ascontiguousarray(array).tobytes(), crc)
-    return crc

@@ -7,6 +7,7 @@ finite, `failure/`.
 """
 
 import dataclasses
+import os
 import pathlib
 
 from common.config import RunConfig, run_config_from_json, to_json
@@ -18,8 +19,8 @@ from common.policy.bundle import PolicyBundle
 POLICY_FILE = "policy.safetensors"
 INITIAL_FILE = "initial.safetensors"
 CONFIG_FILE = "config.json"
-VERSION_FILE = "version"
 LOGS = "logs"
+_VERSION_FILE = "version"
 CHANGEABLE = ("updates", "checkpoint_every", "collapse_patience", "physics", "ppo")
 """Fields of the configuration that a run may go on with other values of; actors that are there do not use them."""
 
@@ -77,3 +78,28 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
             )
     if config != before:
         write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
+
+
+def note_version(run_dir: pathlib.Path, version: int) -> None:
+    """Notes the newest version that was published.
+
+    The file is overwritten in place, which needs no space on a disk that is full, and not flushed: this must survive
+    the process, and a power cut costs no more than a version.
+
+    Raises:
+      CongraspError: it could not be written.
+    """
+    path = run_dir / _VERSION_FILE
+    try:
+        with open(os.open(path, os.O_WRONLY | os.O_CREAT, 0o644), "wb", 0) as file:
+            file.write(f"{version:020d}\n".encode())
+    except OSError as error:
+        raise CongraspError(f"{path} could not be written: {error.strerror}.") from None
+
+
+def published_version(run_dir: pathlib.Path) -> int:
+    """The version of `note_version`; -1 if there is none."""
+    try:
+        return int((run_dir / _VERSION_FILE).read_text())
+    except (OSError, ValueError):
+        return -1
