@@ -17,6 +17,8 @@ from common.objects.procedural import PRIMITIVE_FAMILIES
 
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
 """Families that the human hand fails most often to hold by a part; twice as many of them are trained on."""
+SMOOTH_FAMILIES = ("ellipsoid", "teapot", "mug", "cylinder")
+"""Families that Allegro fails most often to hold by a part, likewise."""
 
 PRESETS = {
     # Minutes on two CPU cores; `easier` says what that takes.
@@ -65,11 +67,11 @@ PRESETS = {
 }
 
 
-def _robot(hand: str, *, force_max: float, heading_position: float, p_affordance: float) -> RunConfig:
+def _robot(hand: str, *, force_max: float, heading_position: float, p_affordance: float, **weights: float) -> RunConfig:
     """The human preset for another hand; what differs is what docs/training.md found to help it."""
     human = PRESETS["human"]
     first, ramp = human.task.reward, human.curriculum
-    last = dataclasses.replace(ramp.reward, force_max=force_max, heading_position=heading_position)
+    last = dataclasses.replace(ramp.reward, force_max=force_max, heading_position=heading_position, **weights)
     return dataclasses.replace(
         human,
         name=hand,
@@ -84,8 +86,17 @@ def _robot(hand: str, *, force_max: float, heading_position: float, p_affordance
 
 
 # At 1.4 times the size an object weighs 2.7 times as much, at 1.1 times 1.3 times.
+_ALLEGRO = _robot(
+    "allegro",
+    force_max=12.0,
+    heading_position=30.0,
+    p_affordance=0.8,
+    affordance_distance=0.2,
+    affordance_force=0.4,
+)
+_FAMILIES = PRIMITIVE_FAMILIES + HARD_FAMILIES + SMOOTH_FAMILIES
 PRESETS |= {
-    "allegro": _robot("allegro", force_max=12.0, heading_position=25.0, p_affordance=0.8),
+    "allegro": dataclasses.replace(_ALLEGRO, objects=ObjectsConfig(families=_FAMILIES, count=840)),
     "sharpa": _robot("sharpa", force_max=4.5, heading_position=16.0, p_affordance=0.7),
 }
 
