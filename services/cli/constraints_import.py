@@ -16,6 +16,12 @@ from rich.table import Table
 from common.errors import CongraspError
 
 _console = Console(highlight=False)
+_HOLDS = {
+    "grab": "s1/*.npz and the other subjects",
+    "oakink": "anno/seq_all.json",
+    "dexycb": "<date>-subject-01/<session>/meta.yml",
+    "myohand": "MyoHand_<object>_<action>.npz",
+}
 REPORT = "import.json"
 """File beside the sets that says what became of each sequence."""
 
@@ -65,7 +71,7 @@ class ConstraintsImport:
         if not self.path.exists():
             raise CongraspError(f"There is no file or folder {self.path}.", "Name the data set's folder.")
         if not self.beyond >= 0:
-            raise CongraspError(f"--beyond is {self.beyond}.", "It must not be negative.")
+            raise CongraspError(f"--beyond is {self.beyond}.", "It is in radians, and not negative.")
         hand = get_hand(self.hand)
         options = Options(self.headings, self.affordance, self.beyond, seed=self.seed)
         columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
@@ -78,6 +84,11 @@ class ConstraintsImport:
                 self.format,
                 lambda name: progress.update(task, description=f"Reading {escape(name)}"),
             )
+            if not report.kept and not report.dropped:
+                raise CongraspError(
+                    f"{self.path} holds no sequence of {self.format}.",
+                    f"Name the folder that holds {_HOLDS[self.format]}.",
+                )
             catalogue = Catalogue(self.objects)
             for obj, made in zip(objects, sets, strict=True):
                 catalogue.add(obj)
@@ -121,8 +132,8 @@ def _say(report: Any, hand: str, sets: int, out: pathlib.Path, objects: pathlib.
     if kept:
         above = sum(row["clear_of_table"] for row in kept)
         _console.print(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")
-    _console.print(
-        f"Constraint sets ({sets}) are in {escape(str(out))}, their objects in {escape(str(objects))}; "
-        f"{escape(str(out / REPORT))} says what became of each sequence.",
-        soft_wrap=True,
-    )
+        _console.print(
+            f"Constraint sets ({sets}) are in {escape(str(out))}, their objects in {escape(str(objects))}.",
+            soft_wrap=True,
+        )
+    _console.print(f"{escape(str(out / REPORT))} says what became of each sequence.", soft_wrap=True)

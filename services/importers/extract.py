@@ -220,7 +220,7 @@ def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame:
 def _fit(sequence: Sequence, frame: int) -> Fit:
     if sequence.q is not None:
         return Fit(np.asarray(sequence.q[frame], float), 0.0, 0.0)
-    return fit(HUMAN, sequence.joints[frame])
+    return fit(sequence.joints[frame])
 
 
 def _check_limits(name: str, q: np.ndarray, beyond: float) -> None:

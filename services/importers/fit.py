@@ -1,4 +1,4 @@
-"""Finger angles from joint positions: a captured hand's pose projected onto the joints of one of ours.
+"""Finger angles from joint positions: a captured hand's pose projected onto the joints of the `human` hand.
 
 The two hands have bones of different lengths, so that what is fitted is the direction of every bone, in the wrist
 frame. Four joints of a finger cannot follow three bones exactly; what is left over is reported.
@@ -11,18 +11,16 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands.spec import Hand, Link, link_origin
+from common.hands.human import HUMAN
+from common.hands.spec import link_origin
 from services.importers.sequence import FINGERS
-
-_SYNONYMS = {"little": ("little", "pinky")}
 
 
 class Fit(NamedTuple):
     """Finger angles and what they leave over."""
 
     q: np.ndarray
-    """(F,) rad; may lie outside the hand's limits."""
+    """(20,) rad; may lie outside the hand's limits."""
     angle: float
     """Root mean square angle between the fifteen bones and those of the capture, rad."""
     tip: float
@@ -38,33 +36,20 @@ class _Finger(NamedTuple):
 
 
 @functools.cache
-def _fingers(hand: Hand) -> tuple[_Finger, ...]:
-    links = {link.name: link for link in hand.links}
-    first = {}
-    for link in hand.links:
-        first[link.name] = sum(len(other.joints) for other in hand.links[: hand.links.index(link)])
+def _fingers() -> tuple[_Finger, ...]:
+    names = [joint.name for joint in HUMAN.joints]
     found = []
     for finger in FINGERS:
-        names = _SYNONYMS.get(finger, (finger,))
-        last = next((link for link in hand.links if link.tip and link.name.startswith(names)), None)
-        chain: list[Link] = []
-        while last is not None and last.parent:
-            chain.insert(0, last)
-            last = links[last.parent]
-        if len(chain) != 3:
-            raise CongraspError(
-                f"The hand '{hand.name}' has no {finger} of three bones, so that no human pose fits it.",
-                "Import for the hand 'human', or give this hand headings and affordance alone.",
-            )
+        chain = [link for link in HUMAN.links if link.name.startswith(finger)]
         joints = [joint for link in chain for joint in link.joints]
         moved = np.cumsum([len(link.joints) for link in chain])
         tip = chain[-1].tip
-        assert tip is not None
+        assert len(chain) == 3 and tip is not None
         found.append(
             _Finger(
                 np.array([joint.axis for joint in joints]),
                 np.array([joint.anchor for joint in joints]),
-                first[chain[0].name],
+                names.index(joints[0].name),
                 (*(int(count) for count in moved), int(moved[-1])),
                 np.array([*(link_origin(link) for link in chain), tip]),
             )
@@ -72,30 +57,26 @@ def _fingers(hand: Hand) -> tuple[_Finger, ...]:
     return tuple(found)
 
 
-def joint_positions(hand: Hand, q: np.ndarray) -> np.ndarray:
-    """(..., 5, 4, 3) joints and tips of `FINGERS` in the hand's wrist frame, m, at finger angles q (..., F)."""
-    return np.stack([_points(f, q[..., f.first : f.first + len(f.axes)]) for f in _fingers(hand)], -3)
+def joint_positions(q: np.ndarray) -> np.ndarray:
+    """(..., 5, 4, 3) m, the `human` hand's joints and tips of `FINGERS` at angles q (..., 20), in its wrist frame."""
+    return np.stack([_points(f, q[..., f.first : f.first + len(f.axes)]) for f in _fingers()], -3)
 
 
-def fit(hand: Hand, joints: np.ndarray) -> Fit:
-    """The finger angles whose bones point as those of a capture.
+def fit(joints: np.ndarray) -> Fit:
+    """The `human` hand's finger angles whose bones point as those of a capture.
 
     Args:
-      hand: one with five fingers of three bones.
-      joints: (5, 4, 3) joints and tips of the captured hand, in the hand's wrist frame.
-
-    Raises:
-      CongraspError: the hand has other fingers.
+      joints: (5, 4, 3) m, joints and tips of the captured hand, in the wrist frame.
     """
-    q = np.zeros(len(hand.joints))
-    for finger, wanted in zip(_fingers(hand), _directions(joints), strict=True):
+    q = np.zeros(len(HUMAN.joints))
+    for finger, wanted in zip(_fingers(), _directions(joints), strict=True):
 
         def residual(angles: np.ndarray, finger: _Finger = finger, wanted: np.ndarray = wanted) -> np.ndarray:
             return (_directions(_points(finger, angles)) - wanted).ravel()
 
         q[finger.first :][: len(finger.axes)] = least_squares(residual, np.zeros(len(finger.axes)), method="lm").x
     q = (q + np.pi) % (2 * np.pi) - np.pi
-    reached = joint_positions(hand, q)
+    reached = joint_positions(q)
     cosine = (_directions(reached) * _directions(joints)).sum(-1).clip(-1, 1)
     tips = np.linalg.norm(reached[:, 3] - joints[:, 3], axis=-1)
     return Fit(q, float(np.sqrt((np.arccos(cosine) ** 2).mean())), float(tips.mean()))

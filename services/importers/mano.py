@@ -62,7 +62,7 @@ def skeleton(
     """
     if model is None:
         order = [FINGERS.index(finger) for finger in MANO_FINGERS]
-        rest = joint_positions(HUMAN, np.zeros(len(HUMAN.joints)))[order] @ TO_HUMAN
+        rest = joint_positions(np.zeros(len(HUMAN.joints)))[order] @ TO_HUMAN
         return Skeleton(MEAN_WRIST, rest + MEAN_WRIST)
     joints, tips = model.skeleton(betas)
     if template is not None:

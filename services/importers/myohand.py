@@ -8,14 +8,14 @@ slides are measured from a point above the table's middle.
 """
 
 import pathlib
-import zipfile
 from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands.human import HUMAN
+from common.errors import CongraspError
 from common.hands.mano import ManoModel
+from services.importers.archive import read_archive
 from services.importers.fit import joint_positions
 from services.importers.objects import Meshes
 from services.importers.sequence import Dropped, Sequence
@@ -39,6 +39,8 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None = None) -> 
             yield _sequence(file, meshes)
         except Dropped as dropped:
             yield dropped
+        except CongraspError as error:
+            yield Dropped(file.stem, "unreadable", str(error))
 
 
 def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
@@ -52,11 +54,7 @@ def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
 
 def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     name = file.stem
-    try:
-        with np.load(file, allow_pickle=False) as data:
-            arrays = {key: data[key] for key in _KEYS if key in data}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise Dropped(name, "unreadable", f"the file cannot be read: {error}") from None
+    arrays = read_archive(file)
     for key, width in _KEYS.items():
         if key not in arrays:
             raise Dropped(name, "wrong layout", f"the file has no '{key}'")
@@ -85,7 +83,7 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
         mesh=meshes.find(name, object_name),
         wrist_position=position,
         wrist_rotation=rotation.as_matrix(),
-        joints=joint_positions(HUMAN, robot[:, 9:]),
+        joints=joint_positions(robot[:, 9:]),
         object_position=pose[:, :3] + _OBJECT,
         object_rotation=Rotation.from_quat(pose[:, 3:], scalar_first=True).as_matrix(),
         present=present,

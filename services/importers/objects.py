@@ -37,8 +37,8 @@ class Meshes:
         """
         found = self._look(name, inside)
         if found is None:
-            where = ", ".join(map(str, self.folders)) or "no folder"
-            raise Dropped(sequence, "no mesh", f"there is no mesh of '{name}' in {where} (--meshes)")
+            where = f" in {', '.join(map(str, self.folders))}" if self.folders else ""
+            raise Dropped(sequence, "no mesh", f"there is no mesh of '{name}'{where}: name its folder with --meshes")
         return found
 
     def _look(self, name: str, inside: str) -> pathlib.Path | None:

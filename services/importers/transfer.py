@@ -83,7 +83,7 @@ def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.n
 
 def _centers(demonstrations: Sequence[Demonstration]) -> np.ndarray:
     """(M, 3) m, the human hand's centre in its wrist frame: between the thumb's tip and the mean of the others."""
-    tips = joint_positions(HUMAN, np.stack([d.q for d in demonstrations]))[:, :, 3]
+    tips = joint_positions(np.stack([d.q for d in demonstrations]))[:, :, 3]
     return (tips[:, 0] + tips[:, 1:].mean(1)) / 2
 
 

@@ -72,7 +72,7 @@ def make(name: str, object_name: str, seed: int = 0, *, farthest: float = 0.27, 
     """
     q = q_closed(np.random.default_rng(0))
     rng = np.random.default_rng(seed)
-    tips = joint_positions(HUMAN, q)[:2, 3]
+    tips = joint_positions(q)[:2, 3]
     middle, across = tips.mean(0), tips[1] - tips[0]
     width = float(np.linalg.norm(across))
     # The box's x axis is the pinch; its other edges are shorter than a hand, and any roll about the pinch will do.

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from common.errors import CongraspError
 from services.importers.mano import MEAN_WRIST
 from tests.importers import known
 from tests.mano_file import content, mano_pickle, skeleton
@@ -109,3 +110,8 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
         "box_lefttouch": "no stable contact",
         "cup_lift": "no mesh",
     }
+
+
+def test_a_folder_of_another_kind_is_refused(run_import, tmp_path):
+    with pytest.raises(CongraspError, match=r"holds no sequence of grab\. Name the folder that holds s1/"):
+        run_import("grab", tmp_path)

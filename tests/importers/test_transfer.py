@@ -45,7 +45,7 @@ def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_pa
         tips = np.asarray(keypoints(hand, link_transforms(hand, jnp.asarray(q))))[len(hand.links) :]
         center = (tips[0] + tips[1:].mean(0)) / 2
         human = np.clip(far[-1, 9:] if m else case.q, HUMAN.lower, HUMAN.upper)
-        human_tips = joint_positions(HUMAN, human)[:, 3]
+        human_tips = joint_positions(human)[:, 3]
         position, turns = case.waypoints()
         wanted = scale * (position + turns.apply((human_tips[0] + human_tips[1:].mean(0)) / 2))
         found = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
