@@ -24,6 +24,7 @@ from services.grasping import constraint_sets
 
 ABOVE = "above"
 """The heading straight down, whatever the object's pose."""
+_FAR = 1.0  # m from an object beyond which nobody grasps it
 _NEAR = 0.004  # m from a part within which a point of the surface belongs to it
 
 
@@ -85,11 +86,14 @@ def read_asked(
       CongraspError: something cannot be read or does not fit; the line names it.
     """
     origin = -np.asarray(obj.origin)
+    position = _numbers(at, 3, "--at") - origin if at else None
+    if position is not None:
+        _check_near(obj, position, "--at")
     direction = None if heading in ("", ABOVE) else _unit(_numbers(heading, 3, "--heading"), "--heading")
     return Asked(
         direction=direction,
         above=heading == ABOVE,
-        position=_numbers(at, 3, "--at") - origin if at else None,
+        position=position,
         minus=_minus(obj, affordance, avoid) if affordance or avoid else None,
         pose=_pose(pose, hand, obj, origin) if pose else None,
         trajectory=_trajectory(trajectory, hand, obj, origin, waypoints) if trajectory else None,
@@ -127,6 +131,8 @@ def _minus(obj: GraspObject, affordance: str, avoid: str) -> np.ndarray:
         minus = plus_distance >= _NEAR
     else:
         minus = minus_distance < plus_distance
+    if minus.all() and not affordance:
+        raise CongraspError(f"'{avoid}' is all of '{obj.name}', so that nothing may be touched.", "Avoid a part of it.")
     if minus.all():
         raise CongraspError(
             f"Nothing of '{affordance or avoid}' lies on the surface of '{obj.name}'.",
@@ -135,6 +141,15 @@ def _minus(obj: GraspObject, affordance: str, avoid: str) -> np.ndarray:
     if not minus.any():
         raise CongraspError(f"'{affordance or avoid}' leaves no difference: all of '{obj.name}' may be touched.")
     return minus
+
+
+def _check_near(obj: GraspObject, position: np.ndarray, what: str) -> None:
+    """Raises a CongraspError if a place (3,), object frame, is so far off that its unit must be another."""
+    away = float(np.linalg.norm(obj.points - position, axis=-1).min())
+    if away > _FAR:
+        raise CongraspError(
+            f"{what} lies {away:.3g} m from '{obj.name}'.", "Give metres, in the axes and with the origin of its file."
+        )
 
 
 def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
@@ -185,6 +200,9 @@ def _pose(text: str, hand: Hand, obj: GraspObject, origin: np.ndarray) -> Refere
         joints = [joints.get(name, 0.0) for name in names]
     q = _floats(joints, (len(names),), f"--pose: 'joints' of {path}")
     position = _floats(given["position"], (3,), f"--pose: 'position' of {path}") - origin
+    _check_near(obj, position, f"--pose: the wrist of {path}")
+    if np.abs(q).max() > 2 * np.pi:
+        raise CongraspError(f"--pose: a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians.")
     turn = _unit(_floats(given["quaternion"], (4,), f"--pose: 'quaternion' of {path}"), "--pose: the quaternion")
     return Reference(np.clip(q, hand.lower, hand.upper), position, turn)
 
@@ -215,6 +233,7 @@ def _trajectory(
         count = len(given["position"]) if isinstance(given["position"], list) else 0
         position = _floats(given["position"], (count, 3), f"--trajectory: 'position' of {path}")
         quaternion = _floats(given["quaternion"], (count, 4), f"--trajectory: 'quaternion' of {path}")
+    _check_near(obj, position[-1] - origin, f"--trajectory: the end of {path}")
     return _resampled(position - origin, quaternion, waypoints, str(path))
 
 

@@ -42,6 +42,8 @@ def test_headings_are_numbers_or_a_word(block):
     np.testing.assert_allclose(given.direction, [0, 0, -1])
     np.testing.assert_allclose(given.position, [0, 0, 0.04], atol=1e-6)
     assert asked(block, heading="above").above and asked(block, heading="above").direction is None
+    with pytest.raises(CongraspError, match=r"--at lies 39.* m from 'block'"):
+        asked(block, at="0 0 40")
     for text, complaint in (("down", "'down', not 3 numbers"), ("1 2", "'1 2', not 3"), ("0 0 0", "has no direction")):
         with pytest.raises(CongraspError, match=complaint):
             asked(block, heading=text)
@@ -102,6 +104,8 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
         ("{}", "lacks 'joints'"),
         ('{"joints": {"elbow": 1}, "position": [0,0,0], "quaternion": [1,0,0,0]}', "has no joint 'elbow'"),
         ('{"joints": {}, "position": [0,0], "quaternion": [1,0,0,0]}', "'position' of .* must be 3 finite"),
+        ('{"joints": {}, "position": [0,0,500], "quaternion": [1,0,0,0]}', "the wrist of .* lies 5.* m from 'block'"),
+        ('{"joints": {"index_pip": 45}, "position": [0,0,0], "quaternion": [1,0,0,0]}', "is at 45. Angles are in rad"),
         ('{"joints": {}, "position": [0,0,0], "quaternion": [0,0,0,0]}', "quaternion has no direction"),
     ],
 )
@@ -116,6 +120,9 @@ def test_what_is_wrong_with_a_trajectory_is_said(block, tmp_path):
     path = tmp_path / "path.csv"
     path.write_text("0,0,0,1,0,0,0\n0,0,0,1,0,0,0\n")
     with pytest.raises(CongraspError, match="wrist does not move"):
+        asked(block, trajectory=str(path))
+    path.write_text("0,0,300,1,0,0,0\n0,0,200,1,0,0,0\n")
+    with pytest.raises(CongraspError, match=r"the end of .* lies 2.* m from 'block'. Give metres"):
         asked(block, trajectory=str(path))
     path.write_text("0,0,0\n0,0,1\n")
     with pytest.raises(CongraspError, match="must be 2 x 7 finite numbers"):
