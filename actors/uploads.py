@@ -1,0 +1,219 @@
+"""Rollouts on their way to the learner: each is sent until it has an outcome, and kept for the learner's next life.
+
+A learner that is killed takes with it what it had accepted since its last checkpoint. So accepted rollouts are kept, a
+few in all: those that are fresh, and those that will be when the learner goes on from that checkpoint. Its next life is
+sent them again; what it has after all is a duplicate to it.
+"""
+
+import itertools
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any, Literal, NamedTuple
+
+from common.errors import CongraspError, TransportError
+from common.journal import Journal
+from common.transport.base import RefusedError, Transport
+from common.wire.codec import Message
+
+Outcome = Literal["accepted", "duplicate", "stale", "refused"]
+"""What became of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""
+_BACKOFF = (0.1, 0.5)  # first and longest pause between two attempts, s
+_SLOWEST = 100e3  # bytes a second of a link that is waited for
+
+
+class _Upload(NamedTuple):
+    message: Message
+    outcome: "Future[Outcome] | None"
+    """None for one that is sent again."""
+
+
+class Uploads:
+    """Threads that send rollouts.
+
+    Attributes:
+      failure: why nothing is sent any more, if that is so; also set by the owner.
+      free: acquired by the owner for each rollout that it hands over; released when that one has its outcome.
+      closed: set once no more is sent.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        key: str,
+        hear: Callable[[Mapping[str, Any]], None],
+        *,
+        window: int,
+        max_refusals: int,
+        request_timeout: float,
+        patience: float,
+        keep: bool,
+        journal: Journal | None,
+    ):
+        """Starts the threads.
+
+        Args:
+          transport: a connected transport.
+          key: what rollouts are sent to.
+          hear: given what every answer says about the learner.
+          window: rollouts on their way at a time.
+          max_refusals: rollouts refused in a row after which nothing more is sent.
+          request_timeout: seconds that sending may take, and more by the rollout's size.
+          patience: seconds without any answer after which the learner is given up.
+          keep: keep accepted rollouts for a learner's next life.
+          journal: where each answer is written down.
+        """
+        self.failure: CongraspError | None = None
+        self.free = threading.Semaphore(window)
+        self.closed = threading.Event()
+        self._transport, self._key, self._hear = transport, key, hear
+        self._max_refusals, self._timeout, self._patience = max_refusals, request_timeout, patience
+        self._keep, self._journal = keep, journal
+        self._refusals = 0
+        self._queue: queue.SimpleQueue[_Upload | None] = queue.SimpleQueue()
+        self._pending: set[Future[Outcome]] = set()
+        self._lock = threading.Lock()  # of the next two
+        self._kept: dict[int, Message] = {}
+        self._owed = 0
+        for index in range(window):
+            threading.Thread(target=self._send_all, daemon=True, name=f"upload-{index}").start()
+
+    @property
+    def owed(self) -> int:
+        """Rollouts that are being sent again."""
+        return self._owed
+
+    def put(self, message: Message) -> "Future[Outcome]":
+        """Sends a rollout in the background; returns its outcome to be."""
+        outcome = Future[Outcome]()
+        self._pending.add(outcome)
+        outcome.add_done_callback(self._pending.discard)
+        self._queue.put(_Upload(message, outcome))
+        return outcome
+
+    def send_again(self) -> None:
+        """Sends what is kept to another life of the learner."""
+        with self._lock:
+            for message in self._kept.values():
+                self._owed += 1
+                self._queue.put(_Upload(message, None))
+            self._kept.clear()
+
+    def forget(self, oldest: int, saved: tuple[int, int]) -> None:
+        """Keeps no longer what no life of the learner can use: versions before `oldest`, but for those of `saved`."""
+        first, last = saved
+        with self._lock:
+            self._kept = {
+                sequence: kept
+                for sequence, kept in self._kept.items()
+                if kept.meta["version"] >= oldest or first <= kept.meta["version"] <= last
+            }
+
+    def start_over(self) -> None:
+        """Forgets failure and refusals."""
+        self.failure, self._refusals = None, 0
+
+    def wait(self, timeout: float) -> bool:
+        """Waits until every rollout has its outcome; False if that takes longer than `timeout` seconds."""
+        deadline = time.monotonic() + timeout
+        for outcome in list(self._pending):
+            try:
+                outcome.exception(max(0.0, deadline - time.monotonic()))
+            except TimeoutError:
+                return False
+        return True
+
+    def close(self) -> None:
+        """Stops sending; what has no outcome yet is given up."""
+        self.closed.set()
+        self._queue.put(None)
+
+    def _send_all(self) -> None:
+        while (upload := self._queue.get()) is not None:
+            outcome = upload.outcome or Future[Outcome]()
+            try:
+                outcome.set_result(self._deliver(upload.message))
+            except CongraspError as error:
+                self.failure = self.failure or error
+                outcome.set_exception(error)
+            except Exception as error:  # an answer that is none: the thread must not die in silence
+                self.failure = CongraspError(f"The learner's answer cannot be understood: {error!r}.")
+                outcome.set_exception(self.failure)
+            finally:
+                if upload.outcome is None:
+                    with self._lock:
+                        self._owed -= 1
+                else:
+                    self.free.release()
+        self._queue.put(None)
+
+    def _deliver(self, message: Message) -> Outcome:
+        """Sends one rollout until it has an outcome."""
+        answered = time.monotonic()
+        damaged = 0
+        # To send again what is still on its way would only fill a slow link; a dead one ends the query by itself.
+        timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience)
+        waits = pauses()
+        while not self.closed.is_set():
+            pause = next(waits)
+            try:
+                reply = self._transport.query(self._key, message, timeout=timeout)
+            except RefusedError as error:  # it arrived damaged, or the learner failed on it
+                damaged += 1
+                answered = time.monotonic()
+                if damaged >= self._max_refusals:
+                    return self._refused(str(error))
+            except TransportError as error:
+                despair(answered, self._patience, error)
+            else:
+                answered = time.monotonic()
+                self._hear(reply.meta)
+                if self.failure:
+                    raise self.failure
+                outcome = reply.meta["outcome"]
+                if outcome != "retry" and self._journal is not None:
+                    self._journal.write(answer=message.meta["sequence"], outcome=outcome, life=reply.meta["life"])
+                if outcome == "refused":
+                    return self._refused(str(reply.meta["why"]))
+                if outcome != "retry":
+                    self._refusals = 0
+                    if self._keep and outcome != "stale":
+                        with self._lock:
+                            self._kept[message.meta["sequence"]] = Message(message.arrays, message.meta)
+                    return outcome
+                waits = pauses()
+                pause = float(reply.meta["retry_after"])
+            self.closed.wait(pause)
+        raise TransportError("The link was closed before the rollout was acknowledged.")
+
+    def _refused(self, why: str) -> Outcome:
+        self._refusals += 1
+        if self._refusals >= self._max_refusals:
+            self.failure = CongraspError(
+                f"The learner refused {self._refusals} rollouts in a row: {why}",
+                "Start the actor with the version of congrasp that the learner has.",
+            )
+        return "refused"
+
+
+def despair(answered: float, patience: float, error: TransportError) -> None:
+    """Gives the learner up if its last answer was too long ago.
+
+    Args:
+      answered: when that was, on the monotonic clock.
+      patience: seconds after which it was too long ago.
+      error: what came instead of an answer.
+    """
+    if time.monotonic() - answered > patience:
+        raise TransportError(
+            f"The learner has not answered for {patience:g} s: {error}", "Start the actor again later."
+        ) from None
+
+
+def pauses() -> "itertools.chain[float]":
+    """Seconds to wait after the first, second, ... failed attempt."""
+    first, longest = _BACKOFF
+    growing: Callable[[int], float] = lambda index: min(longest, first * 2**index)  # noqa: E731
+    return itertools.chain(map(growing, range(10)), itertools.repeat(longest))
