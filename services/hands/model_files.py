@@ -64,6 +64,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     palm = _palm(model, choices.palm)
     bodies = _bodies(model, palm)
     links = _links(model, data, palm, bodies, notes)
+    notes += _remarks(model, palm, bodies)
     tips = [link.name for link in links if link.tip is not None]
     if len(tips) < 2:
         raise CongraspError(
@@ -185,6 +186,7 @@ def _bodies(model: mujoco.MjModel, palm: int) -> dict[int, list[int]]:
 def _links(
     model: mujoco.MjModel, data: mujoco.MjData, palm: int, groups: dict[int, list[int]], notes: list[str]
 ) -> list[Link]:
+    """The links, in the palm's frame at zero, from the bodies of each (`_bodies`); `notes` says what is proposed."""
     turn, origin = data.xmat[palm].reshape(3, 3), data.xpos[palm]
     owner = {body: moved for moved, group in groups.items() for body in group}
     names = {moved: "palm" if moved == palm else _name(model, moved) for moved in groups}
@@ -223,15 +225,25 @@ def _links(
             notes.append(f"'{names[moved]}' has no mass: 1 g")
     if bare:
         notes.append(f"no geometry: {', '.join(bare)}")
-    hinges = [j for moved in groups if moved != palm for j in _hinges(model, moved)]
-    if limitless := [_joint_name(model, j) for j in hinges if not _motor(model, j)[1]]:
-        notes.append(f"no torque limit, {TORQUE:g} N.m is proposed: {', '.join(limitless)}")
-    if model.neq:
-        notes.append(f"{model.neq} couplings between joints are left out: every joint has its own motor here")
     return links
 
 
+def _remarks(model: mujoco.MjModel, palm: int, groups: dict[int, list[int]]) -> list[str]:
+    """What the file does not say of its joints, and what of it is left out."""
+    found = []
+    hinges = [j for moved in groups if moved != palm for j in _hinges(model, moved)]
+    if limitless := [_joint_name(model, j) for j in hinges if not _motor(model, j)[1]]:
+        found.append(f"no torque limit, {TORQUE:g} N.m is proposed: {', '.join(limitless)}")
+    if model.neq:
+        found.append(f"{model.neq} couplings between joints are left out: every joint has its own motor here")
+    return found
+
+
 def _joint(model: mujoco.MjModel, data: mujoco.MjData, j: int, turn: np.ndarray, origin: np.ndarray) -> Joint:
+    """A hinge in the palm's frame, which `turn` (3, 3) brings to the world and whose origin lies at `origin` (3,) m.
+
+    Without a gain of the file kp gives all the torque at `_REACH`, and kv is 1.4 sqrt(kp I) with the joint's inertia I.
+    """
     name = _joint_name(model, j)
     if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
         raise CongraspError(f"The joint '{name}' is not a hinge.", "Hands of hinges alone can be imported.")
