@@ -18,6 +18,7 @@ from actors.physics.readout import diverged, readout
 from actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, addresses
 from actors.physics.slots import Pool
 from common.config import TaskConfig
+from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.task.types import CONTACTS_PER_LINK, Array
@@ -56,7 +57,15 @@ class MjxPhysics:
           task: timing and collision settings.
           objects: the pool that `World.object_index` points into.
           implementation: `warp` or `jax`.
+
+        Raises:
+          CongraspError: MJX-JAX is to simulate collisions between the hand's links.
         """
+        if implementation == "jax" and task.hand_self_collision:
+            raise CongraspError(
+                "The engine 'jax' has no contacts between the links of a hand (--task.hand-self-collision).",
+                "Take --physics native or warp.",
+            )
         self.name: str = implementation
         self._task = task
         self._pool = pool = Pool(hand, task, objects)

@@ -35,7 +35,7 @@ class ConstraintsGenerate:
     first_seed: int = 0
     """Seed of the first of them; the others follow."""
     hand: str = "human"
-    """Name of the hand."""
+    """Name of the hand, or its file."""
     references: Literal["closed", "policy"] = "closed"
     """closed: poses that close the hand around the object; policy: final states of a policy's grasps under headings, as
     in the paper. Places that the policy does not fill are not allowed."""
@@ -64,14 +64,14 @@ class ConstraintsGenerate:
             status.update("Making constraints")
             task, taskset = TaskConfig(hand=hand.name), None
             if self.references == "policy":
-                taskset = self._grasped(objects, lambda text: status.update(f"Grasping: {text}"))
+                taskset = self._grasped(hand.name, objects, lambda text: status.update(f"Grasping: {text}"))
             for constraints in make_sets(hand, task, objects, self.seed, taskset):
                 save(constraints, self.out)
         what = "The constraint set of 1 object is" if len(objects) == 1 else f"The sets of {len(objects)} objects are"
         _console.print(f"{what} in {escape(str(self.out))}.", soft_wrap=True)
         return 0
 
-    def _grasped(self, objects: list[GraspObject], progress: Callable[[str], None]) -> Any:
+    def _grasped(self, hand: str, objects: list[GraspObject], progress: Callable[[str], None]) -> Any:
         """The task set with references from a policy's grasps; says how many there are."""
         import os
 
@@ -80,8 +80,11 @@ class ConstraintsGenerate:
         from services.evaluation.evaluate import Evaluator
 
         bundle = bundles.load(policy_file(self.policy, self.hand))
-        if bundle.spec.hand != self.hand:
-            raise CongraspError(f"The policy is for the hand '{bundle.spec.hand}'.", f"Set --hand {bundle.spec.hand}.")
+        if bundle.spec.hand_name != hand:
+            raise CongraspError(
+                f"The policy is for the hand '{bundle.spec.hand_name}', not '{hand}'.",
+                f"Set --hand {bundle.spec.hand_name}.",
+            )
         evaluator = Evaluator(bundle, objects, threads=os.cpu_count() or 1, seed=self.seed)
         said = ""
 

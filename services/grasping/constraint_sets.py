@@ -117,6 +117,7 @@ def set_of(hand: Hand, row: TaskSet, obj: GraspObject, seed: int, about: dict[st
         "kind": "constraints",
         "format": _FORMAT,
         "hand": hand.name,
+        "hand_reference": hand.reference,
         "object": obj.name,
         "object_digest": store.digest(obj),
         "object_scale": 1.0,

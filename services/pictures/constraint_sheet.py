@@ -40,7 +40,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
     rng = np.random.default_rng(seed)
     place = arrays["rest"][rest]
     turn = Rotation.from_quat(place[3:], scalar_first=True)
-    hand = get_hand(meta["hand"])
+    hand = get_hand(meta.get("hand_reference", meta["hand"]))
 
     def some(which: np.ndarray, count: int) -> np.ndarray:
         found = np.flatnonzero(which)

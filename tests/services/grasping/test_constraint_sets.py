@@ -39,6 +39,7 @@ def test_every_array_is_explained_and_has_the_shape_that_is_written_down(sets):
             assert len(letters) == arrays[name].ndim, name
             for letter, size in zip(letters, arrays[name].shape, strict=True):
                 assert size == (int(letter) if letter.isdigit() else sizes.setdefault(letter, size)), name
+        assert get_hand(meta["hand_reference"]) is HAND
         assert meta["finger_joints"][0] == HAND.joints[0].name and meta["quaternions"] == "(w, x, y, z)"
 
 
