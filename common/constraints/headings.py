@@ -42,6 +42,7 @@ def sample_headings(
     rng: np.random.Generator,
     *,
     use_affordance: bool,
+    lenient: bool = False,
     count: int = COUNT,
     cone: float = np.radians(30),
     inward: float = INWARD,
@@ -71,6 +72,8 @@ def sample_headings(
       obj: the object.
       rng: random generator.
       use_affordance: restricts the headings to O+.
+      lenient: where no candidate is left because fingers that close on O+ meet O-, such as on a small handle, takes
+        those whose approach keeps away from O-.
       count: number of headings H.
       cone: half angle of the cone around the inward normal, rad.
       inward: metres from the surface point to the heading position.
@@ -111,8 +114,13 @@ def sample_headings(
         if total >= count:
             break
     if total == 0 and minus.any():
-        return None
-    if total == 0:
+        if not (lenient and clean):
+            return None
+        bare = points[~minus]
+        position, direction = position[:clean], direction[:clean]
+        cross, _ = _roll(bare, np.zeros(len(bare), bool), position, direction, rng)
+        found.append(Headings(position, direction, cross))
+    elif total == 0:
         cross, width = _roll(points, minus, position, direction, rng)
         # Faults count whole numbers and a width in metres less than one: together they sort in the right order.
         best = (faults + width).argsort(kind="stable")[: _BATCH // 16]

@@ -60,6 +60,8 @@ _SCALES = {
 strongest link's force (N), and the object's way after it went (m)."""
 _UNLIKELY = 0.5
 """What each likelier resting pose weighs against a grasp, likewise."""
+_TOUCHED = 0.2
+"""Share of touches on what must not be touched from which others are tried."""
 _CLEARANCE, _STEEPEST_UP = 0.02, 0.1  # of a wrist over the table, m, and of an approach that rises
 
 Progress = Callable[[str, int, int], None]
@@ -160,11 +162,14 @@ class Grasper:
             _check_aligned(outcome)
             cost = (costs(outcome, _active(asked)) + _UNLIKELY * rests)[:different]
             tried += different
-            held += int(outcome.metrics["held"][:different].sum())
+            holds = outcome.metrics["held"][:different] > 0
+            held += int(holds.sum())
+            if asked.minus is not None:  # one that holds it by what must not be touched is not what was asked for
+                holds &= outcome.metrics["affordance_ratio"][:different] < _TOUCHED
             index = int(cost.argmin())
             if best is None or cost[index] < best[0]:
                 best = (float(cost[index]), outcome, index, int(rests[index]))
-            if held or asked.pose or asked.trajectory:
+            if holds.any() or asked.pose or asked.trajectory:
                 break
         assert best is not None
         _, outcome, index, rest = best
@@ -333,11 +338,14 @@ def _headings(
 
     Likelier resting poses are tried more often.
     """
-    found = sample_headings(obj, rng, use_affordance=asked.minus is not None, along=asked.direction, at=asked.position)
+    restricted = asked.minus is not None
+    found = sample_headings(obj, rng, use_affordance=restricted, lenient=True, along=asked.direction, at=asked.position)
     if found is None:
         raise CongraspError(
             f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
-            "Make the graspable part larger, or leave the heading free.",
+            "Make the graspable part larger."
+            if asked.direction is None and asked.position is None
+            else "Leave out --heading and --at, or make the graspable part larger.",
         )
     options, weights = [], []
     for r, rest in enumerate(obj.rest_poses):

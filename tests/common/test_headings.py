@@ -135,6 +135,19 @@ def test_the_smaller_part_of_a_ball_cannot_be_held_alone():
         assert (sample_headings(capped, np.random.default_rng(0), use_affordance=True) is not None) is held
 
 
+def test_a_part_that_cannot_be_held_alone_is_approached_if_that_is_wished():
+    block = generate(0, "box")
+    outer = np.flatnonzero(block.points[:, 2] > block.points[:, 2].max() - 0.004)  # one face: fingers meet the sides
+    labels = np.ones(len(block.points), np.int32)
+    labels[outer] = 0
+    spot = dataclasses.replace(block, labels=labels, graspable=np.array([True, False]))
+    assert sample_headings(spot, np.random.default_rng(0), use_affordance=True) is None
+    headings = sample_headings(spot, np.random.default_rng(0), use_affordance=True, lenient=True)
+    away = np.linalg.norm(block.points[None] - headings.position[:, None], axis=-1)
+    assert (away[:, labels == 0].min(-1) < away[:, labels == 1].min(-1)).all()
+    np.testing.assert_allclose((headings.direction * headings.cross).sum(-1), 0, atol=1e-5)
+
+
 def test_an_object_without_o_plus_still_gets_headings():
     obj = generate(0, "box")
     barren = dataclasses.replace(obj, graspable=np.zeros(2, bool))
