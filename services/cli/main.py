@@ -45,6 +45,8 @@ COMMANDS = {
 """Commands in the order of the help; `services.cli.<name>` is the module."""
 
 USAGE_ERROR = 2
+UNREAD = 128 + signal.SIGPIPE
+"""The reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXTRAS = {
@@ -66,6 +68,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = run(arguments)
     except CongraspError as error:
         code = _complain(str(error), error.exit_code, debug)
+    except BrokenPipeError:
+        if _last_words(sys.stdout, "\n"):  # it is another pipe that broke
+            raise
+        code = UNREAD
     except OSError as error:
         if error.errno not in _FULL:
             raise
@@ -188,13 +194,15 @@ def _complain(text: str, code: int, debug: bool) -> int:
     return code
 
 
-def _last_words(stream: TextIO, text: str = "") -> None:
-    """Writes and flushes; a log on a full disk must not turn the exit code into another."""
+def _last_words(stream: TextIO, text: str = "") -> bool:
+    """Writes and flushes, if that is possible; a log on a full disk must not turn the exit code into another."""
     try:
         stream.write(text)
         stream.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return False
+    return True
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import errno
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -83,6 +84,15 @@ def test_a_log_on_a_full_disk_does_not_change_the_exit_code():
     command = [sys.executable, "-m", "services.cli.main", "levitate"]
     with open("/dev/full", "wb") as full:
         assert subprocess.run(command, stdout=full, stderr=full, timeout=60, check=False).returncode == 2
+
+
+def test_a_reader_that_is_gone_is_no_error():
+    reader, writer = os.pipe()
+    os.close(reader)  # as `head` does when it has read enough
+    command = [sys.executable, "-m", "services.cli.main", "hands", "list", "--help"]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    os.close(writer)
+    assert done.stderr == "" and done.returncode in (0, 128 + signal.SIGPIPE)
 
 
 def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path):
