@@ -23,11 +23,6 @@ TRAJECTORY = (0.3, 0.03)
 TOUCH = 0.05
 """Newtons from which a link counts as touching."""
 
-_PLAYED = (
-    *("link_position", "link_quaternion", "object_position", "object_quaternion", "contact_force", "table"),
-    *("visual_vertices", "visual_faces", "surface_points", "surface_minus"),
-)
-
 
 class Lane(NamedTuple):
     """One constraint over T steps."""

@@ -93,12 +93,4 @@ export function onPlane(ray, point, normal) {
   return along > 0 ? add(ray.origin, scale(ray.direction, along)) : null;
 }
 
-// The point of a line (through `point` along the unit vector `axis`) that is nearest to a ray.
-export function alongLine(ray, point, axis) {
-  const off = sub(point, ray.origin);
-  const b = dot(axis, ray.direction);
-  const share = (b * dot(off, ray.direction) - dot(off, axis)) / Math.max(1e-6, 1 - b * b);
-  return add(point, scale(axis, share));
-}
-
 export const distance = (a, b) => norm(sub(a, b));

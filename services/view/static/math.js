@@ -23,12 +23,6 @@ export function rotate(q, v) {
 
 export const conjugate = (q) => [q[0], -q[1], -q[2], -q[3]];
 
-// The vector turned by an angle around a unit axis.
-export function turnAround(axis, angle, v) {
-  const half = angle / 2;
-  return rotate([Math.cos(half), ...scale(axis, Math.sin(half))], v);
-}
-
 // Between two orientations, the short way.
 export function blend(a, b, s) {
   const near = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0 ? b.map((x) => -x) : b;

@@ -8,7 +8,7 @@ const ROW = 22;
 
 const UNITS = { rad: (x) => `${((x * 180) / Math.PI).toFixed(0)}°`, m: (x) => `${(100 * x).toFixed(1)} cm` };
 
-export function worded(errors, step) {
+function worded(errors, step) {
   return Object.entries(errors)
     .map(([unit, values]) => (UNITS[unit] ? UNITS[unit](values[step]) : `${values[step].toFixed(0)} ${unit}`))
     .join(", ");

@@ -6,7 +6,7 @@ const KINDS = {
 };
 
 // {arrays: {name: {shape, data}}, meta} of a message's bytes.
-export function decode(buffer) {
+function decode(buffer) {
   const length = Number(new DataView(buffer).getBigUint64(0, true));
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, length)));
   const arrays = {};
