@@ -19,14 +19,10 @@ import numpy as np
 from actors.episode import episode_message
 from actors.rollout import Trace, goal_of_world
 from actors.trials import Beginnings, Outcome, Trials
-from common import rotations
 from common.constraints.contradictions import Wishes, contradictions
-from common.constraints.headings import above, clear_table, feasible, sample_headings
 from common.constraints.priority import Request, explain
 from common.errors import CongraspError
 from common.hands import get_hand
-from common.hands.kinematics import grasp_frame
-from common.hands.spec import Hand
 from common.logs.motion import GraspMotion, motion_of_episode
 from common.objects.meshes import ImportOptions
 from common.objects.spec import GraspObject
@@ -36,6 +32,7 @@ from common.policy.shipped import policy_file
 from common.task.types import MASKS, Goal, Surface
 from common.wire.codec import Message
 from services.grasping.asked import Asked, read_asked
+from services.grasping.beginnings import headings, valid_rests
 from services.grasping.objects import one_object
 
 TRIES = 16
@@ -62,7 +59,6 @@ _UNLIKELY = 0.5
 """What each likelier resting pose weighs against a grasp, likewise."""
 _TOUCHED = 0.2
 """Share of touches on what must not be touched from which others are tried."""
-_CLEARANCE, _STEEPEST_UP = 0.02, 0.1  # of a wrist over the table, m, and of an approach that rises
 
 Progress = Callable[[str, int, int], None]
 """Told what is done, how much of it, and of how much."""
@@ -185,9 +181,9 @@ class Grasper:
         """Tries under the constraints, (B,) the resting pose of each, and how many of them are different."""
         batch, points = self._tries, self.task.surface_points
         labelled = obj if asked.minus is None else with_minus(obj, asked.minus)
-        reference = _valid_rests(self.hand, obj, asked) if asked.pose or asked.trajectory else None
+        reference = valid_rests(self.hand, obj, asked) if asked.pose or asked.trajectory else None
         if reference is None:
-            position, direction, cross, rests = _headings(labelled, asked, batch, self.task.back_off, rng)
+            position, direction, cross, rests = headings(labelled, asked, batch, self.task.back_off, rng)
         else:
             rests = np.resize(reference, batch)
             position, cross = np.zeros((batch, 3)), np.tile([1.0, 0.0, 0.0], (batch, 1))
@@ -329,73 +325,3 @@ def _check_aligned(outcome: Outcome) -> None:
             "The trajectory ends nearer to what must not be touched than to what may be grasped.",
             "Let it end at the graspable part, or leave out --affordance and --avoid.",
         )
-
-
-def _headings(
-    obj: GraspObject, asked: Asked, batch: int, back_off: float, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of tries that the table leaves room for.
-
-    Likelier resting poses are tried more often.
-    """
-    restricted = asked.minus is not None
-    found = sample_headings(obj, rng, use_affordance=restricted, lenient=True, along=asked.direction, at=asked.position)
-    if found is None:
-        raise CongraspError(
-            f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
-            "Make the graspable part larger."
-            if asked.direction is None and asked.position is None
-            else "Leave out --heading and --at, or make the graspable part larger.",
-        )
-    options, weights = [], []
-    for r, rest in enumerate(obj.rest_poses):
-        cleared = clear_table(found, rest)
-        room = feasible(cleared, rest, back_off=back_off)
-        if asked.above:
-            room &= above(cleared, rest)
-        for h in np.flatnonzero(room):
-            options.append((r, cleared.position[h], found.direction[h], found.cross[h]))
-        weights += [1.0 / ((r + 1) * max(room.sum(), 1))] * int(room.sum())
-    if not options:
-        raise CongraspError(*_no_room(obj, asked))
-    shares = np.array(weights) / np.sum(weights)
-    chosen = rng.choice(len(options), batch, replace=len(options) < batch, p=shares)
-    rests, positions, directions, crosses = zip(*(options[i] for i in chosen), strict=True)
-    return np.array(positions), np.array(directions), np.array(crosses), np.array(rests)
-
-
-def _no_room(obj: GraspObject, asked: Asked) -> tuple[str, str]:
-    if asked.direction is None:
-        return (
-            f"'{obj.name}' cannot be approached in any of its resting poses.",
-            "Scale it so that some part is narrower than 12 cm, or leave out --above and --at.",
-        )
-    down = -_matrix(obj.rest_poses[0][3:])[2]
-    return (
-        "The hand would have to come through the table, however the object lies.",
-        f'In its likeliest pose straight down is --heading "{" ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)}".',
-    )
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation of a quaternion (4,)."""
-    return np.asarray(rotations.to_matrix(np.asarray(quaternion, np.float32)))
-
-
-def _valid_rests(hand: Hand, obj: GraspObject, asked: Asked) -> np.ndarray:
-    """Resting poses in which a reference pose or trajectory stays over the table and does not come from below."""
-    if asked.trajectory is not None:
-        path, turn = asked.trajectory[0], asked.trajectory[1][-1]
-    else:
-        assert asked.pose is not None
-        path, turn = asked.pose.position[None], asked.pose.quaternion
-    heading = _matrix(turn) @ grasp_frame(hand).heading
-    up = np.array([_matrix(rest[3:])[2] for rest in obj.rest_poses])
-    lowest = (up @ path.T).min(-1) + obj.rest_poses[:, 2]
-    valid = np.flatnonzero((lowest > _CLEARANCE) & (up @ heading < _STEEPEST_UP))
-    if not len(valid):
-        raise CongraspError(
-            f"With this reference the hand would be in the table in every resting pose of '{obj.name}'.",
-            "Its wrist must stay 2 cm over the table, and the hand come from above or level.",
-        )
-    return valid
