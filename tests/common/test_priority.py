@@ -16,7 +16,7 @@ def _resolve(affordance: bool, pose: bool, trajectory: bool, seed: int = 0, **go
     return asked._replace(**goal), surface, resolve(HAND, surface, Request(asked._replace(**goal), *flags))
 
 
-@pytest.mark.parametrize(("affordance", "pose", "trajectory"), itertools.product([False, True], repeat=3))
+@pytest.mark.parametrize(("affordance", "pose", "trajectory"), list(itertools.product([False, True], repeat=3)))
 def test_truth_table(affordance, pose, trajectory):
     _, _, done = _resolve(affordance, pose, trajectory)
     expected = [affordance and not pose, pose, pose and not trajectory, trajectory]
