@@ -3,7 +3,7 @@
 import collections
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from typing import Protocol, Self
 
@@ -18,6 +18,13 @@ Damage = Callable[[str, CongraspError], None]
 """(key, what is wrong): a request arrived that could not be decoded."""
 Turnstile = Callable[[str], Message | None]
 """key -> the reply with which a request is turned away before anyone looks at it, or None to let it pass."""
+
+
+def join(threads: Iterable[threading.Thread], deadline: float) -> None:
+    """Waits for threads, but this one, until `deadline` on the monotonic clock."""
+    for thread in threads:
+        if thread is not threading.current_thread():
+            thread.join(max(0.0, deadline - time.monotonic()))
 
 
 class RefusedError(TransportError):

@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from typing import NamedTuple, Self
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Answerer, Damage, RefusedError, Subscription, Turnstile
+from common.transport.base import Answerer, Damage, RefusedError, Subscription, Turnstile, join
 from common.transport.keys import matches
 from common.wire.codec import Message
 
@@ -171,10 +171,7 @@ class MemoryTransport:
             _refuse_waiting(server)
         for subscription in self._subscriptions:
             subscription.close()
-        deadline = time.monotonic() + _GRACE
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(max(0.0, deadline - time.monotonic()))
+        join(self._threads, time.monotonic() + _GRACE)
 
     def __enter__(self) -> Self:
         return self

@@ -25,7 +25,7 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Answerer, Damage, RefusedError, Subscription, Turnstile
+from common.transport.base import Answerer, Damage, RefusedError, Subscription, Turnstile, join
 from common.transport.keys import FLOWS, Flow, flow
 from common.transport.security import Credentials, refusal, secured
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
@@ -250,9 +250,7 @@ class _Work:
                 self.start(session.close)
             except RuntimeError:  # the interpreter is ending and starts no threads
                 session.close()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(max(0.0, deadline - time.monotonic()))
+        join(self._threads, deadline)
         with self._changed:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
