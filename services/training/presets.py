@@ -67,11 +67,16 @@ PRESETS = {
 }
 
 
-def _robot(hand: str, *, force_max: float, heading_position: float, p_affordance: float, **weights: float) -> RunConfig:
-    """The human preset for another hand; what differs is what docs/training.md found to help it."""
+def _robot(
+    hand: str, *, force_max: float, p_affordance: float, objects: ObjectsConfig | None = None, **weights: float
+) -> RunConfig:
+    """The human preset for another hand; what differs is what docs/training.md found to help it.
+
+    `weights` are those of the reward at the end of the ramp.
+    """
     human = PRESETS["human"]
     first, ramp = human.task.reward, human.curriculum
-    last = dataclasses.replace(ramp.reward, force_max=force_max, heading_position=heading_position, **weights)
+    last = dataclasses.replace(ramp.reward, force_max=force_max, **weights)
     return dataclasses.replace(
         human,
         name=hand,
@@ -82,22 +87,22 @@ def _robot(hand: str, *, force_max: float, heading_position: float, p_affordance
             reward=dataclasses.replace(first, force_max=force_max),
         ),
         curriculum=dataclasses.replace(ramp, reward=last),
+        objects=objects or human.objects,
     )
 
 
 # At 1.4 times the size an object weighs 2.7 times as much, at 1.1 times 1.3 times.
-_ALLEGRO = _robot(
-    "allegro",
-    force_max=12.0,
-    heading_position=30.0,
-    p_affordance=0.8,
-    affordance_distance=0.2,
-    affordance_force=0.4,
-)
-_FAMILIES = PRIMITIVE_FAMILIES + HARD_FAMILIES + SMOOTH_FAMILIES
 PRESETS |= {
-    "allegro": dataclasses.replace(_ALLEGRO, objects=ObjectsConfig(families=_FAMILIES, count=840)),
-    "sharpa": _robot("sharpa", force_max=4.5, heading_position=16.0, p_affordance=0.7),
+    "allegro": _robot(
+        "allegro",
+        force_max=12.0,
+        p_affordance=0.8,
+        objects=ObjectsConfig(families=PRIMITIVE_FAMILIES + HARD_FAMILIES + SMOOTH_FAMILIES, count=840),
+        heading_position=30.0,
+        affordance_distance=0.2,
+        affordance_force=0.4,
+    ),
+    "sharpa": _robot("sharpa", force_max=4.5, p_affordance=0.7, heading_position=16.0),
 }
 
 
