@@ -99,7 +99,7 @@ def evaluate(
         left_out: list[CongraspError] = []
         if names:
             evaluator = _evaluator(loaded, given, taskset, pool or _POOL, settings, track)
-            names, left_out = allowed_rows(evaluator, names)
+            names, left_out = evaluator.allowed(names)
             advance = track("Episodes", len(names) * episodes)
             rows += evaluator.rows(names, episodes, advance, keep=pictures is not None)
         if "noise" in table or "all" in table:
@@ -140,24 +140,6 @@ def evaluate(
             save_png(pictures / f"{name}.png", sheet)
             console.print(f"Episodes of '{name}' are drawn in {pictures}.", soft_wrap=True)
     return 0
-
-
-def allowed_rows(evaluator: Any, names: list[str]) -> tuple[list[str], list[CongraspError]]:
-    """The rows that some object allows, and why others are left out; captured objects may have no labelled parts.
-
-    Raises:
-      CongraspError: no row is left.
-    """
-    allowed, errors = [], []
-    for name in names:
-        try:
-            evaluator.check_available(name)
-            allowed.append(name)
-        except CongraspError as error:
-            errors.append(error)
-    if not allowed:
-        raise errors[0]
-    return allowed, errors
 
 
 def _captured(

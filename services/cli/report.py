@@ -82,6 +82,7 @@ def report(
             seed=seed,
             hold_steps=two_seconds(policy.task),
         )
+        names, left_out = evaluator.allowed(names)
         rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
         advance = track("Pictures", len(names))
         sheets = []
@@ -98,6 +99,8 @@ def report(
     which = f"{len(given)} objects ({objects_in_words(policy, objects)})"
     conditions = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
     write_report(out, policy, file.name, rows, conditions, sheets, curves, made)
+    for error in left_out:
+        print(f"Left out: {error}")
     print(f"The report is in {out}: open it in a browser.")
     return 0
 

@@ -130,7 +130,7 @@ class Evaluator:
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
 
-    def check_available(self, constraint: str) -> None:
+    def _check_available(self, constraint: str) -> None:
         """Passes if some object of the pool allows a row's constraints.
 
         Raises:
@@ -147,6 +147,23 @@ class Evaluator:
                 f"None of the {len(self.objects)} objects allows the constraint '{constraint}'.",
                 "An affordance needs labelled parts, poses and trajectories need room above the table.",
             )
+
+    def allowed(self, constraints: Sequence[str]) -> tuple[list[str], list[CongraspError]]:
+        """The rows that some object allows, and why others are left out; captured objects may have no labelled parts.
+
+        Raises:
+          CongraspError: no row is left.
+        """
+        allowed, errors = [], []
+        for name in constraints:
+            try:
+                self._check_available(name)
+                allowed.append(name)
+            except CongraspError as error:
+                errors.append(error)
+        if not allowed:
+            raise errors[0]
+        return allowed, errors
 
     def references(self, progress: Callable[[int, int], None] = lambda filled, places: None) -> TaskSet:
         """The task set with reference poses and trajectories from the policy's own grasps under headings.
@@ -227,7 +244,7 @@ class Evaluator:
         keep: bool = False,
     ) -> dict[str, Sample]:
         for constraint in constraints:
-            self.check_available(constraint)
+            self._check_available(constraint)
         found: dict[str, list[Sample]] = {constraint: [] for constraint in constraints}
         counts = dict.fromkeys(constraints, 0)
         seen, limit = 0, _PATIENCE * (episodes + self._batch)
@@ -294,7 +311,7 @@ class Evaluator:
         Raises:
           CongraspError: the pool does not allow these constraints.
         """
-        self.check_available(constraint)
+        self._check_available(constraint)
         with self._worker(mixture(self.task, [constraint]), 1, traced=True) as worker:
             for _ in range(_PATIENCE * tries):
                 sample, message = self._batch_of_episodes(worker)

@@ -15,6 +15,7 @@ from actors.taskset import TaskSet
 from common.config import PhysicsName, TaskConfig
 from common.hands import get_hand
 from common.hands.spec import Hand
+from common.objects.mjcf import CONTACT
 from common.objects.pool import object_scale
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, mean_action
@@ -23,7 +24,7 @@ from common.task.types import Array, SceneState
 
 HOLD_SECONDS = 2.0
 """How long a grasp should last without the table, beyond the paper's quarter of a second."""
-NOMINAL_FRICTION = 1.0
+NOMINAL_FRICTION = CONTACT.friction[0]
 """Sliding friction between hand and object, of evaluations that name no other."""
 
 

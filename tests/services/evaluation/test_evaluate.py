@@ -15,7 +15,6 @@ from common.errors import CongraspError
 from common.objects import procedural
 from common.objects.store import Catalogue
 from common.policy import bundle as bundles
-from services.cli.evaluate import allowed_rows
 from services.cli.main import load
 from services.evaluation.evaluate import Evaluator
 from services.evaluation.scores import Sample, matching
@@ -124,10 +123,10 @@ def test_a_pool_that_never_allows_a_constraint_is_an_error(evaluator, monkeypatc
     monkeypatch.setattr(evaluator, "_taskset", none)
     with pytest.raises(CongraspError, match="None of the 3 objects allows the constraint 'affordance'"):
         evaluator.samples(["heading", "affordance"], 1)
-    names, errors = allowed_rows(evaluator, ["heading", "affordance"])
+    names, errors = evaluator.allowed(["heading", "affordance"])
     assert names == ["heading"] and "'affordance'" in str(errors[0])
     with pytest.raises(CongraspError, match="'affordance'"):
-        allowed_rows(evaluator, ["affordance", "trajectory+affordance"])
+        evaluator.allowed(["affordance", "trajectory+affordance"])
     with pytest.raises(CongraspError, match="trajectory\\+affordance"):
         evaluator.episode("trajectory+affordance")
 
