@@ -18,12 +18,12 @@ from actors.taskset import build_taskset
 from common.config import PhysicsName, RunConfig, run_config_from_json
 from common.hands import get_hand
 from common.journal import Journal
-from common.logs.channels import finite
 from common.objects.pool import load_pool, sized
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
 from common.task.types import Array, Surface
 from common.transport.base import Transport
 from common.wire.codec import Message
+from services.record.channels import finite
 
 ROLLOUT_ARRAYS = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
 """What a rollout holds of every step, and the observation after the last one."""

@@ -16,14 +16,14 @@ import tyro
 
 from common.hands import get_hand
 from common.hands.mano import read_mano
-from common.logs.motion import save_motion
 from common.objects.spec import GraspObject
 from common.wire.codec import Message
-from services.grasping.grasp import grasp
-from services.importers.build import Options, import_sets
-from services.importers.objects import Meshes
-from services.pictures.render import episode_strip
-from services.pictures.sheets import contact_sheet, save_png
+from services.assets.captures.build import Options, import_sets
+from services.assets.captures.objects import Meshes
+from services.export.motion_file import save_motion
+from services.grasp.grasper import grasp
+from services.viz.render import episode_strip
+from services.viz.sheets import contact_sheet, save_png
 
 _MOMENTS = 4
 
@@ -55,7 +55,7 @@ def main(arguments: Arguments) -> None:
     model = read_mano(arguments.mano) if arguments.mano else None
     pictures: dict[str, tuple[list[np.ndarray], list[str]]] = {}
     for name in arguments.hand:
-        reader = importlib.import_module(f"services.importers.{arguments.format}")
+        reader = importlib.import_module(f"services.assets.captures.{arguments.format}")
         sequences = reader.read(arguments.demonstration, Meshes(arguments.meshes), model)
         options = Options(headings="demonstrated", affordance=arguments.affordance, beyond=np.pi)
         objects, sets, report = import_sets(sequences, get_hand(name), options, arguments.format)

@@ -14,14 +14,14 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from common.hands import get_hand
-from common.logs.motion import save_motion
+from services.assets.captures.extract import Surface, approach
+from services.assets.captures.transfer import followed
 from services.cli.objects import find_object
-from services.grasping.grasp import grasp
-from services.grasping.wrist_paths import read_wrist_path
-from services.importers.extract import Surface, approach
-from services.importers.transfer import followed
-from services.pictures.render import episode_sheet
-from services.pictures.sheets import save_png
+from services.export.motion_file import save_motion
+from services.grasp.grasper import grasp
+from services.grasp.wrist_paths import read_wrist_path
+from services.viz.render import episode_sheet
+from services.viz.sheets import save_png
 
 
 @dataclasses.dataclass

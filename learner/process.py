@@ -20,7 +20,6 @@ import numpy as np
 from common.config import RunConfig, to_json
 from common.errors import CongraspError, PhysicsError, TransportError
 from common.files import write_atomically
-from common.logs.channels import finite
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, PolicySpec
 from common.transport.base import Transport
@@ -37,6 +36,7 @@ from learner.run_directory import CONFIG_FILE, INITIAL_FILE, POLICY_FILE, note_v
 from learner.staleness import Ledger, StalenessManager
 from learner.statistics import Pace, overall, summary
 from learner.update import NonFiniteUpdate, TrainState
+from services.record.channels import finite
 
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0

@@ -30,7 +30,7 @@ from common.wire.messages import RolloutForm
 from learner.audit import AuditLog
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
-from services.operations.audit import FAULTS, audit
+from services.ops.audit import FAULTS, audit
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 KEYS = Keys("chaos")

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
-from common.logs.poses import link_poses
 from common.wire.codec import Message
+from services.record.poses import link_poses
 
 RADIUS, HEIGHT, CONTROL_DT = 0.03, 0.12, 0.01
 FORCE = 1.5  # N on each fingertip while it touches

@@ -9,17 +9,17 @@ from typing import Any
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
-from common.logs.channels import JsonChannels
-from common.logs.scene import episode_entries
-from common.logs.writer import LogWriter
 from common.objects import procedural
 from common.objects.spec import GraspObject
 from common.transport.keys import Keys
 from common.wire.codec import Message
-from services.view.jobs import Progress
-from services.view.session import Catalogue, Session
-from services.view.state import Asked
-from services.view.training import TrainingWindow
+from services.record.channels import JsonChannels
+from services.record.scene import episode_entries
+from services.record.writer import LogWriter
+from services.viz.studio.jobs import Progress
+from services.viz.studio.session import Catalogue, Session
+from services.viz.studio.state import Asked
+from services.viz.studio.training import TrainingWindow
 from tests.episodes import episode
 
 STEPS, REMOVAL = 60, 40

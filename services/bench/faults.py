@@ -18,7 +18,7 @@ from common.errors import CongraspError, TransportError
 from common.transport.keys import Keys
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
-from services.operations.audit import audit
+from services.ops.audit import audit
 
 _RUN = "quickstart"
 _SMALL = (

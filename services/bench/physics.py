@@ -23,8 +23,8 @@ from common.config import PhysicsName
 from common.hands import get_hand
 from common.objects.pool import load_pool, sized
 from common.policy.bundle import PolicyBundle, sample_action
-from services.training.presets import get_preset
-from services.training.quickstart import untrained
+from services.train.command import untrained
+from services.train.presets import get_preset
 
 _STEPS = 75
 """One whole episode: every repeat begins with fresh episodes and ends with their reset."""

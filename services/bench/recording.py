@@ -11,14 +11,14 @@ import psutil
 from rich.console import Console
 
 from common.errors import CongraspError
-from common.logs.recorder import Recorder
 from common.transport.keys import Keys
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from learner.process import run_learner
 from learner.run_directory import create_run
-from services.training.presets import get_preset
-from services.training.train import Child, end_all
+from services.record.recorder import Recorder
+from services.train.presets import get_preset
+from services.train.train import Child, end_all
 
 _PATIENCE = 300.0
 

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from common.certificates import create_authority, issue
 from common.errors import TransportError
 from common.transport.keys import Keys
 from common.transport.ports import free_port
@@ -18,6 +17,7 @@ from common.transport.security import Credentials
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 from learner.limits import Credit
+from services.ops.certificates import create_authority, issue
 
 _KEYS = Keys("bench")
 _ACTOR, _EVIL = "0.a", "1.b"

@@ -39,10 +39,10 @@ def actor(
     from common.journal import Journal
     from common.transport.keys import process_name
     from common.transport.zenoh_transport import ZenohTransport
-    from services.operations.access import acting
-    from services.operations.logs import say
-    from services.operations.metrics import ActorMetrics
-    from services.operations.shutdown import on_signal
+    from services.ops.access import acting
+    from services.ops.logs import say
+    from services.ops.metrics import ActorMetrics
+    from services.ops.shutdown import on_signal
 
     credentials, name = acting(certs, id or process_name("actor"))
     metrics = ActorMetrics()

@@ -35,10 +35,10 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
     import tempfile
 
     from common.policy import bundle as bundles
-    from services.serving.client import PolicyClient
-    from services.serving.load import example_episode, measure, processor_seconds, serving, wait_until_ready
-    from services.training.presets import get_preset
-    from services.training.quickstart import untrained
+    from services.serve.client import PolicyClient
+    from services.serve.load import example_episode, measure, processor_seconds, serving, wait_until_ready
+    from services.train.command import untrained
+    from services.train.presets import get_preset
 
     with tempfile.TemporaryDirectory() as folder:
         policy = pathlib.Path(folder, "policy.safetensors")
@@ -198,7 +198,7 @@ def scaling(
     import dataclasses
 
     from services.bench.scaling import bench_scaling
-    from services.training.presets import get_preset
+    from services.train.presets import get_preset
 
     config = get_preset(preset)
     config = dataclasses.replace(config, physics=physics, environments=environments or config.environments)

@@ -19,8 +19,8 @@ def init(folder: Folder = pathlib.Path("certs"), host: tuple[str, ...] = (), for
       host: Names and addresses of this machine, under which others will connect to its learner or policy server.
       force: Replace an authority that is there; certificates that it issued are useless then.
     """
-    from common.certificates import create_authority, issue
     from common.transport.security import LISTENERS, ROLES
+    from services.ops.certificates import create_authority, issue
 
     create_authority(folder, force=force)
     for role in ROLES:
@@ -49,8 +49,8 @@ def issue(
       days: Days until it expires.
       force: Replace the certificate of this number; the old one works until it expires.
     """
-    from common.certificates import issue, read
     from common.transport.security import CERTIFICATE_FILE
+    from services.ops.certificates import issue, read
 
     made = issue(folder, role, number=number, hosts=host, days=days, force=force)
     print(f"{made}: good until {read(made / CERTIFICATE_FILE).expires:%Y-%m-%d}")
@@ -66,7 +66,7 @@ def show(folder: Folder = pathlib.Path("certs")) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from common.certificates import certificates
+    from services.ops.certificates import certificates
 
     table = Table("certificate", "expires (UTC)", "days left", "listens as")
     found = certificates(folder)

@@ -53,7 +53,7 @@ class ConstraintsGenerate:
         from common.config import TaskConfig
         from common.hands import get_hand
         from common.objects.procedural import generate_many
-        from services.grasping.constraint_sets import make_sets, save
+        from services.grasp.constraint_sets import make_sets, save
 
         if not self.objects and self.count < 1:
             raise CongraspError("There is no object to make constraints for.", "Name objects, or set --count.")
@@ -76,8 +76,8 @@ class ConstraintsGenerate:
         import os
 
         from common.policy import bundle as bundles
-        from common.policy.shipped import policy_file
-        from services.evaluation.evaluate import Evaluator
+        from common.policy.pretrained import policy_file
+        from services.evaluate.evaluator import Evaluator
 
         bundle = bundles.load(policy_file(self.policy, self.hand))
         if bundle.spec.hand_name != hand:
@@ -113,7 +113,7 @@ class ConstraintsShow:
 
     def run(self) -> int:
         """Runs the command; returns its exit code."""
-        from services.grasping.constraint_sets import describe, load
+        from services.grasp.constraint_sets import describe, load
 
         constraints = load(self.file)
         rests = len(constraints.arrays["rest"])
@@ -125,8 +125,8 @@ class ConstraintsShow:
             table.add_row(key, escape(value))
         _console.print(table)
         if self.png is not None:
-            from services.pictures.constraint_sheet import constraint_sheet
-            from services.pictures.sheets import save_png
+            from services.viz.constraint_sheet import constraint_sheet
+            from services.viz.sheets import save_png
 
             save_png(self.png, constraint_sheet(constraints, rest - 1, self.seed))
             _console.print(f"The picture is {escape(str(self.png))}.", soft_wrap=True)
@@ -134,8 +134,8 @@ class ConstraintsShow:
 
 
 def _find(text: str, folder: str) -> list[GraspObject]:
+    from services.assets.objects.named import objects_of
     from services.cli.objects import find_object
-    from services.grasping.objects import objects_of
 
     path = pathlib.Path(text)
     return objects_of(path) if path.exists() else [find_object(text, folder)]

@@ -65,8 +65,8 @@ class ConstraintsImport:
         from common.files import write_atomically
         from common.hands import get_hand
         from common.objects.store import Catalogue
-        from services.grasping.constraint_sets import save
-        from services.importers.build import Options, import_sets
+        from services.assets.captures.build import Options, import_sets
+        from services.grasp.constraint_sets import save
 
         if not self.path.exists():
             raise CongraspError(f"There is no file or folder {self.path}.", "Name the data set's folder.")
@@ -101,10 +101,10 @@ class ConstraintsImport:
 
     def _sequences(self) -> Any:
         from common.hands.mano import VARIABLE, read_mano
-        from services.importers.objects import Meshes
+        from services.assets.captures.objects import Meshes
 
         own = self.mano or (pathlib.Path(text) if (text := os.environ.get(VARIABLE)) else None)
-        module = importlib.import_module(f"services.importers.{self.format}")
+        module = importlib.import_module(f"services.assets.captures.{self.format}")
         return module.read(self.path, Meshes(self.meshes), read_mano(own) if own else None)
 
 

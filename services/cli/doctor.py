@@ -19,7 +19,7 @@ def doctor(
       folder: Where runs are to be written.
       certs: Folder of certificates (congrasp certs) to look at, and to connect with as an observer.
     """
-    from services.operations.doctor import examine
+    from services.ops.doctor import examine
 
     findings = examine(connect, run, folder, certs)
     for finding in findings:

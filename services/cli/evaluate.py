@@ -71,12 +71,12 @@ def evaluate(
     from actors.physics import resolve_physics
     from common.objects.pool import HELD_OUT_SEED
     from common.policy import bundle as bundles
-    from common.policy.shipped import policy_file
+    from common.policy.pretrained import policy_file
+    from services.assets.objects.named import objects_of
     from services.cli.progress import tracked
-    from services.evaluation.noise import LEVELS
-    from services.evaluation.scores import TABLES, tables_of, write_json
-    from services.evaluation.worlds import objects_in_words
-    from services.grasping.objects import objects_of
+    from services.evaluate.noise import LEVELS
+    from services.evaluate.scores import TABLES, tables_of, write_json
+    from services.evaluate.worlds import objects_in_words
 
     for name, value, least in (("episodes", episodes, 1), ("pool", pool, 0), ("batch", batch, 0), ("seed", seed, 0)):
         if value < least:
@@ -127,14 +127,14 @@ def evaluate(
         }
         write_json(rows, json, about)
     if pictures is not None and noisy:
-        from services.pictures.noise_sheet import draw_noise
+        from services.evaluate.noise_sheet import draw_noise
 
         title = f"{loaded.spec.hand_name} hand, version {loaded.version}: {episodes} episodes a level"
         draw_noise(evaluator, noisy, pictures, title)
         console.print(f"Curves and examples of noisy references are drawn in {pictures}.", soft_wrap=True)
     if pictures is not None and names:
-        from services.evaluation.failures import failure_sheets
-        from services.pictures.sheets import save_png
+        from services.evaluate.failures import failure_sheets
+        from services.viz.sheets import save_png
 
         for name, sheet, _ in failure_sheets(evaluator, loaded, names, _PICTURED, _PICTURED):
             save_png(pictures / f"{name}.png", sheet)
@@ -146,7 +146,7 @@ def _captured(
     folder: pathlib.Path, split: Split, given: "list[GraspObject] | None", objects: pathlib.Path | None
 ) -> "tuple[list[GraspObject], TaskSet]":
     """The objects that have a constraint set in a folder, and the task set of their sets."""
-    from services.grasping.constraint_sets import load_for, taskset_of
+    from services.grasp.constraint_sets import load_for, taskset_of
 
     if given is None:
         raise CongraspError("--constraints needs the sets' objects.", "Name their folder with --objects.")
@@ -168,8 +168,8 @@ def _evaluator(
 
     from common.config import ObjectsConfig
     from common.objects.pool import HELD_OUT_SEED, load_pool
-    from services.evaluation.evaluate import Evaluator
-    from services.evaluation.worlds import two_seconds
+    from services.evaluate.evaluator import Evaluator
+    from services.evaluate.worlds import two_seconds
 
     track("Making constraints", None)
     return Evaluator(
@@ -193,7 +193,7 @@ def _object_rows(
     import os
 
     from common.objects.pool import HELD_OUT_SEED
-    from services.evaluation.unseen import POOL, evaluate_objects, procedural_pools
+    from services.evaluate.unseen import POOL, evaluate_objects, procedural_pools
 
     pools = iter([given]) if given else procedural_pools(pool, HELD_OUT_SEED)
     number = 1 if given else -(-pool // POOL)

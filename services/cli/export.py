@@ -26,7 +26,7 @@ def policy(
       out: The file to write; policy.onnx or policy.stablehlo.zip otherwise.
     """
     from common.policy.bundle import load
-    from common.policy.shipped import policy_file
+    from common.policy.pretrained import policy_file
     from services.export.policy import SUFFIXES, TOLERANCE, export_policy
 
     source = policy_file(policy, hand)

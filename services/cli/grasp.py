@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from common.errors import CongraspError
-from common.objects.meshes import ImportOptions
+from services.assets.objects.meshes import ImportOptions
 
 NOT_HELD, BAD_INPUT = 1, 2
 
@@ -60,10 +60,10 @@ def grasp(
     from rich.markup import escape
 
     from common.policy import bundle as bundles
-    from common.policy.shipped import policy_file
+    from common.policy.pretrained import policy_file
     from services.cli.progress import bars
-    from services.grasping.grasp import Grasper
-    from services.grasping.jobs import SHEET, Result, Settings, find_jobs, run_job, save_summary
+    from services.grasp.grasper import Grasper
+    from services.grasp.jobs import SHEET, Result, Settings, find_jobs, run_job, save_summary
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")

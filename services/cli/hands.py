@@ -14,7 +14,7 @@ def list_hands() -> int:
 
     from common.errors import CongraspError
     from common.hands import HANDS, get_hand, hands_folder, own_hands
-    from common.policy.shipped import shipped
+    from common.policy.pretrained import shipped
 
     table = Table("hand", "joints", "fingers", "mass", "torque", "objects", "policy")
     missing = []
@@ -53,8 +53,8 @@ def sheet(
       out: The PNG file to write; with several hands, one beside another.
     """
     from common.hands import get_hand
-    from services.pictures.hand_sheets import hands_sheet
-    from services.pictures.sheets import save_png
+    from services.viz.hand_sheets import hands_sheet
+    from services.viz.sheets import save_png
 
     save_png(out, hands_sheet([get_hand(name) for name in hands]))
     print(out)
@@ -88,10 +88,10 @@ def import_hand(
     from common.files import write_atomically
     from common.hands import HANDS, SUFFIX, get_hand, hands_folder
     from common.hands.files import hand_text
-    from services.hands.model_files import Choices, describe
-    from services.hands.model_files import import_hand as proposed
-    from services.pictures.hand_sheets import joints_sheet
-    from services.pictures.sheets import save_png
+    from services.assets.hands.model_files import Choices, describe
+    from services.assets.hands.model_files import import_hand as proposed
+    from services.viz.hand_sheets import joints_sheet
+    from services.viz.sheets import save_png
 
     proposal = proposed(file, Choices(name, palm, thumb, object_scale))
     hand = proposal.hand

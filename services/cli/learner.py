@@ -10,7 +10,7 @@ import tyro
 from common.config import Board, RunConfig, run_config_from_json, to_json
 from services.cli.train import begun
 from services.cli.watch import Watch, Watched
-from services.training.presets import with_hand
+from services.train.presets import with_hand
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,13 +76,13 @@ class Learner:
         from learner.process import run_learner
         from learner.ranks import Ranks
         from learner.run_directory import continue_run, create_run
-        from services.operations.access import listening
-        from services.operations.logs import say
-        from services.operations.metrics import LearnerMetrics
-        from services.operations.shutdown import on_signal
-        from services.operations.status import ask
-        from services.training.boards import recorded
-        from services.training.train import train_in_process
+        from services.ops.access import listening
+        from services.ops.logs import say
+        from services.ops.metrics import LearnerMetrics
+        from services.ops.shutdown import on_signal
+        from services.ops.status import ask
+        from services.train.metric_writers import recorded
+        from services.train.train import train_in_process
 
         resume = self.resume and (self.run_dir / "checkpoints" / "latest").exists()
         config = with_hand(self.config, self.hand)

@@ -16,8 +16,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
 from common.errors import CongraspError
-from services.operations.logs import say_error
-from services.operations.shutdown import follow_parent, on_signal
+from services.ops.logs import say_error
+from services.ops.shutdown import follow_parent, on_signal
 
 COMMANDS = {
     "train": "train a policy: a learner and its actors on this machine",

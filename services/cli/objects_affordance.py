@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from common.errors import CongraspError
-from common.objects import affordance
 from common.objects.store import Catalogue
+from services.assets.objects import affordance
 
 _COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "yellow": (255, 255, 0)}
 

@@ -19,8 +19,8 @@ def plot(
       out: Folder for the figures; 'plots' beside the recordings or the JSON file otherwise.
       formats: Of the files.
     """
-    from services.pictures.evaluation_plots import plot_evaluation
-    from services.pictures.plots import plot_run
+    from services.evaluate.plots import plot_evaluation
+    from services.viz.plots import plot_run
 
     folder = out or (path if path.is_dir() else path.parent) / "plots"
     draw = plot_evaluation if path.suffix == ".json" else plot_run

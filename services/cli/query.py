@@ -35,9 +35,9 @@ def query(
     import json as json_module
 
     from common.errors import CongraspError
-    from services.operations.access import credentials
-    from services.serving.client import PolicyClient
-    from services.serving.load import example_episode, measure, one_answer
+    from services.ops.access import credentials
+    from services.serve.client import PolicyClient
+    from services.serve.load import example_episode, measure, one_answer
 
     for name_, value in (("repeat", repeat), ("concurrency", concurrency), ("states", states)):
         if value < 1:

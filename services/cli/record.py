@@ -2,7 +2,7 @@
 
 import pathlib
 
-from services.operations.logs import LogFormat
+from services.ops.logs import LogFormat
 
 
 def record(
@@ -29,9 +29,9 @@ def record(
       certs: Folder of an observer's certificate (congrasp certs).
     """
     from common.transport.keys import process_name
-    from services.operations.access import credentials
-    from services.operations.logs import logging_as
-    from services.operations.record import record_run
+    from services.ops.access import credentials
+    from services.ops.logs import logging_as
+    from services.record.process import record_run
 
     structured, mine = log_format == "json", credentials(certs, "observer")
     with logging_as(log_format, role="recorder", id=process_name("recorder"), run=run):

@@ -14,8 +14,8 @@ def hand(hand: str = "human", out: pathlib.Path = pathlib.Path("hand.png")) -> i
       out: The PNG file to write.
     """
     from common.hands import get_hand
-    from services.pictures.render import hand_sheet
-    from services.pictures.sheets import save_png
+    from services.viz.render import hand_sheet
+    from services.viz.sheets import save_png
 
     save_png(out, hand_sheet(get_hand(hand)))
     print(out)
@@ -40,8 +40,8 @@ def episode(
       moments: Pictures on the sheet.
       video: Also write the whole episode as an MP4, at half its speed while the table stands.
     """
-    from services.pictures.render import episode_sheet, pick_episode, save_episode_video
-    from services.pictures.sheets import save_png
+    from services.viz.render import episode_sheet, pick_episode, save_episode_video
+    from services.viz.sheets import save_png
 
     chosen = pick_episode(path, index, success=success)
     save_png(out, episode_sheet(chosen, moments=moments))

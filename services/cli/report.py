@@ -10,7 +10,7 @@ from common.config import PhysicsName
 from common.errors import CongraspError
 
 if TYPE_CHECKING:
-    from services.evaluation.report import Picture
+    from services.evaluate.report import Picture
 
 _POOL = 64
 _PICTURED = 4
@@ -47,16 +47,16 @@ def report(
     from common.config import ObjectsConfig
     from common.objects.pool import HELD_OUT_SEED, load_pool
     from common.policy import bundle as bundles
-    from common.policy.shipped import policy_file
+    from common.policy.pretrained import policy_file
     from learner.run_directory import POLICY_FILE
+    from services.assets.objects.named import objects_of
     from services.cli.progress import tracked
-    from services.evaluation.evaluate import Evaluator
-    from services.evaluation.failures import failure_sheets
-    from services.evaluation.report import Made, Picture, causes_in_words, template, write_report
-    from services.evaluation.scores import TABLES
-    from services.evaluation.worlds import objects_in_words, two_seconds
-    from services.grasping.objects import objects_of
-    from services.pictures.sheets import png_of
+    from services.evaluate.evaluator import Evaluator
+    from services.evaluate.failures import failure_sheets
+    from services.evaluate.report import Made, Picture, causes_in_words, template, write_report
+    from services.evaluate.scores import TABLES
+    from services.evaluate.worlds import objects_in_words, two_seconds
+    from services.viz.sheets import png_of
 
     for name, value in (("episodes", episodes), ("pool", pool)):
         if value < 1:
@@ -107,9 +107,9 @@ def report(
 
 def curves_of(run_dir: pathlib.Path) -> "Iterator[Picture]":
     """Figures of a run's recordings, if it has any."""
-    from common.logs.reader import read_metrics
-    from services.evaluation.report import Picture
-    from services.pictures.plots import draw, encoded, figures
+    from services.evaluate.report import Picture
+    from services.record.reader import read_metrics
+    from services.viz.plots import draw, encoded, figures
 
     if any(run_dir.rglob("*.mcap")):
         series = read_metrics(run_dir)

@@ -38,14 +38,14 @@ def serve(
     import jax
 
     from common.errors import CongraspError
-    from common.policy.shipped import policy_file
+    from common.policy.pretrained import policy_file
     from common.transport.keys import Keys
     from common.transport.zenoh_transport import ZenohTransport
-    from services.operations.access import listening
-    from services.operations.logs import say
-    from services.operations.metrics import ServerMetrics
-    from services.operations.shutdown import on_signal
-    from services.serving.server import PolicyServer, follow_file, follow_run
+    from services.ops.access import listening
+    from services.ops.logs import say
+    from services.ops.metrics import ServerMetrics
+    from services.ops.shutdown import on_signal
+    from services.serve.server import PolicyServer, follow_file, follow_run
 
     if policy is not None and connect:
         raise CongraspError(

@@ -32,8 +32,8 @@ def status(
     from rich.live import Live
 
     from common.transport.zenoh_transport import ZenohTransport
-    from services.operations.access import credentials
-    from services.operations.status import ask, follow, tables
+    from services.ops.access import credentials
+    from services.ops.status import ask, follow, tables
 
     with ZenohTransport(connect=[connect], credentials=credentials(certs, "observer")) as transport:
         found = ask(transport, run)

@@ -10,7 +10,7 @@ import tyro
 
 from common.config import Board, RunConfig
 from learner.run_directory import CONFIG_FILE, open_run
-from services.training.presets import get_preset, with_hand
+from services.train.presets import get_preset, with_hand
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Train:
 
     def run(self) -> int:
         """Runs the command."""
-        from services.training.quickstart import run_training
+        from services.train.command import run_training
 
         config = with_hand(self.config, self.hand)
         run_dir = self.run_dir or pathlib.Path("runs") / f"{config.name}-{time.strftime('%Y%m%d-%H%M%S')}"

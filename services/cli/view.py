@@ -30,8 +30,8 @@ def view(
       insecure: Offer the page beyond loopback.
       certs: Folder of an observer's certificate (congrasp certs), for --connect.
     """
-    from services.operations.shutdown import on_signal
-    from services.view.app import open_view
+    from services.ops.shutdown import on_signal
+    from services.viz.studio.app import open_view
 
     with (
         on_signal() as stop,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
-from common.logs.motion import GraspMotion
+from services.export.motion_file import GraspMotion
 
 OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""

@@ -14,8 +14,8 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.logs.motion import GraspMotion
 from services.export.frames import FROM_Y_UP, OBJECT, TO_Y_UP, Body, Track, bodies, facts, pose_matrices, quaternions
+from services.export.motion_file import GraspMotion
 
 _FLOAT, _UNSIGNED = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963

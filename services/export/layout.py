@@ -8,8 +8,8 @@ import foxglove.layouts as fl
 
 from common.errors import CongraspError
 from common.files import write_atomically
-from common.logs.channels import flatten
-from common.logs.reader import log_files, read_records
+from services.record.channels import flatten
+from services.record.reader import log_files, read_records
 
 CURVES = {
     "Success and return": ("episode/success", "episode/return"),

@@ -16,8 +16,8 @@ import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
-from common.logs.motion import GraspMotion
 from services.export.frames import OBJECT, Track, facts, pose_matrices
+from services.export.motion_file import GraspMotion
 from services.export.urdf import forward_kinematics, hand_urdf
 
 VERSION = "v3.0"

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.errors import CongraspError
-from common.logs.motion import GraspMotion, load_motion, motion_of_episode
 from services.export.frames import TOLERANCE_MM, error_mm
-from services.pictures.render import pick_episode
+from services.export.motion_file import GraspMotion, load_motion, motion_of_episode
+from services.viz.render import pick_episode
 
 FORMATS = {
     "glb": ".glb",

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
-from common.logs.motion import GraspMotion
 from services.export.frames import OBJECT, Body, Track, bodies, facts, pose_matrices
+from services.export.motion_file import GraspMotion
 from services.export.urdf import forward_kinematics, hand_urdf
 
 _WORLD = "world"

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.logs.motion import GraspMotion
 from services.export.frames import OBJECT, Track, bodies, facts, identifiers, quaternions
+from services.export.motion_file import GraspMotion
 
 _COLOURS = {"hand": (0.70, 0.73, 0.79), OBJECT: (0.95, 0.62, 0.24)}
 _NAME = "congrasp:name"

@@ -6,7 +6,7 @@ import pytest
 
 from common.config import CurriculumConfig, RewardWeights, RunConfig, run_config_from_json, to_json
 from common.errors import CongraspError
-from services.training.presets import PRESETS
+from services.train.presets import PRESETS
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -18,9 +18,9 @@ from common.hands.kinematics import grasp_frame, link_poses
 from common.hands.mano import VARIABLE
 from common.hands.mjcf import add_hand, overlapping
 from common.hands.spec import link_origin
-from common.logs import poses
 from common.objects import procedural
 from common.objects.pool import sized
+from services.record import poses
 from tests.mano_file import mano_pickle
 
 ROBOTS = ("allegro", "sharpa")

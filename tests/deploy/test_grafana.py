@@ -4,9 +4,9 @@ import json
 import re
 
 from common.transport.ports import free_port
-from services.operations.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
+from services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
 from tests.conftest import ROOT
-from tests.services.operations.test_metrics import STATUS, scrape
+from tests.services.ops.test_metrics import STATUS, scrape
 
 DASHBOARD = json.loads((ROOT / "deploy" / "grafana" / "congrasp.json").read_text())
 UPDATE = ("episode/success", "episode/return", "update_seconds", "wait_seconds")

@@ -12,14 +12,14 @@ import pytest
 
 from common.errors import CongraspError
 from common.journal import AUDIT, Journal, read_journal
-from common.logs.reader import read_metrics
-from common.logs.recorder import Recorder
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
 from learner.process import run_learner
 from learner.run_directory import LOGS, create_run
-from services.operations.audit import audit
+from services.ops.audit import audit
+from services.record.reader import read_metrics
+from services.record.recorder import Recorder
 from tests.learner.test_process import CONFIG, MadeUpActor
 
 

@@ -16,7 +16,6 @@ import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
 from actors.link import ActorLink
-from common.certificates import create_authority, issue, read
 from common.errors import CongraspError, TransportError
 from common.transport.keys import Keys
 from common.transport.ports import free_port
@@ -26,7 +25,8 @@ from common.wire.codec import Message, encode
 from common.wire.messages import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
-from services.serving.client import PolicyClient
+from services.ops.certificates import create_authority, issue, read
+from services.serve.client import PolicyClient
 from tests.cluster import A, B, D, T, bundle, rollout
 
 pytestmark = pytest.mark.timeout(60)

@@ -12,8 +12,8 @@ import numpy as np
 import psutil
 import pytest
 
-from common.logs.reader import read_episodes, read_metrics, read_rollouts
 from common.policy import bundle as bundles
+from services.record.reader import read_episodes, read_metrics, read_rollouts
 
 pytestmark = pytest.mark.timeout(600)
 UPDATES = 40

@@ -7,7 +7,7 @@ import pytest
 from common.errors import CongraspError
 from learner.run_directory import continue_run, create_run, open_run
 from services.cli.train import begun
-from services.training.presets import get_preset
+from services.train.presets import get_preset
 
 
 @pytest.fixture

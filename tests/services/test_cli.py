@@ -111,7 +111,7 @@ def test_the_client_needs_neither_jax_nor_mujoco():
         "import sys\n"
         "for name in ('jax', 'flax', 'mujoco', 'scipy', 'trimesh', 'mcap', 'tyro', 'rich', 'dacite'):\n"
         "    sys.modules[name] = None\n"
-        "import services.serving.client\n"
+        "import services.serve.client\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

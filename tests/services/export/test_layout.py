@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 
 from common.errors import CongraspError
-from common.logs.channels import flatten
-from common.logs.entries import Converter
-from common.logs.reader import read_records
-from common.logs.writer import LogWriter
 from common.wire.codec import Message
 from services.export.layout import export_layout
+from services.record.channels import flatten
+from services.record.entries import Converter
+from services.record.reader import read_records
+from services.record.writer import LogWriter
 from tests.episodes import episode
 
 

@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands import get_hand
-from common.logs.channels import Entry
-from common.logs.entries import Converter
-from common.logs.motion import GraspMotion, hand_arrays, motion_of_episode, save_motion
-from common.logs.poses import link_poses
-from common.logs.writer import LogWriter
 from services.cli.main import main
 from services.export import bvh, frames, glb, lerobot, motion, ros2, urdf, usd
+from services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
+from services.record.channels import Entry
+from services.record.entries import Converter
+from services.record.poses import link_poses
+from services.record.writer import LogWriter
 from tests.episodes import episode
 
 T = 7

@@ -21,7 +21,7 @@ from common.policy import bundle as bundles
 from common.policy import network
 from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.normalizer import Statistics
-from common.policy.shipped import policy_file
+from common.policy.pretrained import policy_file
 from common.task import observation
 from common.task.features import features
 from common.task.types import CONTACTS_PER_LINK, MASKS, Goal, SceneState, Surface

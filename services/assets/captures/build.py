@@ -1,0 +1,252 @@
+"""From sequences to objects and constraint sets, with a report of what was kept and what was dropped, and why."""
+
+import collections
+import dataclasses
+import pathlib
+import re
+from collections.abc import Callable, Iterable
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from actors.taskset import HEADINGS, TaskSet, clear_of_table, headings_of
+from common.config import TaskConfig
+from common.constraints.headings import Headings
+from common.errors import CongraspError
+from common.hands.human import HUMAN
+from common.hands.spec import Hand
+from common.objects import store
+from common.objects.pool import object_scale
+from common.objects.spec import GraspObject
+from common.wire.codec import Message
+from services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
+from services.assets.captures.objects import load_object
+from services.assets.captures.sequence import Dropped, Sequence
+from services.assets.captures.transfer import demonstrated_headings, transferred
+from services.assets.objects.affordance import near_points, relabelled, two_parts
+from services.assets.objects.meshes import UNLABELLED
+from services.grasp.constraint_sets import set_of
+
+Affordance = Literal["auto", "parts", "contacts", "none"]
+_TOUCHED = 0.03
+"""Metres around touched points that count as touched."""
+_VERTICES = 3
+"""Contact points that make a part of an object one of O+ (paper)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What is made of the sequences."""
+
+    headings: Literal["sampled", "demonstrated"] = "sampled"
+    """sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps."""
+    affordance: Affordance = "auto"
+    """parts: O+ are the labelled parts that fingers touch; contacts: what fingers touch; auto: parts if labelled."""
+    beyond: float = BEYOND
+    """Radians by which a captured joint may exceed its limits; it is then moved to the limit. For `human` alone."""
+    waypoints: int = 15
+    seed: int = 0
+    """Of headings, and of the split into training and held-out."""
+
+
+@dataclasses.dataclass
+class Report:
+    """What became of each sequence."""
+
+    kept: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    dropped: list[dict[str, str]] = dataclasses.field(default_factory=list)
+
+    def drop(self, dropped: Dropped) -> None:
+        """Notes that a sequence is not used."""
+        self.dropped.append({"sequence": dropped.name, "rule": dropped.rule, "reason": dropped.reason})
+
+    def rules(self) -> list[tuple[str, int, str]]:
+        """Of each rule its name, how many sequences it dropped, and the first one's reason."""
+        counts = collections.Counter(row["rule"] for row in self.dropped)
+        first = {row["rule"]: f"{row['sequence']}: {row['reason']}" for row in reversed(self.dropped)}
+        return [(rule, count, first[rule]) for rule, count in counts.most_common()]
+
+
+@dataclasses.dataclass
+class _Group:
+    """Demonstrations on one object with one partition."""
+
+    obj: GraspObject
+    demonstrations: list[Demonstration] = dataclasses.field(default_factory=list)
+
+
+def import_sets(
+    sequences: Iterable[Sequence | Dropped],
+    hand: Hand,
+    options: Options,
+    source: str,
+    progress: Callable[[str], None] = lambda name: None,
+) -> tuple[list[GraspObject], list[Message], Report]:
+    """Objects and their constraint sets.
+
+    Args:
+      sequences: from an importer.
+      hand: whose constraints these are; any but the human one follows the demonstrations by its grasp axes.
+      options: see there.
+      source: name of the data set.
+      progress: is told each sequence's name.
+
+    Returns:
+      Objects and, in the same order, their sets; and what was kept and dropped.
+    """
+    report = Report()
+    shapes: dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError] = {}
+    groups: dict[str, _Group] = {}
+    beyond = options.beyond if hand is HUMAN else np.inf
+    for item in sequences:
+        try:
+            if isinstance(item, Dropped):
+                raise item
+            progress(item.name)
+            obj, surface = _shape(item, shapes)
+            demonstration = extract(item, obj, surface, options.waypoints, beyond)
+            labelled = _labelled(item, obj, demonstration, options.affordance)
+            groups.setdefault(labelled.name, _Group(labelled)).demonstrations.append(demonstration)
+        except Dropped as dropped:
+            progress(dropped.name)
+            report.drop(dropped)
+    objects, sets = [], []
+    for number, group in enumerate(groups.values()):
+        try:
+            obj, made = _set(hand, group, options, number, source)
+        except CongraspError as error:
+            for demonstration in group.demonstrations:
+                report.drop(Dropped(demonstration.name, "object out of reach", str(error)))
+            continue
+        objects.append(obj)
+        sets.append(made)
+        usable = made.arrays["pose/allowed"].any((0, 1))
+        for m, demonstration in enumerate(group.demonstrations):
+            report.kept.append(
+                {
+                    "sequence": demonstration.name,
+                    "object": obj.name,
+                    "frame": demonstration.frame,
+                    "first_frame": demonstration.start,
+                    "residual_rad": round(demonstration.fit.angle, 5),
+                    "residual_tip_m": round(demonstration.fit.tip, 5),
+                    "touched_points": len(demonstration.contact),
+                    "clear_of_table": bool(usable[m]),
+                }
+            )
+    return objects, sets, report
+
+
+def _shape(
+    sequence: Sequence, shapes: dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
+) -> tuple[GraspObject, Surface]:
+    if sequence.mesh not in shapes:
+        try:
+            obj = load_object(sequence.mesh, _name(sequence.object_name))
+            # Without labelled parts the whole surface may be grasped.
+            obj = dataclasses.replace(obj, graspable=np.ones_like(obj.graspable))
+            shapes[sequence.mesh] = obj, Surface(obj)
+        except CongraspError as error:
+            shapes[sequence.mesh] = error
+    found = shapes[sequence.mesh]
+    if isinstance(found, CongraspError):
+        raise Dropped(sequence.name, "unusable mesh", str(found))
+    return found
+
+
+def _labelled(
+    sequence: Sequence, obj: GraspObject, demonstration: Demonstration, affordance: Affordance
+) -> GraspObject:
+    """The object with the partition into O+ and O- that the grasp shows, under a name of its own."""
+    names, clouds = _parts(sequence, obj)
+    if affordance == "none" or (affordance == "auto" and not names):
+        return obj
+    if affordance == "contacts":
+        touched = near_points(obj, demonstration.contact, _TOUCHED)
+        return _with_region(sequence, lambda: two_parts(obj, touched, _name(f"{obj.name}-{sequence.name}")))
+    if not names:
+        raise Dropped(sequence.name, "no labelled parts", f"the parts of '{sequence.object_name}' are not labelled")
+    labels = _nearest(clouds, obj.points)
+    counts = np.bincount(_nearest(clouds, demonstration.contact), minlength=len(names))
+    plus = counts >= _VERTICES
+    if not plus.any():
+        reason = f"fingers touch no part in {_VERTICES} points ({counts.max()} at most)"
+        raise Dropped(sequence.name, "no part touched", reason)
+    touched_names = [name for name, touched in zip(names, plus, strict=True) if touched]
+    name = obj.name if plus.all() else _name("-".join([obj.name, *touched_names]))
+    return _with_region(sequence, lambda: relabelled(obj, labels, names, [bool(part) for part in plus], name))
+
+
+def _parts(sequence: Sequence, obj: GraspObject) -> tuple[list[str], list[np.ndarray]]:
+    """Names and points (n, 3), in the object frame, of the parts that the data set or the object's files label."""
+    if sequence.parts:
+        return [part.name for part in sequence.parts], [part.points + obj.origin for part in sequence.parts]
+    if obj.part_names == UNLABELLED:
+        return [], []
+    return list(obj.part_names), [obj.points[obj.labels == i] for i in range(len(obj.part_names))]
+
+
+def _with_region(sequence: Sequence, make: Callable[[], GraspObject]) -> GraspObject:
+    try:
+        return make()
+    except CongraspError as error:
+        raise Dropped(sequence.name, "O+ too small", str(error).split(". ")[0]) from None
+
+
+def _nearest(clouds: list[np.ndarray], points: np.ndarray) -> np.ndarray:
+    """(n,) index of the cloud that is nearest to each point (n, 3)."""
+    if len(points) == 0:
+        return np.zeros(0, int)
+    return np.argmin([cKDTree(cloud).query(points)[0] for cloud in clouds], axis=0)
+
+
+def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) -> tuple[GraspObject, Message]:
+    """The object, and its constraint set in the size in which the hand grasps it."""
+    task = TaskConfig(hand=hand.name, trajectory_points=options.waypoints)
+    obj, demonstrations, seed = group.obj, group.demonstrations, (options.seed, number)
+    scale = object_scale(hand, task)
+    fitting = obj.scaled(scale)
+    given = None
+    if options.headings == "demonstrated":
+        given = Headings(*(np.resize(x, (HEADINGS, 3)) for x in demonstrated_headings(demonstrations, scale)))
+    fields = headings_of(task, fitting, seed, given, scale)
+    if hand is HUMAN:
+        posed = tuple(np.stack([getattr(d, x) for d in demonstrations]) for x in ("q", "position", "quaternion"))
+    else:
+        posed = transferred(hand, demonstrations, fitting, scale)
+    q, position, quaternion = (values.astype(np.float32) for values in posed)
+    clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, np.stack([fields["rest"]] * len(position))))
+    nearer = _ends_nearer_to_plus(position[:, -1], fields["points"], fields["minus"])
+    row = TaskSet(
+        **{name: value for name, value in fields.items() if not name.startswith("chosen")},
+        pose_q=_twice(q),
+        pose_position=_twice(position[:, -1]),
+        pose_quaternion=_twice(quaternion[:, -1]),
+        trajectory_position=_twice(position),
+        trajectory_quaternion=_twice(quaternion),
+        pose_valid=np.stack([clear.T, (clear & nearer[:, None]).T]),
+    )
+    about = {
+        "source": source,
+        "demonstrations": [demonstration.name for demonstration in demonstrations],
+        "object_scale": scale,
+        "object_digest": store.digest(obj),
+    }
+    return obj, set_of(hand, row, fitting, options.seed, about)
+
+
+def _twice(values: np.ndarray) -> np.ndarray:
+    """The same for both variants (2, ...): the whole surface, and O+."""
+    return np.stack([values, values])
+
+
+def _ends_nearer_to_plus(wrist: np.ndarray, points: np.ndarray, minus: np.ndarray) -> np.ndarray:
+    """(M,) bool: wrist positions (M, 3) that agree with the affordance (`common.constraints.priority`)."""
+    away = np.linalg.norm(points[None] - wrist[:, None], axis=-1)
+    return away[:, ~minus].min(-1, initial=np.inf) < away[:, minus].min(-1, initial=np.inf)
+
+
+def _name(text: str) -> str:
+    """A text as the name of an object."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object"

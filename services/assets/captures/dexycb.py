@@ -1,0 +1,117 @@
+"""DexYCB: `<date>-subject-XX/<session>` with `meta.yml` and `pose.npz`, in metres, in the master camera's frame.
+
+`pose_y (F, n, 7)`: of each object quaternion (x, y, z, w) and position; `pose_m (F, 1, 51)`: MANO's root axis-angle, 45
+coefficients of its principal components, and a translation that is added to the vertices. What was not seen is all
+zeros, or the identity. Only the grasped object counts; which hand it is stands in `meta.yml`.
+"""
+
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands.mano import VARIABLE, ManoModel
+from services.assets.captures import mano
+from services.assets.captures.archive import read_archive
+from services.assets.captures.objects import Meshes
+from services.assets.captures.sequence import Dropped, Sequence
+
+OBJECTS = (
+    *("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle"),
+    *("007_tuna_fish_can", "008_pudding_box", "009_gelatin_box", "010_potted_meat_can", "011_banana"),
+    *("019_pitcher_base", "021_bleach_cleanser", "024_bowl", "025_mug", "035_power_drill", "036_wood_block"),
+    *("037_scissors", "040_large_marker", "051_large_clamp", "052_extra_large_clamp", "061_foam_brick"),
+)
+"""Names by DexYCB's ids, from 1."""
+
+
+def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterator[Sequence | Dropped]:
+    """The sequences of a session's folder, or of all of them in a folder.
+
+    Raises:
+      CongraspError: there is no MANO file.
+    """
+    if model is None:
+        raise CongraspError(
+            "DexYCB's hand poses need your own MANO_RIGHT.pkl.", f"Name it with --mano, or set {VARIABLE}."
+        )
+    root = next((folder for folder in (path, *path.parents) if (folder / "calibration").is_dir()), path)
+    found = meshes.beside(root / "models")
+    for file in sorted(path.glob("**/meta.yml")):
+        name = f"{file.parent.parent.name}/{file.parent.name}"
+        try:
+            yield _sequence(name, file.parent, root, found, model)
+        except Dropped as dropped:
+            yield dropped
+        except (CongraspError, yaml.YAMLError, OSError) as error:
+            yield Dropped(name, "unreadable", " ".join(str(error).split()))
+
+
+def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel) -> Sequence:
+    meta = _yaml(name, folder / "meta.yml")
+    sides = _value(name, meta, "mano_sides")
+    if sides != ["right"]:
+        raise Dropped(name, "left hand", f"the hand is the {', '.join(map(str, sides))} one")
+    ids, grasped = _value(name, meta, "ycb_ids"), int(_value(name, meta, "ycb_grasp_ind"))
+    if not 0 <= grasped < len(ids) or not 1 <= ids[grasped] <= len(OBJECTS):
+        raise Dropped(name, "wrong layout", f"'ycb_grasp_ind' {grasped} names none of the objects {ids}")
+    poses = read_archive(folder / "pose.npz")
+    objects, hands = (_poses(name, poses, key, width) for key, width in (("pose_y", 7), ("pose_m", 51)))
+    if len(objects) != len(hands) or objects.shape[1] != len(ids) or hands.shape[1] != 1:
+        raise Dropped(name, "wrong layout", f"'pose_y' {objects.shape} and 'pose_m' {hands.shape} do not fit meta.yml")
+    place, hand = objects[:, grasped], hands[:, 0]
+    seen = np.isfinite(np.concatenate([place, hand], 1)).all(-1)
+    present = seen & (hand != 0).any(-1) & (place[:, 4:] != 0).any(-1)
+    norm = np.linalg.norm(place[:, :4], axis=-1)
+    present &= np.abs(norm - 1) < 0.05
+    place, hand = np.where(present[:, None], place, [0, 0, 0, 1, 0, 0, 0]), np.where(present[:, None], hand, 0.0)
+    skeleton = mano.skeleton(model, _betas(name, root, _value(name, meta, "mano_calib")[0]))
+    angles = model.hand_mean + hand[:, 3:48] @ model.components
+    object_name = OBJECTS[ids[grasped] - 1]
+    return Sequence(
+        name=name,
+        object_name=object_name,
+        mesh=meshes.find(name, object_name, "textured_simple.obj"),
+        wrist_position=skeleton.wrist + hand[:, 48:],
+        wrist_rotation=mano.wrist_rotation(Rotation.from_rotvec(hand[:, :3]).as_matrix()),
+        joints=skeleton.joints(mano.axis_angles(angles)),
+        object_position=place[:, 4:],
+        object_rotation=Rotation.from_quat(place[:, :4]).as_matrix(),
+        present=present,
+    )
+
+
+def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise Dropped(name, "wrong layout", f"there is no {path.name} in {path.parent}")
+    content = yaml.safe_load(path.read_text())
+    if not isinstance(content, dict):
+        raise Dropped(name, "wrong layout", f"{path} holds no settings")
+    return content
+
+
+def _value(name: str, meta: dict[str, Any], key: str) -> Any:
+    if key not in meta:
+        raise Dropped(name, "wrong layout", f"meta.yml has no '{key}'")
+    return meta[key]
+
+
+def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
+    content = _yaml(name, root / "calibration" / f"mano_{calibration}" / "mano.yml")
+    betas = np.array(content.get("betas", []), float)
+    if betas.shape != (10,):
+        raise Dropped(name, "wrong layout", f"mano.yml of {calibration} has {betas.size} 'betas', not 10")
+    return betas
+
+
+def _poses(name: str, poses: dict[str, Any], key: str, width: int) -> np.ndarray:
+    if key not in poses:
+        raise Dropped(name, "wrong layout", f"pose.npz has no '{key}'")
+    array = np.asarray(poses[key], float)
+    if array.ndim != 3 or array.shape[2] != width:
+        raise Dropped(name, "wrong layout", f"'{key}' has the shape {array.shape}, not ('F', 'n', {width})")
+    return array

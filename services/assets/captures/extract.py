@@ -1,0 +1,273 @@
+"""From a captured sequence to a reference pose and a wrist trajectory, by the paper's rules (section Constraint Setup).
+
+The paper leaves some terms open; here they mean:
+
+* wrist-object distance: from the wrist's origin to the nearest point of the object's surface;
+* contact: a finger's skin within `CONTACT` of the surface, or below it;
+* continuous: the wrist moves at most `JUMP` between two frames, and at most `GAP` frames in a row are missing;
+* too complex: the path is more than `DETOUR` times its straight line, or the wrist turns by more than `TURN` in all.
+"""
+
+import dataclasses
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, Slerp
+
+from common.hands.human import HUMAN
+from common.objects.spec import GraspObject
+from services.assets.captures.fit import Fit, fit
+from services.assets.captures.sequence import FINGERS, Dropped, Sequence
+
+STABLE = 5
+"""Frames that thumb and another finger must touch in a row."""
+NEAREST = 0.08
+"""Least distance (m) from which a wrist must come."""
+FARTHEST = 0.20
+"""Distance (m) at which a trajectory begins at most."""
+CONTACT = 0.005
+JUMP = 0.10
+GAP = 3
+DETOUR = 2.0
+TURN = 2.5
+DIP = 0.01
+"""Metres by which the distance may fall, going backwards, before its maximum counts as passed."""
+BEYOND = 0.1
+_RADII = np.array([[0.010] * 3, *[[0.009, 0.0075, 0.0075]] * 3, [0.009, 0.0065, 0.0065]])
+"""(5, 3) m, skin radius of each bone: those that GraspXL gives the MANO hand."""
+_ALONG = (0.25, 0.5, 0.75, 1.0)
+_SPACING, _SAMPLES = 0.0015, (4000, 40_000)
+
+
+class Surface:
+    """A dense sample of an object's surface, to measure distances to it."""
+
+    def __init__(self, obj: GraspObject):
+        mesh = trimesh.Trimesh(obj.visual_vertices, obj.visual_faces, process=False)
+        count = int(np.clip(mesh.area / _SPACING**2, *_SAMPLES))
+        points, face = trimesh.sample.sample_surface(mesh, count, seed=0)
+        self.points, self._normals = np.asarray(points), np.asarray(mesh.face_normals)[face]
+        self._tree = cKDTree(self.points)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """(...,) distances of points (..., 3) in the object frame, m; negative inside."""
+        away, nearest = self._tree.query(points)
+        inside = ((points - self.points[nearest]) * self._normals[nearest]).sum(-1) < 0
+        return np.where(inside, -away, away)
+
+    def within(self, points: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        """(n, 3) samples of the surface within any of the balls (M, 3), (M,)."""
+        return self.points[sorted(set().union(*self._tree.query_ball_point(points, radii)))]
+
+
+@dataclasses.dataclass(frozen=True)
+class Demonstration:
+    """What is kept of a sequence, in the object frame."""
+
+    name: str
+    frame: int
+    """The grasping frame."""
+    start: int
+    """The frame of the farthest distance."""
+    fit: Fit
+    """Finger angles of the `human` hand and residual, before the limits."""
+    q: np.ndarray
+    """(20,) finger angles within its limits."""
+    position: np.ndarray
+    """(K, 3) wrist waypoints, from far to near; the last is the reference pose's."""
+    quaternion: np.ndarray
+    """(K, 4)."""
+    contact: np.ndarray
+    """(n, 3) points of the object's surface that fingers touch in the grasping frame."""
+
+
+def extract(
+    sequence: Sequence, obj: GraspObject, surface: Surface, waypoints: int, beyond: float = BEYOND
+) -> Demonstration:
+    """The reference pose and the trajectory of a sequence.
+
+    Args:
+      sequence: of frames.
+      obj: its object; `origin` says where the mesh file's origin is.
+      surface: of the object.
+      waypoints: K.
+      beyond: radians by which a captured joint may exceed its limits; it is then moved to the limit.
+
+    Raises:
+      Dropped: a rule excludes the sequence.
+    """
+    position, rotation = in_object_frame(sequence, obj)
+    far = surface.distance(np.where(sequence.present[:, None], position, 1e3))
+    if not sequence.present.any():
+        raise Dropped(sequence.name, "frames missing", "hand and object are in no frame together")
+    if far[sequence.present].min() > 1.0:
+        nearest = far[sequence.present].min()
+        reason = f"the wrist stays {nearest:.3g} m from the object: are its positions in metres?"
+        raise Dropped(sequence.name, "wrong units", reason)
+    skin = position[:, None, None] + np.einsum("tij,tfkj->tfki", rotation, sequence.joints)
+    frame = _grasping_frame(sequence, surface, skin)
+    start, path, turns = approach(sequence.name, position, rotation, far, sequence.present, frame, waypoints)
+    found = _fit(sequence, frame)
+    _check_limits(sequence.name, found.q, beyond)
+    return Demonstration(
+        name=sequence.name,
+        frame=frame,
+        start=start,
+        fit=found,
+        q=np.clip(found.q, HUMAN.lower, HUMAN.upper),
+        position=path,
+        quaternion=turns,
+        contact=surface.within(*_skin_balls(skin[frame], CONTACT)),
+    )
+
+
+def approach(
+    name: str,
+    position: np.ndarray,
+    rotation: np.ndarray,
+    far: np.ndarray,
+    present: np.ndarray,
+    frame: int,
+    waypoints: int,
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """The wrist trajectory that leads to a grasp.
+
+    Args:
+      name: of the motion.
+      position: (T, 3) of the wrist, m, object frame.
+      rotation: (T, 3, 3) of the wrist.
+      far: (T,) wrist-object distance, m.
+      present: (T,) bool, which frames are known.
+      frame: the grasping frame.
+      waypoints: K.
+
+    Returns:
+      The frame of the farthest distance, and waypoints (K, 3), (K, 4) from far to near.
+
+    Raises:
+      Dropped: the wrist starts too near, or its path is too complex.
+    """
+    start = _farthest(position, far, present, frame)
+    if far[start] < NEAREST:
+        reason = f"the wrist comes from {100 * far[start]:.1f} cm only ({100 * NEAREST:.0f} cm are needed)"
+        raise Dropped(name, "starts too near", reason)
+    frames = np.flatnonzero(present[start : frame + 1]) + start
+    path, turns = _truncated(position[frames], rotation[frames], far[frames])
+    _check_complexity(name, path, turns)
+    return start, *_resampled(path, turns, waypoints)
+
+
+def in_object_frame(sequence: Sequence, obj: GraspObject) -> tuple[np.ndarray, np.ndarray]:
+    """Wrist positions (T, 3) and rotations (T, 3, 3) in the object frame."""
+    back = np.swapaxes(sequence.object_rotation, -1, -2)
+    offset = sequence.wrist_position - sequence.object_position
+    return np.einsum("tij,tj->ti", back, offset) + obj.origin, back @ sequence.wrist_rotation
+
+
+def _grasping_frame(sequence: Sequence, surface: Surface, skin: np.ndarray) -> int:
+    if sequence.grasp is not None:
+        if not sequence.present[sequence.grasp]:
+            reason = f"hand or object is missing in its grasping frame {sequence.grasp}"
+            raise Dropped(sequence.name, "frames missing", reason)
+        return sequence.grasp
+    touching = sequence.touching
+    if touching is None:
+        points, radii = _bones(skin)
+        points = np.where(sequence.present[:, None, None, None, None], points, 1e3)
+        touching = (surface.distance(points) - radii <= CONTACT).any((-1, -2))
+    both = touching[:, 0] & touching[:, 1:].any(-1) & sequence.present
+    stable = np.convolve(both, np.ones(STABLE), "valid") == STABLE
+    if not stable.any():
+        ever = [name for name, touched in zip(FINGERS, touching[sequence.present].any(0), strict=True) if touched]
+        raise Dropped(
+            sequence.name,
+            "no stable contact",
+            f"thumb and another finger never touch the object for {STABLE} frames (ever touching: "
+            f"{', '.join(ever) or 'none'})",
+        )
+    return int(np.argmax(stable))
+
+
+def _bones(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (..., 5, 3, n, 3) along the bones between joints (..., 5, 4, 3), and the skin's radii (5, 3, 1)."""
+    share = np.array(_ALONG)[:, None]
+    points = (1 - share) * joints[..., :-1, None, :] + share * joints[..., 1:, None, :]
+    return points, _RADII[..., None]
+
+
+def _skin_balls(joints: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:
+    """Balls (n, 3), (n,) that fill the fingers with joints (5, 4, 3), larger by a margin."""
+    points, radii = _bones(joints)
+    return points.reshape(-1, 3), np.broadcast_to(radii + margin, points.shape[:-1]).ravel()
+
+
+def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame: int) -> int:
+    """The frame of the local maximum of the distance, backwards from the grasping frame along continuous motion."""
+    best = last = frame
+    for t in range(frame - 1, -1, -1):
+        if not present[t]:
+            continue
+        step = np.linalg.norm(position[last] - position[t])
+        if last - t > GAP + 1 or step > JUMP * (last - t) or far[t] < far[best] - DIP:
+            break
+        last = t
+        if far[t] > far[best]:
+            best = t
+    return best
+
+
+def _fit(sequence: Sequence, frame: int) -> Fit:
+    if sequence.q is not None:
+        return Fit(np.asarray(sequence.q[frame], float), 0.0, 0.0)
+    return fit(sequence.joints[frame])
+
+
+def _check_limits(name: str, q: np.ndarray, beyond: float) -> None:
+    excess = np.maximum(HUMAN.lower - q, q - HUMAN.upper)
+    worst = int(excess.argmax())
+    if excess[worst] > beyond:
+        raise Dropped(name, "joint limits", f"{HUMAN.joints[worst].name} is {excess[worst]:.2f} rad beyond its limits")
+
+
+def _truncated(path: np.ndarray, turns: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    """The path from where it comes within `FARTHEST` for the last time; that point lies between two frames."""
+    rotation = Rotation.from_matrix(turns)
+    beyond = np.flatnonzero(far > FARTHEST)
+    if len(beyond) == 0 or beyond[-1] == len(far) - 1:
+        return path, rotation
+    i = int(beyond[-1])
+    share = (far[i] - FARTHEST) / (far[i] - far[i + 1])
+    first = Slerp([0.0, 1.0], rotation[[i, i + 1]])(share)
+    start = (1 - share) * path[i] + share * path[i + 1]
+    return np.concatenate([start[None], path[i + 1 :]]), Rotation.concatenate([first, rotation[i + 1 :]])
+
+
+def _check_complexity(name: str, path: np.ndarray, turns: Rotation) -> None:
+    length = np.linalg.norm(np.diff(path, axis=0), axis=-1).sum()
+    straight = np.linalg.norm(path[-1] - path[0])
+    if length > DETOUR * straight:
+        raise Dropped(
+            name, "too complex", f"the wrist's path is {length / max(straight, 1e-9):.1f} times its straight line"
+        )
+    turn = float((turns[1:] * turns[:-1].inv()).magnitude().sum())
+    if turn > TURN:
+        raise Dropped(name, "too complex", f"the wrist turns by {turn:.1f} rad on its way")
+
+
+def _resampled(path: np.ndarray, turns: Rotation, waypoints: int) -> tuple[np.ndarray, np.ndarray]:
+    """K waypoints at equal distances along the path, with quaternions that are continuous in sign."""
+    length = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=-1).cumsum()])
+    # Where the wrist rests its length does not grow: of such frames the last one counts.
+    keep = np.append(np.diff(length) > 1e-6, True)
+    length, path, turns = length[keep], path[keep], turns[keep]
+    wanted = np.linspace(length[0], length[-1], waypoints)
+    position = np.stack([np.interp(wanted, length, axis) for axis in path.T], -1)
+    return position, continuous(Slerp(length, turns)(wanted))
+
+
+def continuous(turns: Rotation) -> np.ndarray:
+    """(K, 4) quaternions w x y z of rotations along a path, without a change of sign between neighbours."""
+    quaternion = turns.as_quat(scalar_first=True)
+    signs = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
+    return quaternion * np.cumprod([1.0, *signs])[:, None]

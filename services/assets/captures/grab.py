@@ -1,0 +1,136 @@
+"""GRAB: one NPZ file a sequence, `grab/s1/mug_drink_1.npz`, in metres, 120 frames a second.
+
+MANO's translation is added to the vertices, so that the wrist lies at the rest shape's wrist joint plus the
+translation. GRAB turns an object's vertices from the right: its rotation is the transpose of the one written. Where
+GrabNet's `frame_names.npz` lies in the folder, its first frame of a sequence is the grasping frame; otherwise the
+labels of the object's contacts say which fingers touch.
+"""
+
+import functools
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands.mano import ManoModel
+from services.assets.captures import mano
+from services.assets.captures.archive import read_archive
+from services.assets.captures.objects import Meshes
+from services.assets.captures.sequence import FINGERS, Dropped, Sequence
+
+_LABELS = {"thumb": (53, 55), "index": (41, 43), "middle": (44, 46), "ring": (50, 52), "little": (47, 49)}
+"""First and last contact label of each right finger."""
+
+
+def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterator[Sequence | Dropped]:
+    """The sequences of a file, or of all subjects' folders in a folder."""
+    root = _root(path)
+    found = meshes.beside(root / "tools" / "object_meshes" / "contact_meshes")
+    files = sorted(file for file in path.glob("**/s*/*.npz")) if path.is_dir() else [path]
+    named = _grasping_frames(root)
+    for file in files:
+        try:
+            yield _sequence(file, root, found, model, named)
+        except Dropped as dropped:
+            yield dropped
+        except CongraspError as error:
+            yield Dropped(file.stem, "unreadable", str(error))
+
+
+def _root(path: pathlib.Path) -> pathlib.Path:
+    """The folder that holds `tools`, at or above the path."""
+    return next((folder for folder in (path, *path.parents) if (folder / "tools").is_dir()), path)
+
+
+def _grasping_frames(root: pathlib.Path) -> dict[tuple[str, str], int]:
+    """The first grasping frame of each (subject, sequence) that GrabNet names."""
+    first: dict[tuple[str, str], int] = {}
+    for file in sorted(root.glob("**/frame_names.npz")) if root.is_dir() else []:
+        for name in np.ravel(read_archive(file).get("frame_names", [])):
+            *_, subject, sequence, frame = str(name).split("/")
+            number = int("".join(filter(str.isdigit, frame.removesuffix(".npz"))))
+            key = subject, sequence
+            first[key] = min(first.get(key, number), number)
+    return first
+
+
+def _sequence(
+    file: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel | None, named: dict[tuple[str, str], int]
+) -> Sequence:
+    name = f"{file.parent.name}/{file.stem}"
+    data = read_archive(file)
+    if "rhand" not in data and "lhand" in data:
+        raise Dropped(name, "left hand", "it has no right hand")
+    hand = _entry(name, data, "rhand", "params")
+    turn, shift, fingers = (_array(name, hand, "rhand", key, width) for key, width in _HAND.items())
+    place = _entry(name, data, "object", "params")
+    object_shift, object_turn = (_array(name, place, "object", key, 3) for key in ("transl", "global_orient"))
+    object_name = str(data.get("obj_name", file.stem.split("_")[0]))
+    subject = _template(root, data)
+    skeleton = _skeleton(model, subject)
+    frames = len(turn)
+    present = np.isfinite(np.concatenate([turn, shift, fingers], 1)).all(-1)
+    present &= np.isfinite(np.concatenate([object_shift, object_turn], 1)).all(-1)
+    for values in (turn, shift, fingers, object_shift, object_turn):
+        values[~present] = 0.0
+    return Sequence(
+        name=name,
+        object_name=object_name,
+        mesh=meshes.find(name, object_name),
+        wrist_position=skeleton.wrist + shift,
+        wrist_rotation=mano.wrist_rotation(Rotation.from_rotvec(turn).as_matrix()),
+        joints=skeleton.joints(mano.axis_angles(fingers)),
+        object_position=object_shift,
+        object_rotation=np.swapaxes(Rotation.from_rotvec(object_turn).as_matrix(), -1, -2),
+        present=present,
+        grasp=_grasp(named.get((file.parent.name, file.stem)), frames),
+        touching=_touching(data, frames),
+    )
+
+
+_HAND = {"global_orient": 3, "transl": 3, "fullpose": 45}
+
+
+def _entry(name: str, data: dict[str, Any], *keys: str) -> dict[str, Any]:
+    for key in keys:
+        if not isinstance(data, dict) or key not in data:
+            raise Dropped(name, "wrong layout", f"the file has no '{'/'.join(keys)}'")
+        data = data[key]
+    return data
+
+
+def _array(name: str, values: dict[str, Any], of: str, key: str, width: int) -> np.ndarray:
+    if key not in values:
+        raise Dropped(name, "wrong layout", f"the file has no '{of}/params/{key}'")
+    array = np.array(values[key], float)
+    if array.ndim != 2 or array.shape[1] != width:
+        raise Dropped(name, "wrong layout", f"'{of}/params/{key}' has the shape {array.shape}, not ('T', {width})")
+    return array
+
+
+def _template(root: pathlib.Path, data: dict[str, Any]) -> pathlib.Path | None:
+    """The mesh of the subject's right hand, where it is there."""
+    text = data["rhand"].get("vtemp")
+    path = root / str(text) if text is not None else None
+    return path if path is not None and path.is_file() else None
+
+
+@functools.lru_cache(maxsize=32)
+def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> mano.Skeleton:
+    return mano.skeleton(model, template=template)
+
+
+def _grasp(named: int | None, frames: int) -> int | None:
+    return named if named is not None and named < frames else None
+
+
+def _touching(data: dict[str, Any], frames: int) -> np.ndarray | None:
+    """(T, 5) bool, from the labels of the object's contacts."""
+    contact = data.get("contact")
+    labels = np.asarray(contact["object"]) if isinstance(contact, dict) and "object" in contact else None
+    if labels is None or labels.ndim != 2 or len(labels) != frames:
+        return None
+    return np.stack([((labels >= low) & (labels <= high)).any(-1) for low, high in (_LABELS[f] for f in FINGERS)], -1)

@@ -1,0 +1,95 @@
+"""MANO's pose parameters as joints of fingers, in the wrist frame of the `human` hand.
+
+MANO's wrist frame has the fingers towards -x, the back of the hand +y and the thumb's side +z. Without the user's own
+MANO file the bones are those of the `human` hand; then a thumb, whose rest directions differ, is off by some degrees.
+"""
+
+import dataclasses
+import pathlib
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands.human import HUMAN
+from common.hands.mano import MANO_FINGERS, TIP_VERTICES, ManoModel
+from services.assets.captures.fit import joint_positions
+from services.assets.captures.sequence import FINGERS
+
+TO_HUMAN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Vectors of MANO's wrist frame in that of the human hand."""
+MEAN_WRIST = np.array([0.0957, 0.0064, 0.0062])
+"""(3,) m, the wrist joint of the mean shape, which MANO's translation is added to."""
+_ORDER = [MANO_FINGERS.index(finger) for finger in FINGERS]
+
+
+@dataclasses.dataclass(frozen=True)
+class Skeleton:
+    """A subject's hand at rest, in MANO's frame."""
+
+    wrist: np.ndarray
+    """(3,) m."""
+    fingers: np.ndarray
+    """(5, 4, 3) joints and tip of each of `MANO_FINGERS`."""
+
+    def joints(self, rotations: np.ndarray) -> np.ndarray:
+        """(T, 5, 4, 3) joints and tips of `FINGERS` in the human hand's wrist frame.
+
+        Args:
+          rotations: (T, 15, 3, 3) of each joint against its parent, in MANO's order.
+        """
+        local = rotations.reshape(-1, 5, 3, 3, 3)
+        bones = np.diff(self.fingers, axis=1)
+        placed = [np.broadcast_to(self.fingers[:, 0] - self.wrist, (len(local), 5, 3))]
+        turn = np.broadcast_to(np.eye(3), (*local.shape[:2], 3, 3))
+        for k in range(3):
+            turn = turn @ local[:, :, k]
+            placed.append(placed[-1] + np.einsum("tfij,fj->tfi", turn, bones[:, k]))
+        return np.stack(placed, 2)[:, _ORDER] @ TO_HUMAN.T
+
+
+def skeleton(
+    model: ManoModel | None, betas: np.ndarray | None = None, template: pathlib.Path | None = None
+) -> Skeleton:
+    """A subject's skeleton.
+
+    Args:
+      model: the user's MANO file; the human hand's bones at MANO's mean wrist without.
+      betas: shape parameters.
+      template: a subject's own mesh at rest, in place of betas.
+    """
+    if model is None:
+        order = [FINGERS.index(finger) for finger in MANO_FINGERS]
+        rest = joint_positions(np.zeros(len(HUMAN.joints)))[order] @ TO_HUMAN
+        return Skeleton(MEAN_WRIST, rest + MEAN_WRIST)
+    joints, tips = model.skeleton(betas)
+    if template is not None:
+        vertices = read_vertices(template)
+        joints, tips = model.regressor @ vertices, vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]]
+    fingers = np.concatenate([joints[1:].reshape(5, 3, 3), tips[:, None]], 1)
+    return Skeleton(joints[0], fingers)
+
+
+def read_vertices(path: pathlib.Path) -> np.ndarray:
+    """(n, 3) vertices of a mesh or a point cloud, in the file's order.
+
+    Raises:
+      CongraspError: it cannot be read.
+    """
+    try:
+        found: Any = trimesh.load(path, process=False, maintain_order=True)
+        return np.asarray(found.vertices, float)
+    except Exception as error:  # the readers raise whatever they stumble over
+        raise CongraspError(f"{path} cannot be read: {' '.join(str(error).split())}.", "Get the file again.") from None
+
+
+def axis_angles(vectors: np.ndarray) -> np.ndarray:
+    """(T, n, 3, 3) rotation matrices of axis-angle vectors (T, 3 n)."""
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(len(vectors), -1, 3, 3)
+
+
+def wrist_rotation(matrices: np.ndarray) -> np.ndarray:
+    """(T, 3, 3) orientations of the human hand's wrist frame, from MANO's root rotations (T, 3, 3)."""
+    return matrices @ TO_HUMAN.T

@@ -1,0 +1,91 @@
+"""MyoDM's reference motions (MyoSuite): NPZ files with the joints of MyoHand, and an object's pose.
+
+`time (T,)` s; `robot (T, 29)`: three slides (m), three hinges, pronation, deviation and wrist flexion, then the twenty
+finger joints in the `human` hand's own order (rad); `object (T, 7)`: position (m) and quaternion (w, x, y, z). A file
+is named `MyoHand_<object>_<action>.npz`. The arm is MyoHand's on its table (Apache-2.0, MyoHub): slides and hinges move
+a base in front of the table, and the wrist hangs on it by shoulder, elbow and forearm, which are rigid. The object's
+slides are measured from a point above the table's middle.
+"""
+
+import pathlib
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands.mano import ManoModel
+from services.assets.captures.archive import read_archive
+from services.assets.captures.fit import joint_positions
+from services.assets.captures.objects import Meshes
+from services.assets.captures.sequence import Dropped, Sequence
+
+_KEYS = {"time": 0, "robot": 29, "object": 7}
+_BASE = np.array([0.1, -0.55, 0.32])
+_ELBOW = np.array([0.002797970, 0.304212085, -0.000513865])
+"""The forearm's origin in the base."""
+_FOREARM = Rotation.from_quat([0.000281544, 0.707106501, -0.000281544, 0.707106949], scalar_first=True)
+_PRONATION = np.array([-0.017161, 0.992666, -0.119668])
+_WRIST = np.array([0.018, -0.242, 0.025])
+"""The wrist in the forearm."""
+_OBJECT = np.array([0.0, 0.0, 0.035])
+_LARGEST = 2 * np.pi
+
+
+def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None = None) -> Iterator[Sequence | Dropped]:
+    """The sequences of a file, or of all NPZ files of a folder; MANO has no part in them."""
+    for file in sorted(path.glob("**/*.npz")) if path.is_dir() else [path]:
+        try:
+            yield _sequence(file, meshes)
+        except Dropped as dropped:
+            yield dropped
+        except CongraspError as error:
+            yield Dropped(file.stem, "unreadable", str(error))
+
+
+def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    """World positions (T, 3) and orientations of the wrist for MyoHand's first nine joints (T, 9)."""
+    arm = Rotation.from_euler("XYZ", robot[:, 3:6])
+    axis = _PRONATION / np.linalg.norm(_PRONATION)
+    forearm = arm * _FOREARM * Rotation.from_rotvec(robot[:, 6:7] * axis)
+    wrist = forearm * Rotation.from_rotvec(robot[:, 7:8] * [0, 0, 1]) * Rotation.from_rotvec(robot[:, 8:9] * [1, 0, 0])
+    return _BASE + robot[:, :3] + arm.apply(_ELBOW) + forearm.apply(_WRIST), wrist
+
+
+def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
+    name = file.stem
+    arrays = read_archive(file)
+    for key, width in _KEYS.items():
+        if key not in arrays:
+            raise Dropped(name, "wrong layout", f"the file has no '{key}'")
+        shape = arrays[key].shape
+        if len(shape) != (2 if width else 1) or (width and shape[1] != width) or len(arrays["time"]) != shape[0]:
+            raise Dropped(
+                name, "wrong layout", f"'{key}' has the shape {shape}, not {('T', width) if width else ('T',)}"
+            )
+    robot, pose = arrays["robot"].astype(float), arrays["object"].astype(float)
+    present = np.isfinite(robot).all(-1) & np.isfinite(pose).all(-1)
+    norm = np.linalg.norm(pose[:, 3:], axis=-1)
+    present &= np.abs(norm - 1) < 0.05
+    if not present.any():
+        raise Dropped(
+            name, "frames missing", "no frame has finite joints and an object with a unit quaternion (w, x, y, z)"
+        )
+    largest = float(np.abs(robot[present, 3:]).max())
+    if largest > _LARGEST:
+        raise Dropped(name, "wrong units", f"a joint is at {largest:.4g}: are its angles in radians?")
+    robot[~present], pose[~present] = robot[present][0], pose[present][0]
+    position, rotation = wrist_pose(robot)
+    object_name = name.removeprefix("MyoHand_").rsplit("_", 1)[0]
+    return Sequence(
+        name=name,
+        object_name=object_name,
+        mesh=meshes.find(name, object_name),
+        wrist_position=position,
+        wrist_rotation=rotation.as_matrix(),
+        joints=joint_positions(robot[:, 9:]),
+        object_position=pose[:, :3] + _OBJECT,
+        object_rotation=Rotation.from_quat(pose[:, 3:], scalar_first=True).as_matrix(),
+        present=present,
+        q=robot[:, 9:],
+    )

@@ -1,0 +1,151 @@
+"""OakInk-Image: annotations of frames as pickles, in metres, in a world frame; affordance from OakBase's parts.
+
+`anno/seq_all.json` lists [sequence, subject, frame, camera]; `anno/general_info/<those joined by __>.pkl` holds
+`hand_anno` (`hand_pose (16, 4)` quaternions (w, x, y, z), `hand_shape (10,)`, and `hand_tsl (3,)`, which is the wrist
+itself) and `obj_anno (4, 4)`. The same moments are annotated for several cameras, of which one is taken; frames are
+sorted. An object's mesh is centred on its bounding box before the annotated pose moves it.
+`OakBase/<category>/<object>` holds `part_*.ply` with `part_*.json`.
+"""
+
+import collections
+import functools
+import json
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands.mano import ManoModel
+from common.pickles import read_pickle
+from services.assets.captures import mano
+from services.assets.captures.objects import Meshes
+from services.assets.captures.sequence import Dropped, Part, Sequence
+from services.assets.objects.sources import read_mesh
+
+_Frames = list[tuple[int, str]]
+
+
+def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterator[Sequence | Dropped]:
+    """The sequences of the folder that holds `anno`.
+
+    Raises:
+      CongraspError: there is no list of sequences.
+    """
+    root = next((folder for folder in (path, path / "image") if (folder / "anno").is_dir()), path)
+    index = root / "anno" / "seq_all.json"
+    if not index.is_file():
+        raise CongraspError(f"There is no {index}.", "Name the folder that holds OakInk-Image's 'anno'.")
+    found = meshes.beside(root / "obj", path / "obj")
+    names = _names(path)
+    for (name, _), frames in sorted(_sequences(json.loads(index.read_text())).items()):
+        try:
+            yield _sequence(name, frames, root / "anno" / "general_info", found, model, names, path)
+        except Dropped as dropped:
+            yield dropped
+        except CongraspError as error:
+            yield Dropped(name, "unreadable", str(error))
+
+
+def _sequences(rows: list[list[Any]]) -> dict[tuple[str, int], _Frames]:
+    """(frame, file stem) of each sequence and subject, sorted, of the camera with the lowest number."""
+    cameras: dict[tuple[str, int], dict[int, _Frames]] = collections.defaultdict(lambda: collections.defaultdict(list))
+    for sequence, subject, frame, camera in rows:
+        stem = "__".join([str(sequence).replace("/", "__"), str(subject), str(frame), str(camera)])
+        cameras[str(sequence), int(subject)][int(camera)].append((int(frame), stem))
+    return {key: sorted(of_camera[min(of_camera)]) for key, of_camera in cameras.items()}
+
+
+def _names(path: pathlib.Path) -> dict[str, str]:
+    """Objects' names by their ids."""
+    names: dict[str, str] = {}
+    for file in sorted(path.glob("**/metaV2/*object_id.json")):
+        names |= {key: str(value.get("name", key)) for key, value in json.loads(file.read_text()).items()}
+    return names
+
+
+def _sequence(
+    name: str,
+    frames: _Frames,
+    folder: pathlib.Path,
+    meshes: Meshes,
+    model: ManoModel | None,
+    names: dict[str, str],
+    root: pathlib.Path,
+) -> Sequence:
+    object_id = name.split("_")[0]
+    object_name = names.get(object_id, object_id)
+    mesh = meshes.find(name, object_id if meshes.has(object_id) else object_name)
+    rows = [_frame(name, folder / f"{stem}.pkl") for _, stem in frames]
+    known = next((row for row in rows if row is not None), None)
+    if known is None:
+        raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
+    pose, shape, wrist, place = (np.stack([(row or known)[i] for row in rows]) for i in range(4))
+    norms = np.linalg.norm(pose, axis=-1)
+    if np.abs(norms - 1).max() > 0.05:
+        raise Dropped(
+            name, "wrong layout", f"a quaternion of 'hand_pose' has the length {norms.flat[norms.argmin()]:.3g}"
+        )
+    skeleton = mano.skeleton(model, shape[0])
+    rotations = Rotation.from_quat(pose.reshape(-1, 4), scalar_first=True).as_matrix().reshape(-1, 16, 3, 3)
+    turn = place[:, :3, :3]
+    return Sequence(
+        name=name,
+        object_name=object_name,
+        mesh=mesh,
+        wrist_position=wrist,
+        wrist_rotation=mano.wrist_rotation(rotations[:, 0]),
+        joints=skeleton.joints(rotations[:, 1:]),
+        object_position=place[:, :3, 3] - turn @ _middle(mesh),
+        object_rotation=turn,
+        present=np.array([row is not None for row in rows]),
+        parts=_parts(root, object_name, object_id),
+    )
+
+
+def _frame(name: str, file: pathlib.Path) -> tuple[np.ndarray, ...] | None:
+    """Hand pose (16, 4), shape (10,), wrist (3,) and object pose (4, 4); nothing where the frame is missing."""
+    if not file.is_file():
+        return None
+    content = read_pickle(file, mixed=True)
+    for key in ("hand_anno", "obj_anno"):
+        if not isinstance(content, dict) or key not in content:
+            raise Dropped(name, "wrong layout", f"{file.name} has no '{key}'")
+    hand = content["hand_anno"]
+    if hand is None or content["obj_anno"] is None:
+        return None
+    values = []
+    for key, shape in (("hand_pose", (16, 4)), ("hand_shape", (10,)), ("hand_tsl", (3,))):
+        if key not in hand:
+            raise Dropped(name, "wrong layout", f"{file.name} has no 'hand_anno/{key}'")
+        values.append(_shaped(name, file, key, hand[key], shape))
+    return (*values, _shaped(name, file, "obj_anno", content["obj_anno"], (4, 4)))
+
+
+def _shaped(name: str, file: pathlib.Path, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(value, float)
+    if array.size != np.prod(shape):
+        raise Dropped(name, "wrong layout", f"'{key}' of {file.name} has the shape {array.shape}, not {shape}")
+    return array.reshape(shape)
+
+
+@functools.lru_cache(maxsize=64)
+def _middle(mesh: pathlib.Path) -> np.ndarray:
+    """(3,) middle of the bounding box of a mesh."""
+    return np.asarray(read_mesh(mesh).bounds, float).mean(0)
+
+
+@functools.lru_cache(maxsize=64)
+def _parts(root: pathlib.Path, *names: str) -> tuple[Part, ...]:
+    """The labelled parts of an object in OakBase, if it is there."""
+    folder = next((f for name in names for f in sorted(root.glob(f"**/OakBase/*/{name}")) if f.is_dir()), None)
+    if folder is None:
+        return ()
+    parts = []
+    for file in sorted(folder.glob("part_*.ply")):
+        labels = file.with_suffix(".json")
+        label = json.loads(labels.read_text()).get("name", file.stem) if labels.is_file() else file.stem
+        parts.append(Part(str(label), mano.read_vertices(file)))
+    return tuple(parts) if len(parts) > 1 else ()

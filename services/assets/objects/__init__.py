@@ -1,0 +1,1 @@
+"""From files to objects: finding, reading, mending, scaling and cutting meshes."""

@@ -1,0 +1,167 @@
+"""Which part of an object may be grasped: new partitions of its surface into O+ and O-.
+
+From a mesh of one part, from painted vertices, from a half-space, or from points that were touched. All of them label
+the object's surface points; nothing else about the object changes.
+"""
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from common.errors import CongraspError
+from common.objects.spec import GraspObject
+from services.assets.objects.sources import read_mesh
+
+LEAST_SHARE = 0.10
+"""Least share of the surface that O+ must have (paper, section Constraint Setup)."""
+_ON_PART = 0.003  # m; a surface point this near to a part's mesh belongs to the part
+_SAME_BOX = 0.1  # share of an object's length by which the bounding box of its painted file may be off
+_COLOUR_TOLERANCE = 60  # largest distance of two colours in RGB that count as one
+
+
+def relabelled(
+    obj: GraspObject, labels: np.ndarray, names: Sequence[str], graspable: Sequence[bool], name: str = ""
+) -> GraspObject:
+    """The object with other parts.
+
+    Args:
+      obj: the object.
+      labels: (512,) part of each of its surface points.
+      names: of the parts.
+      graspable: which of them form O+.
+      name: of the new object, if it is to have another.
+
+    Raises:
+      CongraspError: O+ has less than a tenth of the surface.
+    """
+    labels = np.asarray(labels, np.int32)
+    share = float(np.asarray(graspable, bool)[labels].mean())
+    if share < LEAST_SHARE:
+        raise CongraspError(
+            f"The graspable region of '{obj.name}' is {share:.0%} of its surface.",
+            f"It must be {LEAST_SHARE:.0%} at least: choose a larger part, or swap the parts with --invert.",
+        )
+    near = cKDTree(obj.points)
+    pieces = tuple(
+        dataclasses.replace(piece, part=int(np.bincount(labels[near.query(corners)[1]]).argmax()))
+        for piece, corners in (
+            (piece, np.asarray(piece.pos)[None] if piece.vertices is None else piece.vertices + piece.pos)
+            for piece in obj.pieces
+        )
+    )
+    return dataclasses.replace(
+        obj,
+        name=name or obj.name,
+        pieces=pieces,
+        part_names=tuple(names),
+        graspable=np.array(graspable, bool),
+        labels=labels,
+    )
+
+
+def two_parts(
+    obj: GraspObject, plus: np.ndarray, name: str = "", words: Sequence[str] = ("grasp", "avoid")
+) -> GraspObject:
+    """The object with the surface points `plus` (512,) bool as O+, and the others as O-."""
+    return relabelled(obj, np.where(plus, 0, 1), words, (True, False), name)
+
+
+def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> np.ndarray:
+    """(512,) bool: surface points x with normal . x >= offset (m), in the object frame."""
+    length = float(np.linalg.norm(normal))
+    if not np.isfinite(length) or length < 1e-9:
+        raise CongraspError(f"The direction {tuple(normal)} has no length.", "Give three finite numbers, not all zero.")
+    farthest = float(np.linalg.norm(obj.points, axis=-1).max())
+    if not abs(offset) <= farthest:
+        raise CongraspError(
+            f"The plane at {offset:g} m misses '{obj.name}', which reaches {farthest:.3f} m from its centre of mass.",
+            "Give the distance from there in metres.",
+        )
+    return obj.points @ (np.asarray(normal, float) / length) >= offset
+
+
+def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
+    """(512,) bool: surface points that lie on the mesh of a part.
+
+    Args:
+      obj: an imported object.
+      path: the part, in the frame and unit of the file that the object was imported from.
+
+    Raises:
+      CongraspError: the mesh cannot be read, or lies elsewhere.
+    """
+    dense, _ = trimesh.sample.sample_surface(read_mesh(path), 8000, seed=0)
+    distance = cKDTree(np.asarray(dense) * obj.file_scale + obj.origin).query(obj.points)[0]
+    if distance.min() > _ON_PART:
+        raise CongraspError(
+            f"{path} lies {100 * distance.min():.1f} cm from the surface of '{obj.name}'.",
+            "The part must be in the frame and unit of the object's own file.",
+        )
+    return distance <= _ON_PART
+
+
+def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) -> np.ndarray:
+    """(512,) bool: surface points whose nearest vertex in a coloured PLY file has a colour.
+
+    Args:
+      obj: an imported object.
+      path: its mesh with coloured vertices, in the frame and unit of the file that it was imported from.
+      colour: red, green and blue, 0 to 255.
+
+    Raises:
+      CongraspError: the file has no coloured vertices, none of this colour, or shows something else than the object.
+    """
+    if not path.is_file():
+        raise CongraspError(f"There is no file {path}.", "Check the path.")
+    try:
+        mesh: Any = trimesh.load(path, process=False)
+    except Exception as error:  # the readers raise whatever they stumble over
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise CongraspError(f"{path} cannot be read: {reason}.", "Export it as PLY with coloured vertices.") from None
+    visual = getattr(mesh, "visual", None)
+    colours = getattr(visual, "vertex_colors", None) if getattr(visual, "kind", None) == "vertex" else None
+    if colours is None and isinstance(mesh, trimesh.PointCloud):
+        colours = mesh.colors if len(mesh.colors) else None
+    if colours is None:
+        raise CongraspError(f"{path} has no coloured vertices.", "Paint them and export as PLY with colours.")
+    vertices = np.asarray(mesh.vertices, float) * obj.file_scale + obj.origin
+    finite = np.isfinite(vertices).all(-1)
+    vertices, rgb = vertices[finite], np.asarray(colours)[finite, :3].astype(int)
+    _check_box(obj, path, vertices)
+    same = np.linalg.norm(rgb - np.array(colour), axis=-1) <= _COLOUR_TOLERANCE
+    if not same.any():
+        seen = ", ".join("#{:02x}{:02x}{:02x}".format(*row) for row in _commonest(rgb))
+        given = "#{:02x}{:02x}{:02x}".format(*colour)
+        raise CongraspError(f"No vertex of {path} has the colour {given}.", f"Its colours are {seen}.")
+    return same[cKDTree(vertices).query(obj.points)[1]]
+
+
+def _check_box(obj: GraspObject, path: pathlib.Path, vertices: np.ndarray) -> None:
+    """Raises a CongraspError if vertices (n, 3), m, object frame, do not span what the object does."""
+    if not len(vertices):
+        raise CongraspError(f"{path} has no vertex of finite numbers.", "Export it again.")
+    own, other = (np.stack([x.min(0), x.max(0)]) for x in (obj.visual_vertices, vertices))
+    off = float(np.abs(own - other).max())
+    if off > _SAME_BOX * np.ptp(own, axis=0).max():
+        raise CongraspError(
+            f"{path} does not show '{obj.name}': its bounding box is off by {100 * off:.3g} cm.",
+            "It must be in the frame and unit of the object's own file.",
+        )
+
+
+def near_points(obj: GraspObject, points: np.ndarray, radius: float) -> np.ndarray:
+    """(512,) bool: surface points within `radius` (m) of any of the points (n, 3) of the object frame."""
+    if len(points) == 0:
+        return np.zeros(len(obj.points), bool)
+    return cKDTree(points).query(obj.points)[0] <= radius
+
+
+def _commonest(rgb: np.ndarray) -> np.ndarray:
+    """The five colours (n, 3) that most rows (N, 3) have."""
+    colours, counts = np.unique(rgb, axis=0, return_counts=True)
+    return colours[np.argsort(-counts)[:5]]

@@ -1,0 +1,296 @@
+"""Import of meshes: from files to a `GraspObject`, with every complaint in one line."""
+
+import dataclasses
+import hashlib
+import os
+import pathlib
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import trimesh
+from scipy.spatial import QhullError, cKDTree
+
+from common.errors import CongraspError
+from common.objects import shapes, store
+from common.objects.procedural import MASS_RANGE
+from common.objects.resting import rest_poses
+from common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
+from common.objects.surface import halves, mass_properties, sample_mesh
+from services.assets.objects import decompose, repair
+from services.assets.objects.sizes import Unit, metres_per_unit
+from services.assets.objects.sources import MeshFile, Source, find_sources, read_mesh
+
+UNLABELLED = ("near half", "far half")
+"""Parts of an object whose files name none."""
+_CACHE_VERSION = 3
+_MAX_FACES = 20_000
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportOptions:
+    """How meshes become objects; the string under a field is its help on the command line."""
+
+    unit: Unit = "auto"
+    """Unit of the files' numbers; auto takes metres if that makes an object of 1 to 60 cm, and asks otherwise; guess
+    then takes the unit that fits, if only one does."""
+    scale: float = 1.0
+    """Factor on the size, after the unit."""
+    density: float = 500.0
+    """kg/m^3, for the mass where none is given; that mass is kept between 0.05 and 0.5 kg."""
+    mass: float | None = None
+    """Mass in kg."""
+    time_limit: float = 60.0
+    """Seconds for the convex decomposition (CoACD) of one mesh; V-HACD takes over after it."""
+    max_pieces: int = MAX_MESH_PIECES
+    """Most convex pieces of an object; more are merged."""
+    cache_dir: str = ""
+    """Folder that remembers finished imports; empty means the user's cache folder."""
+
+
+def import_paths(paths: Sequence[str | os.PathLike[str]], options: ImportOptions | None = None) -> list[GraspObject]:
+    """Imports everything that the paths hold; see `find_sources` for what they may be.
+
+    Raises:
+      CongraspError: a mesh cannot be used; the line names it, its fault and the remedy.
+    """
+    options = options or ImportOptions()
+    return [import_source(source, options)[0] for path in paths for source in find_sources(path)]
+
+
+def import_source(source: Source, options: ImportOptions) -> tuple[GraspObject, list[str]]:
+    """Imports one object.
+
+    Its origin moves to the centre of mass; its orientation stays the file's. Parts come from part files; an object
+    without them is labelled by its two halves, the slimmer one graspable.
+
+    Returns:
+      The object, and what the user should know about it.
+
+    Raises:
+      CongraspError: see `import_paths`.
+    """
+    check_options(options)
+    key = _cache_key(source, options)
+    cached = _cache_folder(options) / f"{key}{store.SUFFIX}"
+    if cached.is_file():
+        try:
+            obj = store.load(cached)
+            return obj, list(obj.notes)
+        except CongraspError:
+            cached.unlink()
+    notes: list[str] = []
+    obj = _build(source, options, int(key, 16), notes)
+    store.save(obj, cached)
+    return obj, notes
+
+
+def check_options(options: ImportOptions) -> None:
+    """Raises a CongraspError for numbers that are not positive."""
+    for name in ("scale", "density", "time_limit", "max_pieces"):
+        if not getattr(options, name) > 0:
+            raise CongraspError(f"--{name.replace('_', '-')} is {getattr(options, name)}.", "It must be positive.")
+    if options.mass is not None and not options.mass > 0:
+        raise CongraspError(f"--mass is {options.mass}.", "It must be positive, in kilograms.")
+
+
+def _cache_folder(options: ImportOptions) -> pathlib.Path:
+    if options.cache_dir:
+        return pathlib.Path(options.cache_dir)
+    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "objects"
+
+
+def _cache_key(source: Source, options: ImportOptions) -> str:
+    settings = dataclasses.replace(options, cache_dir="")
+    content = hashlib.sha256(f"{_CACHE_VERSION} {source.name} {settings}".encode())
+    for file in source.files():
+        content.update(f" {file.path.name} {file.role} {file.part} ".encode())
+        content.update(hashlib.sha256(file.path.read_bytes()).digest())
+    return content.hexdigest()[:24]
+
+
+def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) -> GraspObject:
+    visuals = [read_mesh(file.path, notes) for file in source.visuals] or [
+        shapes.triangulate(_corners(file)) for file in source.pieces
+    ]
+    if not (source.pieces or source.parts):
+        visuals = [repair.closed(repair.largest_body(mesh, notes), notes) for mesh in visuals]
+    sides = tuple(_joined(visuals).extents.tolist())
+    factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
+    meshes = [_scaled(mesh, factor) for mesh in visuals]
+    whole = _joined(meshes)
+    closed = all(mesh.is_volume for mesh in meshes)
+    if not closed:
+        stand_in = "convex pieces" if source.pieces else "convex hull"
+        notes.append(
+            f"its surface is open, so that nobody knows what is inside: mass and inertia are those of its {stand_in} "
+            "(--mass sets the mass)"
+        )
+    hulls, owners = _pieces(source, meshes, factor, closed, options, notes)
+    solids = hulls if source.pieces else [np.asarray(whole.vertices)]
+    mass, center, inertia = _weigh(whole if closed else None, solids, options)
+    pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
+    whole.apply_translation(-center)
+    points, normals, face = sample_mesh(
+        np.asarray(whole.triangles), pieces, np.random.default_rng(seed), oriented=closed
+    )
+    part_names, graspable, labels = _labels(source, meshes, factor, center, points, face)
+    share = graspable[labels].mean()
+    if not 0.1 <= share <= 0.9:
+        notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
+    if not source.parts_are_pieces:
+        near = cKDTree(points)
+        votes = (labels[near.query(np.asarray(piece.vertices) + piece.pos)[1]] for piece in pieces)
+        pieces = tuple(
+            dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
+            for piece, vote in zip(pieces, votes, strict=True)
+        )
+    picture = _reduced(whole)
+    obj = GraspObject(
+        name=source.name,
+        family="imported",
+        pieces=pieces,
+        part_names=part_names,
+        graspable=graspable,
+        mass=mass,
+        inertia=inertia,
+        points=points.astype(np.float32),
+        normals=normals.astype(np.float32),
+        labels=labels.astype(np.int32),
+        rest_poses=np.zeros((0, 7)),
+        visual_vertices=np.asarray(picture.vertices, np.float32),
+        visual_faces=np.asarray(picture.faces, np.int32),
+        origin=tuple((-center).tolist()),
+        file_scale=factor,
+        notes=tuple(notes),
+    )
+    return dataclasses.replace(obj, rest_poses=rest_poses(obj))
+
+
+def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
+    return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)
+
+
+def _reduced(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with at most `_MAX_FACES` faces."""
+    return mesh if len(mesh.faces) <= _MAX_FACES else mesh.simplify_quadric_decimation(face_count=_MAX_FACES)
+
+
+def _corners(file: MeshFile) -> np.ndarray:
+    return np.asarray(read_mesh(file.path).vertices, np.float64)
+
+
+def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
+    mesh = mesh.copy()
+    mesh.apply_scale(factor)
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh
+
+
+def _pieces(
+    source: Source,
+    meshes: list[trimesh.Trimesh],
+    factor: float,
+    closed: bool,
+    options: ImportOptions,
+    notes: list[str],
+) -> tuple[list[np.ndarray], list[int]]:
+    """Vertices of at most `max_pieces` simple convex pieces, and the part of each (0 where the parts are labels)."""
+    hulls: list[np.ndarray] = []
+    owners: list[int] = []
+    missing = 0.0
+    try:
+        if source.pieces:
+            groups, limits = [[_corners(file) * factor for file in source.pieces]], [options.max_pieces]
+        else:
+            volumes = np.array([shapes.hull_of(mesh.vertices).volume for mesh in meshes])
+            limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
+            groups = []
+            for mesh, limit in zip(meshes, limits, strict=True):
+                small = _reduced(mesh)
+                found = decompose.decompose(
+                    np.asarray(small.vertices),
+                    np.asarray(small.faces),
+                    fill=float(mesh.volume) if closed else None,
+                    time_limit=options.time_limit,
+                    max_pieces=limit,
+                )
+                groups.append(found.pieces)
+                notes.extend(found.notes)
+        for owner, (group, limit) in enumerate(zip(groups, limits, strict=True)):
+            merged = decompose.merge(group, limit)
+            before, after = (sum(shapes.hull_of(piece).volume for piece in pieces) for pieces in (group, merged))
+            if after > 1.1 * before:
+                notes.append(
+                    f"{len(group)} convex pieces were merged into {len(merged)}, whose volume is "
+                    f"{after / before - 1:.0%} larger: some hollows are filled (--max-pieces)"
+                )
+            for piece in merged:
+                vertices, lost = decompose.simplify(piece)
+                hulls.append(vertices)
+                owners.append(owner if source.parts_are_pieces else 0)
+                missing = max(missing, lost)
+    except QhullError:
+        raise CongraspError(
+            f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
+        ) from None
+    if missing > 0.1:
+        notes.append(
+            "its round parts are a little angular in the simulation: pieces have 32 vertices "
+            f"(up to {missing:.0%} of a piece's volume is made up by its scale)"
+        )
+    return hulls, owners
+
+
+def _weigh(
+    closed: trimesh.Trimesh | None, solids: Iterable[np.ndarray], options: ImportOptions
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre of mass and inertia: of the mesh if it is closed, of convex solids (V, 3) otherwise."""
+    if closed is not None:
+        properties = closed.mass_properties
+        volume, center = float(properties["volume"]), np.asarray(properties["center_mass"])
+        per_volume = np.asarray(properties["inertia"]) / volume
+    else:
+        pieces = tuple(Piece("mesh", (0, 0, 0), vertices=solid) for solid in solids)
+        volume, center, inertia = mass_properties(pieces, np.ones(len(pieces)))
+        per_volume = inertia / volume
+    mass = float(np.clip(volume * options.density, *MASS_RANGE)) if options.mass is None else options.mass
+    return mass, center, per_volume * mass
+
+
+def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
+    middle = hull.mean(0)
+    return Piece("mesh", (0.0, 0.0, 0.0), tuple((middle - center).tolist()), vertices=hull - middle, part=part)
+
+
+def _labels(
+    source: Source,
+    meshes: list[trimesh.Trimesh],
+    factor: float,
+    center: np.ndarray,
+    points: np.ndarray,
+    face: np.ndarray,
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Names of the parts, which of them form O+, and the part (N,) of each surface point."""
+    if source.parts_are_pieces:
+        ends = np.cumsum([len(mesh.faces) for mesh in meshes])
+        labels = np.searchsorted(ends, face, side="right")
+    elif source.parts:
+        distances = []
+        for file in source.parts:
+            part = read_mesh(file.path)
+            dense, _ = trimesh.sample.sample_surface(part, 4000, seed=0)
+            distances.append(cKDTree(dense * factor - center).query(points)[0])
+        labels = np.argmin(distances, axis=0)
+    else:
+        labels = halves(points, 0.5)
+        middle = [points[labels == k] - points[labels == k].mean(0) for k in (0, 1)]
+        slim = int(np.argmin([np.linalg.svd(half, compute_uv=False)[2] / np.sqrt(len(half)) for half in middle]))
+        return UNLABELLED, np.arange(2) == slim, labels
+    files = source.parts
+    graspable = np.array([bool(file.graspable) for file in files])
+    if graspable.all() or not graspable.any():
+        graspable = np.arange(len(files)) == np.bincount(labels, minlength=len(files)).argmax()
+    return tuple(file.part for file in files), graspable, labels

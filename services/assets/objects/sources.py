@@ -1,0 +1,167 @@
+"""What a path offers for import: single meshes, decomposed objects, objects in part files; and reading one mesh."""
+
+import dataclasses
+import os
+import pathlib
+from typing import Literal
+
+import numpy as np
+import trimesh
+
+from common.errors import CongraspError
+from services.assets.objects import repair
+from services.assets.objects.kinds import CONVERT, SUFFIXES, kind_of
+
+_GRASPABLE_WORDS = ("handle", "grip", "neck", "stem", "shaft", "body")
+# GraspXL marks the absence of a non-graspable part by a cube of 1 cm here (m).
+_NO_PART = 0.346408
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshFile:
+    """One mesh of an object."""
+
+    path: pathlib.Path
+    role: Literal["visual", "piece", "part"]
+    part: str = ""
+    """Name of the part that it shows."""
+    graspable: bool = True
+    """Whether that part belongs to O+."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """The files of one object."""
+
+    name: str
+    path: pathlib.Path
+    visuals: tuple[MeshFile, ...]
+    """The surface; part files where these are the surface themselves."""
+    pieces: tuple[MeshFile, ...] = ()
+    """Convex pieces, if it is already decomposed."""
+    parts: tuple[MeshFile, ...] = ()
+    """Meshes that show which part of the surface is which."""
+
+    @property
+    def parts_are_pieces(self) -> bool:
+        """Whether the part files together are the object, so that no collision piece spans two of them."""
+        return bool(self.parts) and self.visuals == self.parts
+
+    def files(self) -> tuple[MeshFile, ...]:
+        """All files, without repetition."""
+        return tuple(dict.fromkeys(self.visuals + self.pieces + self.parts))
+
+
+def find_sources(path: str | os.PathLike[str]) -> list[Source]:
+    """The objects that a path holds.
+
+    * A mesh file (STL, OBJ, PLY, GLB) is one object.
+    * A folder with `graspable.*` and `non_graspable.*` (or `top*` and `bottom*`) is one object of two parts.
+    * A folder with `contact*` files is one object that is already cut into convex pieces. Its other meshes show it:
+      `<name>.stl` the whole, `<name>_<part>.stl` its parts.
+    * A folder with `<name>.*` and `<name>_<part>.*` is one object with labelled parts.
+    * In any other folder every mesh is an object; a folder without meshes stands for its subfolders.
+
+    Raises:
+      CongraspError: there is nothing to import.
+    """
+    path = pathlib.Path(path)
+    if path.is_file():
+        return [Source(_name(path.stem), path, (MeshFile(path, "visual"),))]
+    if not path.is_dir():
+        raise CongraspError(f"There is no file or folder {path}.", "Check the path.")
+    meshes = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+    if not meshes:
+        found = [source for folder in sorted(path.iterdir()) if folder.is_dir() for source in _nested(folder)]
+        if not found:
+            raise CongraspError(f"The folder {path} holds no STL, OBJ, PLY or GLB file.", CONVERT)
+        return found
+    return _in_folder(path, meshes)
+
+
+def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Trimesh:
+    """Reads one mesh, in the file's own unit, with merged vertices and without degenerate triangles.
+
+    Args:
+      path: the file; its content counts, not its name.
+      notes: what was mended is added to it.
+
+    Raises:
+      CongraspError: not a mesh, empty, or not finite.
+    """
+    said = [] if notes is None else notes
+    suffix = kind_of(path)
+    kind = suffix[1:].upper()
+    if suffix != path.suffix.lower():
+        said.append(f"its content is {kind}, whatever its name says, and was read as that")
+    try:
+        mesh = trimesh.load_scene(path, file_type=suffix[1:], process=False).to_mesh()
+    except Exception as error:  # the readers raise whatever they stumble over
+        reason = (str(error) or type(error).__name__).splitlines()[0].rstrip(" .!")
+        raise CongraspError(f"{path} cannot be read as {kind}: {reason}.", "Export it again, or convert it.") from None
+    if len(mesh.faces) == 0:
+        points = f"only {len(mesh.vertices)} points" if len(mesh.vertices) else "nothing that can be read as a mesh"
+        raise CongraspError(f"{path} has no triangles: it holds {points}.", f"Export it as a triangle mesh ({kind}).")
+    finite = repair.without_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), said)
+    if finite is None:
+        bad = int((~np.isfinite(mesh.vertices)).any(-1).sum())
+        raise CongraspError(f"{path} has {bad} vertices that are not finite numbers.", "Repair or export it again.")
+    mesh = trimesh.Trimesh(*repair.reduced(*finite, said), process=False)
+    mesh.merge_vertices()
+    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) < 4:
+        raise CongraspError(f"{path} has no volume: only {len(mesh.faces)} proper triangles.", "Export a closed mesh.")
+    return mesh
+
+
+def _nested(folder: pathlib.Path) -> list[Source]:
+    meshes = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+    return _in_folder(folder, meshes) if meshes else []
+
+
+def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]:
+    name = _name(folder.resolve().name)
+    two = _two_parts(meshes)
+    if two:
+        return [Source(name, folder, two, (), two)]
+    pieces = tuple(MeshFile(file, "piece") for file in meshes if file.stem.startswith("contact"))
+    others = [file for file in meshes if not file.stem.startswith("contact")]
+    main = next((file for file in others if all(o.stem.startswith(file.stem) for o in others)), None)
+    if others and main is None:
+        if not pieces:
+            return [Source(_name(file.stem), file, (MeshFile(file, "visual"),)) for file in others]
+        raise CongraspError(
+            f"The folder {folder} has contact pieces, but it is not clear which mesh shows the whole object.",
+            f"Name it {name}{others[0].suffix} and its parts {name}_<part>{others[0].suffix}.",
+        )
+    visuals = (MeshFile(main, "visual"),) if main else ()
+    parts = tuple(_part(file, file.stem[len(main.stem) :].strip("_- ")) for file in others if main and file != main)
+    return [Source(name, folder, visuals, pieces, parts if len(parts) > 1 else ())]
+
+
+def _part(file: pathlib.Path, part: str) -> MeshFile:
+    return MeshFile(file, "part", part, any(word in part.lower() for word in _GRASPABLE_WORDS))
+
+
+def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
+    """The graspable and the non-graspable file, or none; one of them suffices."""
+    found: dict[bool, pathlib.Path] = {}
+    for file in meshes:
+        stem = file.stem.lower()
+        if stem == "graspable" or stem.startswith("top"):
+            found.setdefault(True, file)
+        elif stem == "non_graspable" or stem.startswith("bottom"):
+            found.setdefault(False, file)
+    if True not in found:
+        return ()
+    if False in found and np.allclose(read_mesh(found[False]).bounds.mean(0), _NO_PART, atol=0.01):
+        del found[False]
+    names = {True: "graspable", False: "non-graspable"}
+    return tuple(MeshFile(found[key], "part", names[key], key) for key in (True, False) if key in found)
+
+
+def _name(text: str) -> str:
+    """A name that can be a file name."""
+    safe = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in text).lstrip("._-")
+    return safe or "object"

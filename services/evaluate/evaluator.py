@@ -1,0 +1,397 @@
+"""Evaluation by the paper's protocol: the deterministic policy under chosen constraints on a pool of objects."""
+
+import contextlib
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from actors.environment import METRICS, EnvironmentState
+from actors.episode import episode_message
+from actors.rollout import Rollout, RolloutWorker, Trace, finished_episodes, goal_of_world
+from actors.taskset import TaskSet, build_taskset
+from common.config import PhysicsName, TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects.pool import sized
+from common.objects.spec import GraspObject
+from common.policy.bundle import PolicyBundle
+from common.task.types import Surface
+from common.wire.codec import Message
+from services.evaluate.noise import LEVELS, Noise, disturbed
+from services.evaluate.scores import Row, Sample, active_mask, joined, matching, summarise
+from services.evaluate.worlds import NOMINAL_FRICTION, acting, mixture, protocol, two_seconds
+
+_BATCH = {"native": 64, "warp": 4096, "jax": 256}
+_PATIENCE = 100
+_TRIES = 40
+_REFERENCES = 4
+"""References that an object needs, on average."""
+_KEPT = 8
+"""Episodes of a row that can be looked at afterwards: so many that hold the object to the end, and so many others."""
+
+
+class Evaluator:
+    """A policy on a pool of objects."""
+
+    def __init__(
+        self,
+        bundle: PolicyBundle,
+        objects: Sequence[GraspObject],
+        *,
+        physics: PhysicsName = "native",
+        batch: int = 0,
+        threads: int = 2,
+        seed: int = 0,
+        task: TaskConfig | None = None,
+        friction: float = NOMINAL_FRICTION,
+        hold_steps: int | None = None,
+        taskset: TaskSet | None = None,
+    ):
+        """Builds the constraint sets.
+
+        Args:
+          bundle: the policy.
+          objects: what it grasps; they are brought to the size of its hand (`common.objects.pool.sized`).
+          physics: engine; not `auto`.
+          batch: worlds that run side by side; 0 chooses by the engine.
+          threads: threads of the `native` engine.
+          seed: seed of constraints and episodes.
+          task: where it is not to be the bundle's; see `protocol` for what stays of it.
+          friction: sliding friction between hand and object.
+          hold_steps: control steps without the table; the task's, which count for success, if not given.
+          taskset: constraints to draw from, of these objects in this order
+            (`services.grasp.constraint_sets.taskset_of`); made from the seed if not given.
+        """
+        base = task or bundle.task
+        hold = hold_steps or base.hold_steps
+        self.bundle = bundle
+        self.task = protocol(base, hold, friction)
+        self._hold = hold
+        self._hand = get_hand(bundle.spec.hand)
+        self.objects = sized(self._hand, self.task, objects)
+        self._physics, self._threads, self._seed = physics, threads, seed
+        self._batch = batch or _BATCH[physics]
+        self._taskset = taskset or build_taskset(self._hand, self.task, self.objects, seed)
+        self._referred = taskset is not None
+        self._kept: dict[str, dict[bool, list[Message]]] = {}
+
+    def samples(
+        self,
+        constraints: Sequence[str],
+        episodes: int,
+        progress: Callable[[int], None] = lambda done: None,
+        *,
+        keep: bool = False,
+    ) -> dict[str, Sample]:
+        """Episodes for every row, in one run: an episode counts for the row whose constraints were all it had.
+
+        Args:
+          constraints: names of rows.
+          episodes: for each row.
+          progress: is told how many episodes of all rows there are.
+          keep: keep some of them for `examples`, for which every step of all worlds has to be in memory.
+
+        Raises:
+          CongraspError: no object of the pool allows a row's constraints, or too few resting poses do.
+        """
+        with self._worker(mixture(self.task, constraints), episodes, traced=keep) as worker:
+            self._refer(worker, constraints)
+            if keep:
+                self._kept |= {constraint: {False: [], True: []} for constraint in constraints}
+            return self._gather(worker, constraints, episodes, progress, keep)
+
+    def samples_of_pools(
+        self,
+        constraint: str,
+        pools: Iterable[Sequence[GraspObject]],
+        episodes: int,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Iterator[Sample]:
+        """`episodes` on this evaluator's objects, then on each of further pools, with nothing compiled anew.
+
+        Args:
+          constraint: name of a row.
+          pools: as many objects each as this evaluator has; primitive ones where the engine is compiled.
+          episodes: on each pool.
+          progress: is told how many episodes of the present pool there are.
+        """
+        with self._worker(mixture(self.task, [constraint]), episodes) as worker:
+            yield self._gather(worker, [constraint], episodes, progress)[constraint]
+            for number, objects in enumerate(pools, 1):
+                self.objects = sized(self._hand, self.task, objects)
+                self._taskset = build_taskset(self._hand, self.task, self.objects, self._seed + number)
+                self._referred = False
+                worker.replace_objects(self.objects, self._taskset)
+                worker.restart()
+                yield self._gather(worker, [constraint], episodes, progress)[constraint]
+
+    def _check_available(self, constraint: str) -> None:
+        """Passes if some object of the pool allows a row's constraints.
+
+        Raises:
+          CongraspError: none does.
+        """
+        affordance, *pose, trajectory = active_mask(constraint)
+        allowed = np.ones(self._taskset.has_affordance.shape, bool)
+        if affordance:
+            allowed &= np.asarray(self._taskset.has_affordance)
+        if trajectory or any(pose):
+            allowed &= np.asarray(self._taskset.pose_valid)[:, int(affordance)].any(-1)
+        if not allowed.any():
+            raise CongraspError(
+                f"None of the {len(self.objects)} objects allows the constraint '{constraint}'.",
+                "An affordance needs labelled parts, poses and trajectories need room above the table.",
+            )
+
+    def allowed(self, constraints: Sequence[str]) -> tuple[list[str], list[CongraspError]]:
+        """The rows that some object allows, and why others are left out; captured objects may have no labelled parts.
+
+        Raises:
+          CongraspError: no row is left.
+        """
+        allowed, errors = [], []
+        for name in constraints:
+            try:
+                self._check_available(name)
+                allowed.append(name)
+            except CongraspError as error:
+                errors.append(error)
+        if not allowed:
+            raise errors[0]
+        return allowed, errors
+
+    def references(self, progress: Callable[[int, int], None] = lambda filled, places: None) -> TaskSet:
+        """The task set with reference poses and trajectories from the policy's own grasps under headings.
+
+        It grasps until every place is filled, or until `_TRIES` episodes a region of an object filled no further one.
+
+        Args:
+          progress: is told how many places are filled, and how many there are: those on the whole surface of every
+            object, and on O+ where that can be approached.
+        """
+        with self._worker(mixture(self.task, ["heading", "affordance"]), self._batch) as worker:
+            regions = np.stack([np.ones(len(self.objects), bool), np.asarray(self._taskset.has_affordance).any(-1)], -1)
+            places = int(regions.sum()) * self._taskset.pose_q.shape[2]
+            worker.forget_references()
+            filled = idle = 0
+            while filled < places and idle < _TRIES * regions.sum():
+                worker.restart()
+                worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
+                worker.renew_references()
+                before, filled = filled, int(np.any(worker.taskset.pose_valid, axis=2)[regions].sum())
+                idle = 0 if filled > before else idle + self._batch
+                progress(filled, places)
+            return TaskSet(*(np.asarray(field) for field in worker.taskset))
+
+    def rows_under_noise(self, progress: Callable[[int], None], episodes: int) -> list[Row]:
+        """A row for each of `services.evaluate.noise.LEVELS`; see there. The same references are disturbed in all.
+
+        Args:
+          progress: is told how many episodes of all rows there are.
+          episodes: for each row.
+        """
+        rows: list[Row] = []
+        for constraint, group in itertools.groupby(LEVELS, lambda noise: noise.constraint):
+            with self._worker(mixture(self.task, [constraint]), episodes) as worker:
+                self._refer(worker, [constraint])
+                for noise in group:
+                    worker.replace_objects(self.objects, disturbed(self._hand, self._taskset, noise, self._seed))
+                    worker.restart()
+                    advance = functools.partial(lambda done, n: progress(done + n), len(rows) * episodes)
+                    sample = self._gather(worker, [constraint], episodes, advance)
+                    rows.append(self.row(constraint, sample[constraint], noise.label))
+        return rows
+
+    def noisy_example(self, noise: Noise) -> Message | None:
+        """An episode under a noisy reference in which the object is held to the end, if there is one."""
+        kept = self._taskset, self._kept
+        try:
+            self._taskset, self._kept = disturbed(self._hand, self._taskset, noise, self._seed), {}
+            return next(iter(self.examples(noise.constraint, 1, 0, self._batch)), None)
+        finally:
+            self._taskset, self._kept = kept
+
+    def _refer(self, worker: RolloutWorker, constraints: Sequence[str]) -> None:
+        """References from the policy's own grasps under headings, as the paper makes them for its hands; once."""
+        asked = any(any(active_mask(name)[1:]) for name in constraints)
+        if not self.task.own_references or self._referred or not asked:
+            return
+        self._referred = True
+        worker.forget_references()
+        wanted = _REFERENCES * len(self.objects)
+        for _ in range(0, 2 * wanted, self._batch):
+            worker.restart()
+            worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
+            worker.renew_references()
+        made = int(np.asarray(worker.taskset.pose_valid).any(2).sum())
+        if made < wanted // 4:  # a policy that hardly grasps: those that closing the hand gave are all there is
+            worker.replace_objects(self.objects, self._taskset)
+        else:
+            self._taskset = worker.taskset
+        worker.restart()
+
+    def _gather(
+        self,
+        worker: RolloutWorker,
+        constraints: Sequence[str],
+        episodes: int,
+        progress: Callable[[int], None],
+        keep: bool = False,
+    ) -> dict[str, Sample]:
+        for constraint in constraints:
+            self._check_available(constraint)
+        found: dict[str, list[Sample]] = {constraint: [] for constraint in constraints}
+        counts = dict.fromkeys(constraints, 0)
+        seen, limit = 0, _PATIENCE * (episodes + self._batch)
+        while min(counts.values()) < episodes:
+            if seen > limit:
+                scarce = min(counts, key=lambda name: counts[name])
+                raise CongraspError(
+                    f"Of {seen} episodes only {counts[scarce]} had the constraints '{scarce}'.",
+                    "Ask for fewer --episodes, or add objects that allow these constraints.",
+                )
+            batch, message = self._batch_of_episodes(worker)
+            seen += len(batch.values["success"])
+            for name in constraints:
+                fits = matching(batch.values, name)
+                sample = batch.where(fits).first(episodes - counts[name])
+                for row in np.flatnonzero(fits)[: episodes - counts[name]] if keep else ():
+                    kept = self._kept[name][bool(batch.values["held"][row] > 0)]
+                    if len(kept) < _KEPT:
+                        kept.append(message(int(row)))
+                found[name].append(sample)
+                counts[name] += len(sample.values["success"])
+            progress(sum(counts.values()))
+        return {name: joined(parts) for name, parts in found.items()}
+
+    def rows(
+        self,
+        constraints: Sequence[str],
+        episodes: int,
+        progress: Callable[[int], None] = lambda done: None,
+        *,
+        keep: bool = False,
+    ) -> list[Row]:
+        """One row for each set of constraints; see `samples`."""
+        samples = self.samples(constraints, episodes, progress, keep=keep)
+        return [self.row(name, sample) for name, sample in samples.items()]
+
+    def row(self, constraint: str, sample: Sample, group: str = "") -> Row:
+        """A row of episodes of this evaluator's protocol."""
+        held = self._hold == two_seconds(self.task)
+        return summarise(constraint, self._hand.name, sample, held_2s=held, group=group)
+
+    def draws(self, constraint: str, episodes: int, count: int) -> list[Row]:
+        """`count` rows of `episodes` each from independent draws, to see how much chance there is in one."""
+        sample = self.samples([constraint], episodes * count)[constraint]
+        order = np.arange(episodes * count) // episodes
+        return [self.row(constraint, sample.where(order == i)) for i in range(count)]
+
+    def examples(self, constraint: str, successes: int, failures: int, most: int = 300) -> list[Message]:
+        """Episodes of a row to look at, failures first; the object must be held to the end of the hold to succeed.
+
+        They are some of those that `samples` kept last, or of `most` that are evaluated now.
+
+        Raises:
+          CongraspError: the pool does not allow these constraints.
+        """
+        if constraint not in self._kept:
+            self.samples([constraint], most, keep=True)
+        kept = self._kept[constraint]
+        return [*kept[False][:failures], *kept[True][:successes]]
+
+    def episode(self, constraint: str, tries: int = 1) -> Message:
+        """An episode of one world under a set of constraints: the first that succeeds, or the last of `tries`.
+
+        Raises:
+          CongraspError: the pool does not allow these constraints.
+        """
+        self._check_available(constraint)
+        with self._worker(mixture(self.task, [constraint]), 1, traced=True) as worker:
+            for _ in range(_PATIENCE * tries):
+                sample, message = self._batch_of_episodes(worker)
+                if not matching(sample.values, constraint)[0]:
+                    continue
+                tries -= 1
+                if sample.values["success"][0] > 0 or not tries:
+                    return message(0)
+        raise CongraspError(f"No episode had the constraints '{constraint}'.", "Choose other objects.")
+
+    def _message(self, begun: EnvironmentState, trace: Trace, metrics: dict[str, float], world: int) -> Message:
+        """The episode of one of the worlds, from how all of them began and what was recorded of it."""
+        return episode_message(
+            self._hand,
+            self.task,
+            trace,
+            goal_of_world(begun.goal, world),
+            Surface(*(np.asarray(field)[world] for field in begun.surface)),
+            self.objects[int(np.asarray(begun.world.object_index)[world])],
+            {
+                "version": self.bundle.version,
+                "actor": "evaluation",
+                "success": metrics["success"] > 0,
+                "metrics": metrics,
+            },
+        )
+
+    def _worker(
+        self, task: TaskConfig, episodes: int, traced: bool = False
+    ) -> contextlib.AbstractContextManager[RolloutWorker]:
+        """Acting worlds, not many more than `episodes` of each row need."""
+        rows = 2 ** sum(p not in (0.0, 1.0) for p in (task.p_affordance, task.p_pose, task.p_trajectory))
+        return acting(
+            self.bundle,
+            task,
+            self.objects,
+            self._taskset,
+            physics=self._physics,
+            threads=self._threads,
+            batch=min(self._batch, 1 << (episodes * rows - 1).bit_length()),
+            seed=self._seed,
+            traced=slice(None) if traced else slice(0),
+        )
+
+    def _begin(self, worker: RolloutWorker) -> EnvironmentState:
+        """Gives the episodes that begin now the full hold, whatever was drawn for them."""
+        worker.env = worker.env._replace(hold=jnp.full_like(worker.env.hold, self._hold))
+        return worker.env
+
+    def _batch_of_episodes(self, worker: RolloutWorker) -> tuple[Sample, Callable[[int], Message]]:
+        """One episode of every world, and what gives the recording of one; all of them begin and end together.
+
+        It is collected in pieces, so that a large batch's observations need not be in memory for all steps.
+        """
+        start, window = self.task.approach_steps, self.task.hold_steps
+        length = start + self._hold
+        piece = math.gcd(start, self._hold)
+        piece = piece if piece >= 10 else length
+        probed: list[Any] = []
+        traces: list[Trace] = []
+        begun = self._begin(worker)
+        for step in range(0, length, piece):
+            rollout = worker.collect(self.bundle.acting, piece)
+            traces.append(rollout.trace)
+            if step + piece > start and step < start + window:
+                rows = slice(max(0, start - step), start + window - step)
+                probed.append([np.asarray(values)[rows].swapaxes(0, 1) for values in rollout.probed])
+        force, torque = (np.concatenate(parts, 1) for parts in zip(*probed, strict=True))
+        values = _metrics(rollout)
+
+        def message(world: int) -> Message:
+            trace = Trace(
+                *(np.concatenate([np.asarray(x[:, world]) for x in field]) for field in zip(*traces, strict=True))
+            )
+            return self._message(begun, trace, {name: float(column[world]) for name, column in values.items()}, world)
+
+        return Sample(values, force, torque), message
+
+
+def _metrics(rollout: Rollout) -> dict[str, np.ndarray]:
+    """Metrics (E,) of the episodes that ended, by the names in `METRICS`."""
+    episodes = finished_episodes(rollout)
+    return {name: episodes[f"episode/{name}"] for name in METRICS}

@@ -1,0 +1,151 @@
+"""Figures of an evaluation from its JSON: the table beside the paper's, rates with intervals, and how errors spread."""
+
+import json
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from common.errors import CongraspError
+from services.evaluate.scores import ERRORS
+from services.viz.plots import COLOURS, INK, QUIET, new_figure, save, style
+
+_TITLES = {
+    "heading_rad": ("Heading, direction", "rad"),
+    "heading_m": ("Heading, position", "m"),
+    "pose_rad": ("Pose, joints", "rad"),
+    "pose_m": ("Pose, wrist", "m"),
+    "traj_rad": ("Trajectory, direction", "rad"),
+    "traj_m": ("Trajectory, position", "m"),
+    "affordance_ratio": ("Affordance, wrong contacts", "share"),
+}
+_COLUMNS = 4
+
+
+def plot_evaluation(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str]) -> list[pathlib.Path]:
+    """Draws the result of `congrasp evaluate --json`.
+
+    Args:
+      path: the file.
+      out: folder for the figures.
+      formats: of the files: png, pdf.
+
+    Returns:
+      The files written: table, success, and errors where the file has their quantiles.
+
+    Raises:
+      CongraspError: it is no such file.
+    """
+    try:
+        rows = json.loads(path.read_text())["rows"]
+        figures = {"table": _table(rows), "success": _success(rows)}
+        if any(row.get("quantiles") for row in rows):
+            figures["errors"] = _errors(rows)
+    except OSError as error:
+        raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise CongraspError(
+            f"{path} is not the result of an evaluation ({type(error).__name__}: {error}).",
+            "Name a file that 'congrasp evaluate --json FILE' wrote, or a run's folder.",
+        ) from None
+    return [file for name, figure in figures.items() for file in save(figure, out / name, formats)]
+
+
+def cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """The table's text, its header first; a pair is ours and the paper's."""
+    shown = [name for name in _TITLES if any(row.get(name) is not None for row in rows)]
+    head = ["constraint", "episodes", "success, %", "paper", "held 2 s, %"]
+    table = [[*head, *(word for name in shown for word in (f"{_TITLES[name][0]}, {_TITLES[name][1]}", "paper"))]]
+    for row in rows:
+        paper = row["paper"] or {"success": None, "errors": {}}
+        interval = f"{_percent(row['success'])} ({_percent(row['success_low'])}-{_percent(row['success_high'])})"
+        line = [_name(row), str(row["episodes"]), interval, _percent(paper["success"]), _percent(row["held_2s"])]
+        line += [word for name in shown for word in (_figure(row.get(name)), _figure(paper["errors"].get(name)))]
+        table.append(line)
+    return table
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    return f"{row['constraint']}, {row['group']}" if row["group"] else str(row["constraint"])
+
+
+def _percent(rate: float | None) -> str:
+    return "" if rate is None else f"{100 * rate:.1f}"
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> Any:
+    text = cells(rows)
+    widths = [
+        max(max(len(word) for word in cell.split("\n")) for cell in column)
+        for column in zip(*_wrapped(text), strict=True)
+    ]
+    total = sum(widths) + 2 * len(widths)
+    figure = new_figure(0.085 * total + 0.3, 0.32 * len(text) + 1.0, "Evaluation beside the paper")
+    axes = figure.subplots()
+    axes.set_axis_off()
+    edges = np.cumsum([0, *(width + 2 for width in widths)]) / total
+    for r, line in enumerate(_wrapped(text)):
+        y = 1 - (r + 0.5) / len(text)
+        for c, word in enumerate(line):
+            heavy = "bold" if r == 0 or c == 0 else "normal"
+            quiet = QUIET if text[0][c] == "paper" else INK
+            x, side = (edges[c], "left") if c == 0 else (edges[c + 1], "right")
+            axes.text(x, y, word, ha=side, va="center", fontsize=8.5, color=quiet, fontweight=heavy)
+        axes.axhline(1 - (r + 1) / len(text), color=INK if r == 0 else "#e3e6ea", linewidth=1.0 if r == 0 else 0.6)
+    axes.set_xlim(0, 1)
+    axes.set_ylim(0, 1)
+    return figure
+
+
+def _wrapped(text: Sequence[Sequence[str]]) -> list[list[str]]:
+    """The header's words one below the other after their comma."""
+    return [[word.replace(", ", ",\n", 1) for word in text[0]], *map(list, text[1:])]
+
+
+def _success(rows: Sequence[Mapping[str, Any]]) -> Any:
+    figure = new_figure(7.2, 0.9 + 0.36 * len(rows), "Success, with 95 % intervals")
+    axes = figure.subplots()
+    y = np.arange(len(rows))[::-1]
+    rates = np.array([row["success"] for row in rows])
+    spread = np.abs(np.array([[row["success_low"], row["success_high"]] for row in rows]).T - rates)
+    axes.errorbar(rates, y, xerr=spread, fmt="o", color=COLOURS[0], capsize=3, markersize=5, label="ours")
+    paper = [(row["paper"]["success"], height) for row, height in zip(rows, y, strict=True) if row["paper"]]
+    if paper:
+        axes.plot(*zip(*paper, strict=True), "D", color=COLOURS[1], markersize=5, label="paper")
+    axes.set_yticks(y, [_name(row) for row in rows])
+    style(axes, "", "share of episodes", "")
+    axes.set_xlim(right=1.005)
+    axes.legend(fontsize=8, frameon=False, labelcolor=QUIET, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _errors(rows: Sequence[Mapping[str, Any]]) -> Any:
+    names = [name for part in ERRORS.values() for name in part.values()]
+    shown = [name for name in names if any(name in row.get("quantiles", {}) for row in rows)]
+    columns = min(_COLUMNS, len(shown))
+    lines = -(-len(shown) // columns)
+    figure = new_figure(3.6 * columns, 0.6 + 2.8 * lines, "Errors of successful episodes: share of episodes below")
+    grid = figure.subplots(lines, columns, squeeze=False)
+    for axes in grid.flat[len(shown) :]:
+        axes.set_axis_off()
+    labels = [_name(row) for row in rows]
+    for axes, name in zip(grid.flat, shown, strict=False):
+        title, unit = _TITLES[name]
+        for row in rows:
+            found = row.get("quantiles", {}).get(name)
+            if not found:
+                continue
+            colour = COLOURS[labels.index(_name(row)) % len(COLOURS)]
+            axes.plot(found, np.linspace(0, 1, len(found)), color=colour, linewidth=1.6, label=_name(row))
+            paper = (row["paper"] or {"errors": {}})["errors"].get(name)
+            if paper is not None:
+                axes.axvline(paper, color=colour, linewidth=1.0, linestyle=":")
+        style(axes, title, f"{unit}   (dotted: mean of the paper)", "share")
+        axes.set_ylim(0, 1)
+        axes.legend(fontsize=7, frameon=False, labelcolor=QUIET)
+    return figure

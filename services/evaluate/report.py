@@ -1,0 +1,149 @@
+"""A policy's report and model card: one HTML file with tables, pictures, curves and how each was made."""
+
+import base64
+import collections
+import dataclasses
+import functools
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from common.config import TaskConfig
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.policy.bundle import PolicyBundle, content_hash
+from common.wire.codec import encode
+from services.evaluate.scores import FORCES, Row, force_cells, paper_cells, rate_cells
+
+_LIMITS = (
+    "What it is for: grasps in simulation, of rigid objects that fit the hand, under headings, affordances, reference "
+    "poses and wrist trajectories in any combination. It observes exact poses and contacts.",
+    "What it is not: it was never run on a physical hand, it does not see soft or jointed objects, and success in "
+    "simulation says nothing about the safety of a robot.",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A picture of the report."""
+
+    title: str
+    png: bytes
+    words: str = ""
+    """What is to be seen."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """How the parts of a report are made again."""
+
+    table: str
+    pictures: str
+    curves: str = ""
+
+
+def write_report(
+    out: pathlib.Path,
+    policy: PolicyBundle,
+    name: str,
+    rows: Sequence[Row],
+    conditions: str,
+    sheets: Sequence[Picture],
+    curves: Sequence[Picture],
+    made: Made,
+) -> None:
+    """Writes the report, whole or not at all.
+
+    Args:
+      out: the HTML file; it needs nothing beside it.
+      policy: what it is about.
+      name: of the policy's file.
+      rows: the evaluation.
+      conditions: objects, engine and seed of the evaluation, in words.
+      sheets: episodes of each row.
+      curves: of the training, where it was recorded.
+      made: commands.
+
+    Raises:
+      CongraspError: jinja2 is absent, or the file cannot be written.
+    """
+    text = template().render(
+        title=f"Grasping policy of the {policy.spec.hand} hand, version {policy.version}",
+        summary=_summary(rows),
+        conditions=conditions,
+        rates=[{"cells": _compared(row), "verdict": _verdict(row)} for row in rows],
+        forces={"columns": FORCES, "rows": [force_cells(row) for row in rows]},
+        command=made.table,
+        sheets=[_embedded(sheet) for sheet in sheets],
+        pictures_command=made.pictures,
+        curves=[_embedded(curve) for curve in curves],
+        curves_command=made.curves,
+        facts=_facts(policy, name),
+        limits=_LIMITS,
+    )
+    write_atomically(out, text.encode())
+
+
+@functools.cache
+def template() -> Any:
+    """The page that reports fill; a CongraspError if jinja2 is absent."""
+    try:
+        import jinja2
+    except ImportError:
+        raise CongraspError("Reports need the package 'jinja2'.", "Run: pip install 'congrasp[viz]'") from None
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    return environment.from_string(pathlib.Path(__file__).with_suffix(".html").read_text(encoding="utf-8"))
+
+
+def causes_in_words(causes: Sequence[str]) -> str:
+    """Such as "2 held, 1 slipped 0.82 s after the table went"."""
+    return ", ".join(f"{count} {cause}" for cause, count in collections.Counter(causes).items())
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    compared = [row for row in rows if row.paper]
+    above = sum(row.success >= row.paper.success for row in compared if row.paper)
+    clear = collections.Counter(_verdict(row) for row in compared)
+    return (
+        f"{sum(row.episodes for row in rows)} episodes in simulation. Success is at or above the paper's in {above} of "
+        f"the {len(compared)} rows that it has; the 95 % interval is above it in {clear['better']} and below it in "
+        f"{clear['worse']}."
+    )
+
+
+def _compared(row: Row) -> tuple[str, ...]:
+    """A row's cells: rates, then errors, each followed by the paper's."""
+    name, episodes, success, held, errors, _ = rate_cells(row)
+    rate, paper_errors = paper_cells(row)
+    return name, episodes, success, rate, held, errors, paper_errors
+
+
+def _verdict(row: Row) -> str:
+    if row.paper is None or row.success_low <= row.paper.success <= row.success_high:
+        return ""
+    return "better" if row.success_low > row.paper.success else "worse"
+
+
+def _embedded(picture: Picture) -> Mapping[str, Any]:
+    return {"title": picture.title, "words": picture.words, "image": base64.b64encode(picture.png).decode()}
+
+
+def _trained(task: TaskConfig) -> str:
+    shares = {"an affordance": task.p_affordance, "a reference pose": task.p_pose, "a trajectory": task.p_trajectory}
+    words = [f"{name} in {100 * share:.0f} %" for name, share in shares.items()]
+    return f"headings: {task.headings}; of the episodes {', '.join(words)}"
+
+
+def _facts(policy: PolicyBundle, name: str) -> list[tuple[str, str]]:
+    task, network = policy.task, policy.spec.network
+    return [
+        ("file", name),
+        ("content", content_hash(encode(policy.to_message()))),
+        ("hand", policy.spec.hand),
+        ("trained on", f"{policy.transitions:,} environment steps, version {policy.version}"),
+        ("constraints in training", _trained(task)),
+        ("observation", f"{sum(size for _, size in policy.spec.layout)} numbers"),
+        ("action", f"{policy.spec.action_size} numbers, {1 / task.control_dt:g} times a second"),
+        ("network", f"{' - '.join(map(str, network.hidden))}, encoders of {network.encoder}"),
+        ("method", "ConGraspXL: decoupled PPO in MuJoCo; this implementation, Apache-2.0"),
+    ]

@@ -1,0 +1,212 @@
+"""A grasp motion as one NPZ file that says itself what its numbers mean; what exports and other programs start from.
+
+Metres, radians, seconds, newtons; quaternions are (w, x, y, z) and turn a body's frame into the world. The world's z
+axis points up and the table's top is at z = 0. T moments, F finger joints, L links, C capsules, K waypoints.
+"""
+
+import dataclasses
+import io
+import json
+import pathlib
+import zipfile
+from typing import Annotated, Any, get_type_hints
+
+import numpy as np
+
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.hands import get_hand
+from common.hands.spec import Hand, link_origin
+from common.task.types import MASKS
+from common.wire.codec import Message
+
+FORMAT = 1
+_META = "meta"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GraspMotion:
+    """A hand that approaches an object, closes, and holds it after the table is gone.
+
+    What is no array is kept as JSON under the name `meta`, beside the meaning of every array.
+    """
+
+    hand: str
+    """Name of the hand."""
+    object: str
+    """Name of the object."""
+    success: bool
+    """Whether the object was held a quarter of a second after the table went; `metrics["held"]`: to the end."""
+    control_dt: float
+    """Seconds between two moments."""
+    constraints: tuple[str, ...]
+    """Active constraints: heading, affordance, pose, trajectory."""
+    metrics: dict[str, float]
+    """Errors, forces and reward of the episode, by the names in `actors.environment.METRICS`."""
+    about: dict[str, Any]
+    """Where it comes from: version of the policy, file of the object, command."""
+    time: Annotated[np.ndarray, "(T,) s"]
+    table: Annotated[np.ndarray, "(T,) bool, whether the table stands"]
+    wrist_position: Annotated[np.ndarray, "(T, 3) m, world"]
+    wrist_quaternion: Annotated[np.ndarray, "(T, 4) w x y z, wrist frame to world"]
+    joint_position: Annotated[np.ndarray, "(T, F) rad, finger joints in the order of joint_names"]
+    joint_target: Annotated[np.ndarray, "(T, F) rad, what the joints' position servos aimed at"]
+    link_position: Annotated[np.ndarray, "(T, L, 3) m, world, origins of the links in the order of link_names"]
+    link_quaternion: Annotated[np.ndarray, "(T, L, 4) w x y z, link frame to world; link 0, the palm, is the wrist"]
+    link_force: Annotated[np.ndarray, "(T, L, 3) N, world, net contact force of the object on each link"]
+    object_position: Annotated[np.ndarray, "(T, 3) m, world, the object's centre of mass"]
+    object_quaternion: Annotated[np.ndarray, "(T, 4) w x y z, object frame to world"]
+    object_vertices: Annotated[np.ndarray, "(V, 3) m, object frame: axes of its file, origin at its centre of mass"]
+    object_faces: Annotated[np.ndarray, "(E, 3) indices of object_vertices"]
+    object_file_origin: Annotated[np.ndarray, "(3,) m: object frame = object_file_scale * file - object_file_origin"]
+    object_file_scale: Annotated[np.ndarray, "() m per unit of the object's file"]
+    joint_names: Annotated[np.ndarray, "(F,) text"]
+    joint_link: Annotated[np.ndarray, "(F,) the link that a joint moves; joints of one link act in this order"]
+    joint_axis: Annotated[np.ndarray, "(F, 3) unit, link frame; with all joints at zero links are turned as the wrist"]
+    joint_anchor: Annotated[np.ndarray, "(F, 3) m, wrist frame with all joints at zero"]
+    joint_limits: Annotated[np.ndarray, "(F, 2) rad, lower and upper"]
+    link_names: Annotated[np.ndarray, "(L,) text"]
+    link_parent: Annotated[np.ndarray, "(L,) index of the link that carries it, -1 for the palm"]
+    capsule_link: Annotated[np.ndarray, "(C,) link of each capsule of the hand's shape"]
+    capsule_ends: Annotated[np.ndarray, "(C, 2, 3) m, link frame"]
+    capsule_radius: Annotated[np.ndarray, "(C,) m"]
+    surface_points: Annotated[np.ndarray, "(N, 3) m, object frame, points of the surface"]
+    surface_minus: Annotated[np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"]
+    heading_position: Annotated[np.ndarray, "(3,) m, object frame, where the middle of the grasping hand should be"]
+    heading_direction: Annotated[np.ndarray, "(3,) unit, object frame, the way the hand comes"]
+    pose_joints: Annotated[np.ndarray, "(F,) rad, reference pose (where pose is among the constraints)"]
+    pose_position: Annotated[np.ndarray, "(3,) m, object frame, wrist of the reference pose"]
+    pose_quaternion: Annotated[np.ndarray, "(4,) w x y z, wrist frame to object frame"]
+    trajectory_position: Annotated[np.ndarray, "(K, 3) m, object frame, wrist (where trajectory is a constraint)"]
+    trajectory_quaternion: Annotated[np.ndarray, "(K, 4) w x y z, wrist frame to object frame"]
+
+
+_HINTS = get_type_hints(GraspMotion, include_extras=True)
+_ARRAYS = {name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")}
+_FACTS = tuple(name for name in _HINTS if name not in _ARRAYS)
+
+
+def motion_of_episode(episode: Message) -> GraspMotion:
+    """The motion of an episode, whether just made or read from MCAP (`services.record.reader.read_episodes`)."""
+    arrays, meta = {name: np.asarray(value) for name, value in episode.arrays.items()}, dict(episode.meta)
+    hand = get_hand(meta.pop("hand"))
+    bits = dict(zip(MASKS, arrays["goal/mask"] > 0, strict=True))
+    active = {"affordance": bits["affordance"], "pose": bits["pose_finger"], "trajectory": bits["trajectory"]}
+    dt = float(meta.pop("control_dt"))
+    return GraspMotion(
+        hand=hand.name,
+        object=meta.pop("object"),
+        success=bool(meta.pop("success")),
+        control_dt=dt,
+        constraints=("heading", *(name for name, bit in active.items() if bit)),
+        metrics={name: float(value) for name, value in meta.pop("metrics", {}).items()},
+        about=meta,
+        time=dt * np.arange(len(arrays["table"])),
+        table=arrays["table"].astype(bool),
+        wrist_position=arrays["link_position"][:, 0],
+        wrist_quaternion=arrays["link_quaternion"][:, 0],
+        joint_position=arrays["q"],
+        joint_target=arrays["q_target"],
+        link_position=arrays["link_position"],
+        link_quaternion=arrays["link_quaternion"],
+        link_force=arrays["contact_force"],
+        object_position=arrays["object_position"],
+        object_quaternion=arrays["object_quaternion"],
+        object_vertices=arrays["visual_vertices"],
+        object_faces=arrays["visual_faces"],
+        object_file_origin=np.asarray(meta.pop("object_file_origin", (0.0, 0.0, 0.0)), np.float64),
+        object_file_scale=np.asarray(meta.pop("object_file_scale", 1.0), np.float64),
+        **hand_arrays(hand),
+        surface_points=arrays["surface_points"],
+        surface_minus=arrays["surface_minus"].astype(bool),
+        heading_position=arrays["goal/heading_position"],
+        heading_direction=arrays["goal/heading_direction"],
+        pose_joints=arrays["goal/pose_q"],
+        pose_position=arrays["goal/pose_position"],
+        pose_quaternion=arrays["goal/pose_quaternion"],
+        trajectory_position=arrays["goal/trajectory_position"],
+        trajectory_quaternion=arrays["goal/trajectory_quaternion"],
+    )
+
+
+def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
+    """Joints, links and capsules of a hand, by the names of a motion's arrays."""
+    index = {link.name: i for i, link in enumerate(hand.links)}
+    capsules = [(i, link, capsule) for i, link in enumerate(hand.links) for capsule in link.capsules]
+    ends = [np.subtract([capsule.start, capsule.end], link_origin(link)) for _, link, capsule in capsules]
+    return {
+        "joint_names": np.array([joint.name for joint in hand.joints]),
+        "joint_link": np.array([i for i, link in enumerate(hand.links) for _ in link.joints], np.int32),
+        "joint_axis": np.array([joint.axis for joint in hand.joints]),
+        "joint_anchor": np.array([joint.anchor for joint in hand.joints]),
+        "joint_limits": np.array([(joint.lower, joint.upper) for joint in hand.joints]),
+        "link_names": np.array([link.name for link in hand.links]),
+        "link_parent": np.array([index.get(link.parent, -1) for link in hand.links], np.int32),
+        "capsule_link": np.array([i for i, _, _ in capsules], np.int32),
+        "capsule_ends": np.array(ends),
+        "capsule_radius": np.array([capsule.radius for _, _, capsule in capsules]),
+    }
+
+
+def save_motion(path: pathlib.Path, motion: GraspMotion) -> None:
+    """Writes a motion as NPZ, whole or not at all.
+
+    Raises:
+      CongraspError: the file cannot be written.
+    """
+    meta = {
+        "format": FORMAT,
+        **{name: getattr(motion, name) for name in _FACTS},
+        "units": "m, rad, s, N",
+        "quaternions": "(w, x, y, z)",
+        "world": "z up, table's top at z = 0",
+        "arrays": _ARRAYS,
+    }
+    buffer = io.BytesIO()
+    arrays: dict[str, Any] = {name: getattr(motion, name) for name in _ARRAYS}
+    arrays[_META] = np.array(json.dumps(meta))
+    np.savez_compressed(buffer, **arrays)
+    write_atomically(path, buffer.getvalue())
+
+
+def load_motion(path: pathlib.Path) -> GraspMotion:
+    """Reads a motion.
+
+    Raises:
+      CongraspError: there is no such file, it is another kind of file, or it is damaged.
+    """
+    remedy = "Make it anew with 'congrasp grasp'."
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        meta = json.loads(str(arrays.pop(_META)))
+        if meta["format"] != FORMAT:
+            raise CongraspError(f"{path} has format {meta['format']}, not {FORMAT}.", remedy)
+        facts = {name: meta[name] for name in _FACTS}
+        facts["constraints"] = tuple(facts["constraints"])
+        _check_shapes(arrays)
+        return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS})
+    except OSError as error:
+        raise CongraspError(f"The motion {path} cannot be read: {error.strerror or error}.", remedy) from None
+    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        why = error if zipfile.is_zipfile(path) else "it is no NPZ file, or was cut"
+        raise CongraspError(f"{path} is not a grasp motion ({why}).", remedy) from None
+
+
+def _check_shapes(arrays: dict[str, np.ndarray]) -> None:
+    """A ValueError where an array has another shape than its meaning says, or none, or a face names no vertex."""
+    sizes: dict[str, int] = {}
+    for name, meaning in _ARRAYS.items():
+        words = meaning[1 : meaning.index(")")]
+        letters, shape = words.replace(",", " ").split(), arrays[name].shape
+        if 0 in shape:
+            raise ValueError(f"{name} is empty")
+        if len(letters) == len(shape):
+            for letter, size in zip(letters, shape, strict=True):
+                sizes.setdefault(letter, int(letter) if letter.isdigit() else size)
+        wanted = [sizes.get(letter) for letter in letters]
+        if wanted != list(shape):
+            raise ValueError(f"{name} has shape {shape}, where ({words}) is {tuple(wanted)}")
+    faces = arrays["object_faces"]
+    if faces.min() < 0 or faces.max() >= sizes["V"]:
+        raise ValueError("object_faces names vertices that are not there")

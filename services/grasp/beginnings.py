@@ -1,0 +1,83 @@
+"""Where the tries of a grasp begin: headings and resting poses that the table leaves room for."""
+
+import numpy as np
+
+from common import rotations
+from common.constraints.headings import above, clear_table, feasible, sample_headings
+from common.errors import CongraspError
+from common.hands.kinematics import grasp_frame
+from common.hands.spec import Hand
+from common.objects.spec import GraspObject
+from services.grasp.asked import Asked
+
+_CLEARANCE, _STEEPEST_UP = 0.02, 0.1  # of a wrist over the table, m, and of an approach that rises
+
+
+def headings(
+    obj: GraspObject, asked: Asked, batch: int, back_off: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of tries that the table leaves room for.
+
+    Likelier resting poses are tried more often.
+    """
+    restricted = asked.minus is not None
+    found = sample_headings(obj, rng, use_affordance=restricted, lenient=True, along=asked.direction, at=asked.position)
+    if found is None:
+        raise CongraspError(
+            f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
+            "Make the graspable part larger."
+            if asked.direction is None and asked.position is None
+            else "Leave out --heading and --at, or make the graspable part larger.",
+        )
+    options, weights = [], []
+    for r, rest in enumerate(obj.rest_poses):
+        cleared = clear_table(found, rest)
+        room = feasible(cleared, rest, back_off=back_off)
+        if asked.above:
+            room &= above(cleared, rest)
+        for h in np.flatnonzero(room):
+            options.append((r, cleared.position[h], found.direction[h], found.cross[h]))
+        weights += [1.0 / ((r + 1) * max(room.sum(), 1))] * int(room.sum())
+    if not options:
+        raise CongraspError(*_no_room(obj, asked))
+    shares = np.array(weights) / np.sum(weights)
+    chosen = rng.choice(len(options), batch, replace=len(options) < batch, p=shares)
+    rests, positions, directions, crosses = zip(*(options[i] for i in chosen), strict=True)
+    return np.array(positions), np.array(directions), np.array(crosses), np.array(rests)
+
+
+def _no_room(obj: GraspObject, asked: Asked) -> tuple[str, str]:
+    if asked.direction is None:
+        return (
+            f"'{obj.name}' cannot be approached in any of its resting poses.",
+            "Scale it so that some part is narrower than 12 cm, or leave out --heading above and --at.",
+        )
+    down = -_matrix(obj.rest_poses[0][3:])[2]
+    return (
+        "The hand would have to come through the table, however the object lies.",
+        f'In its likeliest pose straight down is --heading "{" ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)}".',
+    )
+
+
+def _matrix(quaternion: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation of a quaternion (4,)."""
+    return np.asarray(rotations.to_matrix(np.asarray(quaternion, np.float32)))
+
+
+def valid_rests(hand: Hand, obj: GraspObject, asked: Asked) -> np.ndarray:
+    """Resting poses in which a reference pose or trajectory stays over the table and does not come from below."""
+    if asked.trajectory is not None:
+        path, turn = asked.trajectory[0], asked.trajectory[1][-1]
+    else:
+        assert asked.pose is not None
+        path, turn = asked.pose.position[None], asked.pose.quaternion
+    heading = _matrix(turn) @ grasp_frame(hand).heading
+    up = np.array([_matrix(rest[3:])[2] for rest in obj.rest_poses])
+    lowest = (up @ path.T).min(-1) + obj.rest_poses[:, 2]
+    valid = np.flatnonzero((lowest > _CLEARANCE) & (up @ heading < _STEEPEST_UP))
+    if not len(valid):
+        raise CongraspError(
+            f"With this reference the hand would be in the table in every resting pose of '{obj.name}'.",
+            "Its wrist must stay 2 cm over the table, and the hand come from above or level.",
+        )
+    return valid

@@ -1,0 +1,93 @@
+"""What `congrasp grasp` leaves in an object's folder, and how it knows later that it is all there."""
+
+import hashlib
+import json
+import pathlib
+import time
+from typing import Any
+
+import numpy as np
+
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.wire.codec import Message
+from services.export.motion_file import save_motion
+from services.grasp.grasper import Grasp
+from services.record.channels import JsonChannels
+from services.record.scene import episode_entries
+from services.record.writer import LogWriter
+from services.viz.render import best_camera, episode_sheet, render_episode_frames, save_episode_video
+from services.viz.sheets import save_png
+
+MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
+THUMBNAIL = "thumbnail.png"
+"""Its last moment."""
+OBJECT = "object.png"
+"""Pictures of the object before and after its import."""
+
+
+_SMALL, _VIDEO = (320, 240), (480, 360)  # pixels
+
+
+def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: bool, about: dict[str, Any]) -> None:
+    """Writes a grasp; the result comes last, so that where there is one everything is there.
+
+    Args:
+      folder: the object's folder.
+      found: the grasp.
+      video: also writes the MP4.
+      pictures: also writes the contact sheet.
+      about: further entries of the result.
+
+    Raises:
+      CongraspError: a file cannot be written.
+    """
+    (folder / RESULT).unlink(missing_ok=True)
+    save_motion(folder / MOTION, found.motion)
+    save_recording(folder / RECORDING, found.episode)
+    episode = found.episode
+    steps = _moments(np.asarray(episode.arrays["table"], bool))
+    last = steps[-1]
+    camera = best_camera(episode, steps) if pictures or video else None
+    if pictures:
+        save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera, quick=True))
+        save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera, quick=True)))
+    if video:
+        save_episode_video(folder / VIDEO, episode, _VIDEO, camera)
+    write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
+
+
+def _moments(table: np.ndarray) -> list[int]:
+    """Steps of a grasp worth seeing: six of the approach, one while it is held, and the last."""
+    removal, last = int(table.sum()), len(table) - 1
+    approach = np.linspace(0, min(removal, last), 6)
+    return sorted({round(step) for step in [*approach, (removal + last) / 2, last]})
+
+
+def save_recording(path: pathlib.Path, episode: Message) -> None:
+    """Writes an episode as an MCAP file of that name.
+
+    Raises:
+      CongraspError: the file cannot be written.
+    """
+    try:
+        writer = LogWriter(path.parent, f".{path.stem}", run=str(episode.meta["object"]))
+        writer.write(*episode_entries("grasp", episode, time.time_ns(), 0, JsonChannels()))
+        writer.close()
+        writer.files[-1].rename(path)
+    except OSError as error:
+        raise CongraspError(f"{path} could not be written: {error.strerror}.") from None
+
+
+def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
+    """The result of an object that was grasped before by the same key; None where there is none."""
+    try:
+        result = json.loads((folder / RESULT).read_text())
+    except (OSError, ValueError):
+        return None
+    return result if isinstance(result, dict) and result.get("key") == key else None
+
+
+def key_of(*parts: Any) -> str:
+    """Sixteen hex digits that change when anything that makes a grasp does."""
+    return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:16]

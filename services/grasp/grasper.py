@@ -1,0 +1,327 @@
+"""A grasp motion for one object under constraints: several tries at once, of which the best is kept.
+
+from services.grasp.grasper import grasp
+from services.export.motion_file import save_motion
+
+found = grasp("mug.obj", heading="0 0 -1")
+save_motion(pathlib.Path("mug.npz"), found.motion)
+"""
+
+import dataclasses
+import functools
+import os
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from actors.episode import episode_message
+from actors.rollout import Trace, goal_of_world
+from actors.trials import Beginnings, Outcome, Trials
+from common.constraints.contradictions import Wishes, contradictions
+from common.constraints.priority import Request, explain
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects.spec import GraspObject
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle
+from common.policy.pretrained import policy_file
+from common.task.types import MASKS, Goal, Surface
+from common.wire.codec import Message
+from services.assets.objects.meshes import ImportOptions
+from services.assets.objects.named import one_object
+from services.export.motion_file import GraspMotion, motion_of_episode
+from services.grasp.asked import Asked, read_asked
+from services.grasp.beginnings import headings, valid_rests
+
+TRIES = 16
+"""Grasps that are simulated side by side."""
+ROUNDS = 4
+"""How often that many others are tried while none holds."""
+HOLD_SECONDS = 2.0
+"""How long the object should be held without the table."""
+_SCALES = {
+    "heading_rad": 0.2,
+    "heading_m": 0.02,
+    "pose_rad": 0.25,
+    "pose_m": 0.02,
+    "trajectory_rad": 0.2,
+    "trajectory_m": 0.03,
+    "affordance_ratio": 0.05,
+    "moved_at_removal": 0.03,
+    "force_link_max": 10.0,
+    "slip": 0.02,
+}
+"""What weighs as much as one another, among grasps that hold: errors, the object's way before the table goes (m), the
+strongest link's force (N), and the object's way after it went (m)."""
+_UNLIKELY = 0.5
+"""What each likelier resting pose weighs against a grasp, likewise."""
+_TOUCHED = 0.2
+"""Share of touches on what must not be touched from which others are tried."""
+
+Progress = Callable[[str, int, int], None]
+"""Told what is done, how much of it, and of how much."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Grasp:
+    """The best of some tries."""
+
+    episode: Message
+    """The whole episode, as recordings keep it."""
+    motion: GraspMotion
+    """What the NPZ holds."""
+    tries: int
+    held: int
+    """How many of the tries held the object to the end."""
+    rest: int
+    """Which of the object's resting poses it starts from."""
+    words: tuple[str, ...]
+    """Which constraints are active and why."""
+
+    @property
+    def success(self) -> bool:
+        """Whether this one held the object to the end."""
+        return self.motion.metrics["held"] > 0
+
+    def facts(self) -> dict[str, Any]:
+        """Result, tries and errors, for tables and files."""
+        return {
+            "object": self.motion.object,
+            "hand": self.motion.hand,
+            "success": self.success,
+            "held_quarter_second": self.motion.success,
+            "tries": self.tries,
+            "tries_held": self.held,
+            "rest": self.rest,
+            "constraints": list(self.motion.constraints),
+            "links_at_removal": self.motion.metrics["links_at_removal"],
+            **{name: self.motion.metrics[name] for name in _errors_of(self.motion.constraints)},
+        }
+
+
+class Grasper:
+    """A policy that grasps one object after another; what it compiles serves all of them."""
+
+    def __init__(
+        self,
+        policy: PolicyBundle,
+        *,
+        tries: int = TRIES,
+        rounds: int = ROUNDS,
+        seconds: float = HOLD_SECONDS,
+        threads: int = 0,
+        seed: int = 0,
+    ):
+        """Compiles nothing yet.
+
+        Args:
+          policy: the policy, which names the hand.
+          tries: grasps side by side.
+          rounds: how often that many others are tried while none holds.
+          seconds: how long the object should be held without the table.
+          threads: of the physics; 0 takes one a core.
+          seed: draws what is tried.
+        """
+        self.hand = get_hand(policy.spec.hand)
+        self.task = dataclasses.replace(policy.task, end_when_fallen=False)
+        self._policy, self._tries, self._rounds, self._seed = policy, tries, rounds, seed
+        self._compiled = False
+        hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
+        self._trials = Trials(self.hand, self.task, policy, hold=hold, threads=threads or os.cpu_count() or 1)
+
+    def grasp(
+        self, obj: GraspObject, asked: Asked | None = None, progress: Progress = lambda what, done, total: None
+    ) -> Grasp:
+        """The best grasp of some tries.
+
+        Args:
+          obj: the object.
+          asked: constraints on it; any grasp by default.
+          progress: told how far it is.
+
+        Raises:
+          CongraspError: the constraints contradict one another, or the table is in the way of all of them.
+        """
+        asked = asked or Asked()
+        best: tuple[float, Outcome, int, int] | None = None
+        held = tried = 0
+        for round_ in range(self._rounds):
+            beginnings, rests, different = self._beginnings(obj, asked, np.random.default_rng((self._seed, round_)))
+            progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
+            self._compiled = True
+            what = f"Trying others ({round_ + 1})" if round_ else "Trying"
+            outcome = self._trials.run(
+                obj, beginnings, functools.partial(lambda what, step: progress(what, step, self._trials.steps), what)
+            )
+            _check_aligned(outcome)
+            cost = (costs(outcome, _active(asked)) + _UNLIKELY * rests)[:different]
+            tried += different
+            holds = outcome.metrics["held"][:different] > 0
+            held += int(holds.sum())
+            if asked.minus is not None:  # one that holds it by what must not be touched is not what was asked for
+                holds &= outcome.metrics["affordance_ratio"][:different] < _TOUCHED
+            index = int(cost.argmin())
+            if best is None or cost[index] < best[0]:
+                best = (float(cost[index]), outcome, index, int(rests[index]))
+            if holds.any() or asked.pose or asked.trajectory:
+                break
+        assert best is not None
+        _, outcome, index, rest = best
+        return self._result(obj, asked, outcome, index, rest, tried, held)
+
+    def close(self) -> None:
+        """Ends the physics' threads."""
+        self._trials.close()
+
+    def _beginnings(
+        self, obj: GraspObject, asked: Asked, rng: np.random.Generator
+    ) -> tuple[Beginnings, np.ndarray, int]:
+        """Tries under the constraints, (B,) the resting pose of each, and how many of them are different."""
+        batch, points = self._tries, self.task.surface_points
+        labelled = obj if asked.minus is None else with_minus(obj, asked.minus)
+        reference = valid_rests(self.hand, obj, asked) if asked.pose or asked.trajectory else None
+        if reference is None:
+            position, direction, cross, rests = headings(labelled, asked, batch, self.task.back_off, rng)
+        else:
+            rests = np.resize(reference, batch)
+            position, cross = np.zeros((batch, 3)), np.tile([1.0, 0.0, 0.0], (batch, 1))
+            direction = np.tile([0.0, 0.0, -1.0], (batch, 1))
+        pose_q, pose_position, pose_quaternion = (
+            (asked.pose.q, asked.pose.position, asked.pose.quaternion)
+            if asked.pose
+            else (self.hand.q_open, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        )
+        count = self.task.trajectory_points
+        path, turns = asked.trajectory or (np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
+
+        def all_of(value: np.ndarray) -> np.ndarray:
+            return np.broadcast_to(np.asarray(value, np.float32), (batch, *np.shape(value)))
+
+        goal = Goal(
+            heading_position=position.astype(np.float32),
+            heading_direction=direction.astype(np.float32),
+            heading_cross=cross.astype(np.float32),
+            pose_q=all_of(pose_q),
+            pose_position=all_of(pose_position),
+            pose_quaternion=all_of(pose_quaternion),
+            trajectory_position=all_of(path),
+            trajectory_quaternion=all_of(turns),
+            mask=np.zeros((batch, len(MASKS)), np.float32),
+        )
+        flags = [np.full(batch, flag is not None) for flag in (asked.minus, asked.pose, asked.trajectory)]
+        minus = labelled.non_graspable_points[:points]
+        surface = Surface(all_of(obj.points[:points]), np.broadcast_to(minus, (batch, points)))
+        rest = np.asarray(obj.rest_poses, np.float32)[rests]
+        different = batch if reference is None else min(batch, len(reference))
+        return Beginnings(Request(goal, *flags), surface, rest), rests, different
+
+    def _result(
+        self, obj: GraspObject, asked: Asked, outcome: Outcome, index: int, rest: int, tries: int, held: int
+    ) -> Grasp:
+        metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
+        labelled = obj if asked.minus is None else with_minus(obj, asked.minus)
+        points = self.task.surface_points
+        episode = episode_message(
+            self.hand,
+            self.task,
+            Trace(*(field[:, index] for field in outcome.trace)),
+            goal_of_world(outcome.goal, index),
+            Surface(obj.points[:points], labelled.non_graspable_points[:points]),
+            obj,
+            {
+                "version": self._policy.version,
+                "actor": "grasp",
+                "success": metrics["success"] > 0,
+                "metrics": metrics,
+                "tries": tries,
+                "tries_held": held,
+                "object_file_scale": obj.file_scale,
+                "object_file_origin": [-x for x in obj.origin],
+            },
+        )
+        words = explain(
+            affordance=asked.minus is not None,
+            pose=asked.pose is not None,
+            trajectory=asked.trajectory is not None,
+            redirected=bool(outcome.redirected[index]),
+        )
+        pose = (asked.pose.q, asked.pose.position, asked.pose.quaternion) if asked.pose else None
+        wishes = Wishes(asked.direction, asked.position, asked.minus, pose, asked.trajectory)
+        words += [found.words for found in contradictions(self.hand, obj.points, wishes)]
+        return Grasp(episode, motion_of_episode(episode), tries, held, rest, tuple(words))
+
+
+def grasp(
+    thing: str | os.PathLike[str] | GraspObject,
+    *,
+    policy: str | os.PathLike[str] | None = None,
+    hand: str = "human",
+    options: ImportOptions | None = None,
+    tries: int = TRIES,
+    seed: int = 0,
+    progress: Progress = lambda what, done, total: None,
+    **constraints: str,
+) -> Grasp:
+    """The best grasp motion of an object under constraints; what is compiled is kept for the next call.
+
+    Args:
+      thing: a mesh (STL, OBJ, PLY, GLB), an object file, or an object.
+      policy: a policy file; the one that comes with the package if none is named.
+      hand: name of the hand whose shipped policy is taken.
+      options: how a mesh becomes an object.
+      tries: grasps that are simulated side by side.
+      seed: draws what is tried.
+      progress: told how far it is.
+      **constraints: heading, at, affordance, avoid, pose, trajectory; see `services.grasp.asked.read_asked`.
+
+    Raises:
+      CongraspError: the object cannot be imported, or a constraint cannot be read or kept.
+    """
+    file = policy_file(None if policy is None else pathlib.Path(policy), hand)
+    grasper = _grasper(file, file.stat().st_mtime_ns, tries, seed)
+    obj = (
+        thing if isinstance(thing, GraspObject) else one_object(pathlib.Path(thing), options or ImportOptions("guess"))
+    )
+    asked = read_asked(obj, grasper.hand, grasper.task.trajectory_points, **constraints)
+    return grasper.grasp(obj, asked, progress)
+
+
+@functools.lru_cache(maxsize=2)
+def _grasper(file: pathlib.Path, changed: int, tries: int, seed: int) -> Grasper:
+    return Grasper(bundles.load(file), tries=tries, seed=seed)
+
+
+def with_minus(obj: GraspObject, minus: np.ndarray) -> GraspObject:
+    """The object with another O-, (512,) bool."""
+    return dataclasses.replace(
+        obj, part_names=("graspable", "non-graspable"), graspable=np.array([True, False]), labels=minus.astype(np.int32)
+    )
+
+
+def _active(asked: Asked) -> tuple[str, ...]:
+    others = (("affordance", asked.minus), ("pose", asked.pose), ("trajectory", asked.trajectory))
+    return ("heading", *(name for name, value in others if value is not None))
+
+
+def _errors_of(constraints: tuple[str, ...]) -> list[str]:
+    names = [name for name in _SCALES if name.split("_")[0] in constraints]
+    return [*names, "moved_at_removal", "force_link_max"]
+
+
+def costs(outcome: Outcome, constraints: tuple[str, ...]) -> np.ndarray:
+    """(B,) what is worse about each try: first whether it held, then whether it did for a while, then all the rest."""
+    place = outcome.trace.object_position
+    removal = int(np.asarray(outcome.trace.table[:, 0]).sum()) - 1
+    values = {**outcome.metrics, "slip": np.linalg.norm(place[-1] - place[removal], axis=-1)}
+    cost = sum(np.minimum(values[name] / _SCALES[name], 10.0) for name in [*_errors_of(constraints), "slip"])
+    return np.asarray(cost) + 1e3 * (values["success"] == 0) + 1e4 * (values["held"] == 0)
+
+
+def _check_aligned(outcome: Outcome) -> None:
+    if not outcome.aligned.all():
+        raise CongraspError(
+            "The trajectory ends nearer to what must not be touched than to what may be grasped.",
+            "Let it end at the graspable part, or leave out --affordance and --avoid.",
+        )

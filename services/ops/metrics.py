@@ -1,0 +1,200 @@
+"""A Prometheus endpoint for each role; docs/operations.md lists what they offer."""
+
+import collections
+import contextlib
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+
+from common.errors import CongraspError, TransportError
+
+_TICKETS = ("granted", "redeemed", "returned", "expired")
+_GAUGES = {
+    "running": ("tickets_running", "Tickets that are out."),
+    "capacity": (
+        "tickets_capacity",
+        "Tickets that could be granted now; with those that run, the actors that it can use.",
+    ),
+    "missing": ("rollouts_missing", "Gaps in the counts of actors' rollouts."),
+    "turned_away": ("requests_turned_away", "Requests of actors that had made too many useless ones."),
+}
+_MILLISECONDS = (0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000)
+
+
+@contextlib.contextmanager
+def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
+    """Offers collectors at http://HOST:PORT/metrics while the block runs, and this process's memory and CPU time.
+
+    Raises:
+      CongraspError: it cannot listen there.
+    """
+    registry = CollectorRegistry()
+    ProcessCollector(registry=registry)
+    for collector in collectors:
+        registry.register(collector)
+    try:
+        server, thread = start_http_server(port, host, registry)
+    except OSError as error:
+        raise CongraspError(
+            f"The metrics cannot be offered at {host}:{port} ({error.strerror}).", "Choose another --metrics-port."
+        ) from None
+    try:
+        yield
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(1.0)
+
+
+class LearnerMetrics:
+    """A learner's status at the moment of the scrape, and the figures of its last update."""
+
+    def __init__(self, ask: Callable[[], Mapping[str, Any]]):
+        """The function returns what `services.ops.status.ask` does."""
+        self._ask = ask
+        self._figures: Mapping[str, float] = {}
+
+    def update(self, figures: Mapping[str, float]) -> None:
+        """Takes the figures of an update."""
+        self._figures = figures
+
+    def describe(self) -> Iterable[Metric]:
+        """Nothing: what there is depends on the run."""
+        return ()
+
+    def collect(self) -> Iterator[Metric]:
+        """See the class."""
+        try:
+            status = self._ask()
+        except TransportError:
+            yield GaugeMetricFamily("congrasp_learner_ready", "Whether it takes rollouts.", 0.0)
+            return
+        yield GaugeMetricFamily("congrasp_learner_ready", "Whether it takes rollouts.", float(status["version"] >= 0))
+        yield _gauge("version", "Newest policy version.", status["version"])
+        yield _gauge("finished", "Whether the run is over.", status["finished"])
+        yield _gauge("ledger_balanced", "Whether the ledger adds up.", not status["warnings"])
+        yield _gauge("queue_length", "Rollouts that wait.", status["queue"]["length"])
+        yield _gauge("queue_limit", "Rollouts that may wait.", status["queue"]["limit"])
+        for name, value in status["rates"].items():
+            yield _gauge(name, "Over the last ten seconds.", value)
+        yield from self._ledger(status["ledger"])
+        yield from self._roles(status["roles"])
+        update = _gauge("update", "Figures of the last update, by the names of the log.", labels=["figure"])
+        for name, value in self._figures.items():
+            update.add_metric([name], value)
+        yield update
+
+    @staticmethod
+    def _ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:
+        tickets = CounterMetricFamily("congrasp_learner_tickets", "Tickets by what became of them.", labels=["outcome"])
+        rollouts = CounterMetricFamily(
+            "congrasp_learner_rollouts", "Rollouts by what became of them.", labels=["outcome"]
+        )
+        for name, value in ledger.items():
+            if name in _GAUGES:
+                yield _gauge(*_GAUGES[name], value)
+            elif name != "queued":
+                (tickets if name in _TICKETS else rollouts).add_metric([name], value)
+        yield from (tickets, rollouts)
+
+    @staticmethod
+    def _roles(roles: Iterable[Mapping[str, Any]]) -> Iterator[Metric]:
+        alive = _gauge("roles", "Processes of the run.", labels=["role"])
+        for role, number in collections.Counter(role["role"] for role in roles).items():
+            alive.add_metric([role], number)
+        who = ["actor", "incarnation"]
+        lag = _gauge("actor_lag", "Versions by which an actor's last rollout was behind.", labels=who)
+        steps = _gauge("actor_steps_per_second", "Over the last ten seconds.", labels=who)
+        rollouts = CounterMetricFamily("congrasp_learner_actor_rollouts", "Accepted of an actor.", labels=who)
+        for role in roles:
+            labels = [role["id"], role["incarnation"]]
+            if "lag" in role:
+                lag.add_metric(labels, role["lag"])
+                rollouts.add_metric(labels, role["rollouts"])
+            if "steps_per_second" in role:
+                steps.add_metric(labels, role["steps_per_second"])
+        yield from (alive, lag, steps, rollouts)
+
+
+def _gauge(name: str, help: str, value: float | None = None, labels: Sequence[str] | None = None) -> GaugeMetricFamily:
+    return GaugeMetricFamily(f"congrasp_learner_{name}", help, None if value is None else float(value), labels)
+
+
+class ActorMetrics:
+    """An actor's last rollout."""
+
+    def __init__(self) -> None:
+        self._last: Mapping[str, float] = {}
+
+    def rollout(self, figures: Mapping[str, float]) -> None:
+        """Takes the figures of a rollout; `rollouts` and `version` among them."""
+        self._last = figures
+
+    def describe(self) -> Iterable[Metric]:
+        """Nothing before the first rollout."""
+        return ()
+
+    def collect(self) -> Iterator[Metric]:
+        """See the class."""
+        last = dict(self._last)
+        yield CounterMetricFamily("congrasp_actor_rollouts", "Rollouts that it made.", last.pop("rollouts", 0.0))
+        yield GaugeMetricFamily("congrasp_actor_version", "Policy version that acts.", last.pop("version", -1.0))
+        for name, value in last.items():
+            yield GaugeMetricFamily(f"congrasp_actor_{name}", "Of the last rollout.", value)
+
+
+class ServerMetrics:
+    """A policy server's answers and batches, and its health at the moment of the scrape."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.outcomes: collections.Counter[str] = collections.Counter()
+        """Queries by what was said to them."""
+        self._seconds = Histogram(
+            "congrasp_policy_seconds",
+            "From the arrival of a query to its answer.",
+            registry=None,
+            buckets=[1e-3 * bound for bound in _MILLISECONDS],
+        )
+        self._batch = Histogram(
+            "congrasp_policy_batch", "States in a batch.", registry=None, buckets=[1, 2, 4, 8, 16, 32, 64, 128]
+        )
+        self.health: Callable[[], Mapping[str, Any]] = dict
+        """Of the server, once there is one."""
+
+    def answer(self, outcome: str, seconds: float) -> None:
+        """Takes note of an answer: answered, refused, overloaded or late."""
+        with self._lock:
+            self.outcomes[outcome] += 1
+        if outcome == "answered":
+            self._seconds.observe(seconds)
+
+    def batch(self, size: int) -> None:
+        """Takes note of a batch."""
+        self._batch.observe(size)
+
+    def describe(self) -> Iterable[Metric]:
+        """Nothing before there is a server."""
+        return ()
+
+    def collect(self) -> Iterator[Metric]:
+        """See the class."""
+        health = self.health()
+        for name, help in (
+            ("ready", "Whether it answers."),
+            ("version", "Of the policy."),
+            ("queue", "Queries that wait."),
+        ):
+            if name in health:
+                yield GaugeMetricFamily(f"congrasp_policy_{name}", help, float(health[name]))
+        outcomes = CounterMetricFamily("congrasp_policy_queries", "Queries by outcome.", labels=["outcome"])
+        with self._lock:
+            counts = dict.fromkeys(("answered", "refused", "overloaded", "late"), 0) | self.outcomes
+        for outcome, count in counts.items():
+            outcomes.add_metric([outcome], count)
+        yield outcomes
+        yield from self._seconds.collect()
+        yield from self._batch.collect()

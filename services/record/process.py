@@ -1,0 +1,85 @@
+"""The recorder as a process of its own."""
+
+import contextlib
+import functools
+import pathlib
+import secrets
+import time
+
+from rich.console import Console
+
+from common.errors import CongraspError
+from common.transport.keys import Keys, process_name
+from common.transport.security import Credentials
+from common.transport.zenoh_transport import ZenohTransport
+from services.ops.logs import say
+from services.record.live import LiveServer
+from services.record.recorder import Recorder
+
+_REFRESH, _CLOSE = 0.5, 2.5  # seconds
+
+
+def record_run(
+    connect: str,
+    run: str,
+    out: pathlib.Path,
+    *,
+    live: int | None = None,
+    duration: float | None = None,
+    structured: bool = False,
+    credentials: Credentials | None = None,
+) -> int:
+    """Records until `duration` seconds have passed, Ctrl-C, or, without a live view, the disk refuses.
+
+    Args:
+      connect: endpoint of the learner.
+      run: name of the run.
+      out: folder for the files.
+      live: port of the live view, or None.
+      duration: seconds, or None.
+      structured: speak through the log alone, without a progress line.
+      credentials: of an observer, or None.
+
+    Returns:
+      Zero.
+
+    Raises:
+      CongraspError: recording stopped, or nothing could be recorded at all.
+    """
+    console = Console(stderr=True, quiet=structured)
+    complain = functools.partial(say, "warning") if structured else lambda text: console.print(f"congrasp: {text}")
+    end = time.monotonic() + duration if duration is not None else None
+    with contextlib.ExitStack() as stack:
+        transport = stack.enter_context(ZenohTransport(connect=[connect], credentials=credentials))
+        server = stack.enter_context(LiveServer(live)) if live is not None else None
+        if server is not None:
+            console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")
+        sinks = [server] if server else []
+        recorder = stack.enter_context(Recorder(transport, run, out, name="record", sinks=sinks, complain=complain))
+        transport.declare_alive(Keys(run).alive("recorder", process_name("recorder"), secrets.token_hex(4)))
+        try:
+            with console.status(_state(recorder)) as status:
+                while (end is None or time.monotonic() < end) and (server is not None or not recorder.error):
+                    time.sleep(_REFRESH if end is None else max(0.0, min(_REFRESH, end - time.monotonic())))
+                    status.update(_state(recorder))
+        finally:
+            recorder.close(_CLOSE)
+            for file in recorder.files:
+                if structured:
+                    say("info", f"Wrote {file}.")
+                else:
+                    print(file)
+            console.print(_state(recorder))
+    if recorder.error:
+        raise CongraspError(recorder.error, "Free space and start again; a new file begins.")
+    if not recorder.messages:
+        console.print(f"Nothing came from the run '{run}'. Is that its name? 'congrasp status' shows who works on it.")
+    return 0
+
+
+def _state(recorder: Recorder) -> str:
+    size = sum(file.stat().st_size for file in recorder.files if file.exists())
+    return (
+        f"{recorder.messages} messages recorded, {size / 1e6:.1f} MB; "
+        f"lost {recorder.dropped}, damaged {recorder.damaged}"
+    )

@@ -1,0 +1,131 @@
+"""Reads recordings, whole or cut off: a killed writer's file reads up to its last flush."""
+
+import collections
+import json
+import pathlib
+import struct
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import zstandard
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader
+from mcap.writer import MCAP0_MAGIC
+
+from common.errors import CongraspError
+from common.wire.codec import Message, decode
+from services.record.channels import ROLLOUT_SCHEMA, flatten
+from services.record.scene import EPISODE_SCHEMA
+from services.record.writer import PART
+
+_CUT = (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError)
+_RECORD_LIMIT = 1 << 30
+
+
+class Record(NamedTuple):
+    """One message of a file."""
+
+    topic: str
+    schema: str
+    """Name of its schema."""
+    encoding: str
+    time: int
+    """Nanoseconds since 1970."""
+    data: bytes
+
+
+def log_files(path: pathlib.Path) -> list[pathlib.Path]:
+    """The recordings at `path`, a file or a folder (with those below it), in the order of their names.
+
+    Raises:
+      CongraspError: there are none.
+    """
+    if not path.exists():
+        raise CongraspError(f"There is no file or folder {path}.", "Name a run's folder or an MCAP file.")
+    if path.is_file():
+        return [path]
+    found = sorted([*path.rglob("*.mcap"), *path.rglob(f"*.mcap{PART}")], key=lambda file: (file.name, file))
+    if not found:
+        raise CongraspError(f"There is no recording (*.mcap) in {path}.", "Name a run's folder or an MCAP file.")
+    return found
+
+
+def is_complete(path: pathlib.Path) -> bool:
+    """Whether the file was finished; false for one whose writer was killed."""
+    with path.open("rb") as file:
+        file.seek(0, 2)
+        size = file.tell()
+        file.seek(max(0, size - len(MCAP0_MAGIC)))
+        return size > 2 * len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC
+
+
+def read_records(path: pathlib.Path, wanted: Callable[[str], bool] = lambda topic: True) -> Iterator[Record]:
+    """Messages of one file in the order in which they were written, as far as the file is intact.
+
+    Args:
+      path: the file.
+      wanted: which topics to read.
+
+    Raises:
+      CongraspError: the file cannot be opened, or is no MCAP file.
+    """
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
+    with file:
+        start = file.read(len(MCAP0_MAGIC))
+        if not MCAP0_MAGIC.startswith(start):
+            raise CongraspError(f"{path} is not an MCAP file.", "Name a file that 'congrasp record' wrote.")
+        file.seek(0)
+        reader = NonSeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT)
+        try:
+            for schema, channel, message in reader.iter_messages(log_time_order=False):
+                if wanted(channel.topic):
+                    name = schema.name if schema else ""
+                    yield Record(channel.topic, name, channel.message_encoding, message.log_time, message.data)
+        except _CUT:
+            return  # cut off here; everything before has been given
+
+
+def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Every metric of a run's recordings, by `<role>/<name>/<metric>`.
+
+    Returns:
+      For each metric its steps (n,), rising (updates, else versions, else seconds since the first message), and
+      values (n,). Where a run was resumed from a checkpoint, the later value of a step counts.
+    """
+    series: dict[str, dict[float, float]] = collections.defaultdict(dict)
+    first: int | None = None
+    for file in log_files(path):
+        for record in read_records(file, lambda topic: topic.startswith("/metrics/")):
+            first = record.time if first is None else first
+            message = json.loads(record.data)
+            step = message.get("update", message.get("version", (record.time - first) / 1e9))
+            for name, value in flatten(message["values"]).items():
+                series[f"{record.topic.removeprefix('/metrics/')}/{name}"][step] = value
+    return {
+        name: (np.array(sorted(points)), np.array([points[step] for step in sorted(points)]))
+        for name, points in sorted(series.items())
+    }
+
+
+def read_episodes(path: pathlib.Path) -> Iterator[Message]:
+    """The recorded episodes at `path`, a file or a folder, as the actors sent them, in the order of recording."""
+    return _messages(path, EPISODE_SCHEMA, lambda topic: topic.startswith("/episode/") and topic.endswith("/raw"))
+
+
+def read_rollouts(path: pathlib.Path) -> Iterator[Message]:
+    """The recorded rollouts at `path`, a file or a folder, as the actors sent them, in the order of recording.
+
+    Axes are (T, B, ...); `meta["layout"]` lists the blocks of an observation with their sizes.
+    """
+    return _messages(path, ROLLOUT_SCHEMA, lambda topic: topic.startswith("/rollout/"))
+
+
+def _messages(path: pathlib.Path, schema: str, wanted: Callable[[str], bool]) -> Iterator[Message]:
+    for file in log_files(path):
+        for record in read_records(file, wanted):
+            if record.schema == schema:
+                yield decode(record.data)

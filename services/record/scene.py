@@ -1,0 +1,295 @@
+"""An episode as a 3-D scene: link frames, capsules, object, constraints, contacts and signals, step by step.
+
+Each actor has a frame of its own, side by side under `world`. What stays the same through an episode is sent once, at
+its start; link frames, contacts and signals follow at the control step.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from scipy.spatial.transform import Rotation
+
+from common.hands import get_hand
+from common.hands.mjcf import WRIST_JOINTS
+from common.hands.spec import Capsule, Hand, Link, link_origin
+from common.task.types import MASKS
+from common.wire.codec import Message, encode
+from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
+from services.record.poses import link_poses
+
+EPISODE_SCHEMA = "congrasp.Episode"
+SPACING = 0.8
+"""Metres between two actors' frames in the world."""
+Colour = tuple[float, float, float, float]
+_SKIN, _GHOST = (0.70, 0.73, 0.79, 1.0), (0.22, 0.40, 0.86, 0.25)
+_OBJECT, _TABLE = (0.95, 0.62, 0.24, 1.0), (0.80, 0.79, 0.77, 1.0)
+_PLUS, _MINUS = (0.20, 0.65, 0.32, 1.0), (0.80, 0.16, 0.16, 1.0)
+_HEADING, _WAYPOINT, _FORCE = (0.22, 0.40, 0.86, 1.0), (0.53, 0.30, 0.75, 1.0), (0.93, 0.26, 0.21, 1.0)
+_AXES = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.7, 0.2, 1.0), (0.2, 0.3, 0.9, 1.0))
+_ARROW = 0.10  # length of the approach arrow, m
+_FORCE_LENGTH, _FORCE_MAX = 0.01, 0.10  # m per newton, and the longest arrow
+_FORCE_LEAST = 0.05  # N
+_SKIN_POINTS = 96  # on each capsule
+_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+_NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def episode_entries(actor: str, episode: Message, start: int, slot: int, channels: JsonChannels) -> Iterator[Entry]:
+    """Everything that a recorder writes for one episode.
+
+    Args:
+      actor: name of the actor; topics and frames begin with it.
+      episode: the message (see `services.record`).
+      start: time of its first step, ns.
+      slot: the actor's place in the row of actors.
+      channels: schemas of the JSON signals.
+
+    Raises:
+      Exception: of any kind, when the message is not a whole episode.
+    """
+    topic = f"/episode/{actor}"
+    arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
+    hand = get_hand(episode.meta["hand"])
+    step = round(1e9 * episode.meta["control_dt"])
+    yield Entry(opaque_channel(f"{topic}/raw", EPISODE_SCHEMA), start, encode(episode))
+    yield _protobuf(f"{topic}/scene", start, _static_scene(hand, actor, arrays, episode.meta, start), latched=True)
+    yield _protobuf(f"{topic}/surface", start, _surface(actor, arrays, start), latched=True)
+    for link in hand.links:
+        # Rerun draws point clouds and no scenes; a topic holds one frame's cloud.
+        cloud = _cloud(f"{actor}/{link.name}", _skin(link), np.multiply(_SKIN, 255), start)
+        yield _protobuf(f"{topic}/hand/{link.name}", start, cloud, latched=True)
+    for i in range(len(arrays["object_position"])):
+        now = start + i * step
+        yield _protobuf(f"{topic}/tf", now, _transforms(hand, actor, arrays, i, slot, now))
+        yield _protobuf(f"{topic}/contacts", now, _contacts(hand, actor, arrays, i, now, step))
+        yield channels.entry(f"{topic}/signals", now, _signals(hand, arrays, i, episode.meta["control_dt"]))
+
+
+def duration(episode: Message) -> int:
+    """Length of an episode in ns."""
+    return round(1e9 * episode.meta["control_dt"]) * len(episode.arrays["object_position"])
+
+
+def _protobuf(topic: str, time: int, message: Any, *, latched: bool = False) -> Entry:
+    kind: Any = type(message)
+    return Entry(protobuf_channel(topic, kind, latched=latched), time, message.SerializeToString())
+
+
+def _transforms(
+    hand: Hand, actor: str, arrays: Mapping[str, np.ndarray], i: int, slot: int, now: int
+) -> FrameTransforms:
+    message = FrameTransforms()
+    poses = [("world", actor, np.array([SPACING * slot, 0.0, 0.0]), _NO_TURN)]
+    for k, link in enumerate(hand.links):
+        poses.append((actor, f"{actor}/{link.name}", arrays["link_position"][i, k], arrays["link_quaternion"][i, k]))
+    poses.append((actor, f"{actor}/object", arrays["object_position"][i], arrays["object_quaternion"][i]))
+    for parent, child, position, quaternion in poses:
+        transform = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
+        transform.timestamp.FromNanoseconds(now)
+        _set_vector(transform.translation, position)
+        _set_quaternion(transform.rotation, quaternion)
+    return message
+
+
+def _static_scene(
+    hand: Hand, actor: str, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], now: int
+) -> SceneUpdate:
+    """Hand, object and constraints; begins by removing what the episode before it left."""
+    update = SceneUpdate()
+    update.deletions.add(type=SceneEntityDeletion.ALL).timestamp.FromNanoseconds(now)
+    for link in hand.links:
+        entity = _entity(update, f"hand/{link.name}", f"{actor}/{link.name}", now)
+        for capsule in link.capsules:
+            _add_capsule(entity, capsule, np.array(link_origin(link)), np.zeros(3), Rotation.identity(), _SKIN)
+    frame = f"{actor}/object"
+    body = _entity(update, "object", frame, now).triangles.add()
+    body.pose.orientation.w = 1.0
+    for vertex in arrays["visual_vertices"]:
+        _set_vector(body.points.add(), vertex)
+    body.indices.extend(arrays["visual_faces"].ravel().tolist())
+    _set_colour(body.color, _OBJECT)
+    text = _entity(update, "label", frame, now).texts.add(billboard=True, font_size=0.015, text=_label(meta))
+    _set_vector(text.pose.position, [0.0, 0.0, arrays["visual_vertices"][:, 2].max() + 0.12])
+    _set_colour(text.color, (0.15, 0.17, 0.2, 1.0))
+    _add_constraints(update, hand, frame, arrays, now)
+    return update
+
+
+def _label(meta: Mapping[str, Any]) -> str:
+    return f"{meta['object']}, version {meta['version']}, {'success' if meta['success'] else 'no success'}"
+
+
+def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mapping[str, np.ndarray], now: int) -> None:
+    mask = dict(zip(MASKS, arrays["goal/mask"] > 0, strict=True))
+    direction = arrays["goal/heading_direction"]
+    heading = _entity(update, "constraint/heading", frame, now)
+    _add_arrow(heading, arrays["goal/heading_position"] - _ARROW * direction, direction, _ARROW, 0.006, _HEADING)
+    if mask["trajectory"]:
+        entity = _entity(update, "constraint/trajectory", frame, now)
+        line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.003)
+        line.pose.orientation.w = 1.0
+        _set_colour(line.color, _WAYPOINT)
+        for point in arrays["goal/trajectory_position"]:
+            _set_vector(line.points.add(), point)
+            _add_sphere(entity, point, 0.004, _WAYPOINT)
+    if mask["pose_finger"] or mask["pose_wrist"]:
+        entity = _entity(update, "constraint/pose", frame, now)
+        wrist = Rotation.from_quat(arrays["goal/pose_quaternion"], scalar_first=True)
+        origin = arrays["goal/pose_position"]
+        for axis, colour in zip(wrist.as_matrix().T, _AXES, strict=True):
+            _add_arrow(entity, origin, axis, 0.05, 0.003, colour)
+        if mask["pose_finger"]:
+            position, quaternion = link_poses(hand, arrays["goal/pose_q"])
+            for k, link in enumerate(hand.links):
+                turn = wrist * Rotation.from_quat(quaternion[k], scalar_first=True)
+                for capsule in link.capsules:
+                    place = wrist.apply(position[k]) + origin
+                    _add_capsule(entity, capsule, np.array(link_origin(link)), place, turn, _GHOST)
+
+
+def _surface(actor: str, arrays: Mapping[str, np.ndarray], now: int) -> PointCloud:
+    """The object's surface points: O+ green, O- red."""
+    colours = np.where(arrays["surface_minus"][:, None], np.multiply(_MINUS, 255), np.multiply(_PLUS, 255))
+    return _cloud(f"{actor}/object", arrays["surface_points"], colours, now)
+
+
+def _skin(link: Link) -> np.ndarray:
+    """(n, 3) points spread evenly over the link's capsules, in its frame.
+
+    Equal steps along a capsule's whole length cut equal areas off it, caps included (Archimedes).
+    """
+    points = []
+    for capsule in link.capsules:
+        start, end = np.subtract([capsule.start, capsule.end], link_origin(link))
+        length = float(np.linalg.norm(end - start))
+        axis = (end - start) / length if length else np.array([0.0, 0.0, 1.0])
+        turn = Rotation.from_quat(_turn_onto([0.0, 0.0, 1.0], axis), scalar_first=True)
+        along = np.linspace(-1, 1, 2 * _SKIN_POINTS + 1)[1::2] * (length / 2 + capsule.radius)
+        around = _GOLDEN_ANGLE * np.arange(_SKIN_POINTS)
+        radius = np.sqrt(capsule.radius**2 - np.maximum(np.abs(along) - length / 2, 0.0) ** 2)
+        local = np.stack([radius * np.cos(around), radius * np.sin(around), along], -1)
+        points.append(turn.apply(local) + (start + end) / 2)
+    return np.concatenate(points) if points else np.zeros((0, 3))
+
+
+def _cloud(frame: str, points: np.ndarray, colours: np.ndarray, now: int) -> PointCloud:
+    """Points (N, 3) of a frame with colours (4,) or (N, 4) from 0 to 255."""
+    packed = np.zeros(len(points), [("position", "<f4", 3), ("colour", "u1", 4)])
+    packed["position"] = points
+    # Foxglove's packed colours lie as red, green, blue, alpha in memory, one field of a byte each.
+    packed["colour"] = colours
+    cloud = PointCloud(frame_id=frame, point_stride=packed.dtype.itemsize, data=packed.tobytes())
+    cloud.timestamp.FromNanoseconds(now)
+    cloud.pose.orientation.w = 1.0
+    kinds = [("x", 0), ("y", 4), ("z", 8), ("red", 12), ("green", 13), ("blue", 14), ("alpha", 15)]
+    for name, offset in kinds:
+        kind = PackedElementField.FLOAT32 if offset < 12 else PackedElementField.UINT8
+        cloud.fields.add(name=name, offset=offset, type=kind)
+    return cloud
+
+
+def _contacts(hand: Hand, actor: str, arrays: Mapping[str, np.ndarray], i: int, now: int, step: int) -> SceneUpdate:
+    """Table and contact forces of one step; they vanish by themselves shortly after it."""
+    update = SceneUpdate()
+    if arrays["table"][i]:
+        entity = _entity(update, "table", actor, now, lifetime=2 * step)
+        cube = entity.cubes.add()
+        _set_vector(cube.pose.position, [0.0, 0.0, -0.01])
+        cube.pose.orientation.w = 1.0
+        _set_vector(cube.size, [0.6, 0.6, 0.02])
+        _set_colour(cube.color, _TABLE)
+    entity = _entity(update, "forces", actor, now, lifetime=2 * step)
+    for k, force in enumerate(arrays["contact_force"][i]):
+        strength = float(np.linalg.norm(force))
+        if strength > _FORCE_LEAST:
+            length = min(_FORCE_LENGTH * strength, _FORCE_MAX)
+            _add_arrow(entity, arrays["link_position"][i, k], force / strength, length, 0.004, _FORCE)
+    return update
+
+
+def _signals(hand: Hand, arrays: Mapping[str, np.ndarray], i: int, control_dt: float) -> dict[str, Any]:
+    """Numbers of one step: seconds, rewards, forces, joints, the object's height."""
+    terms = {name.removeprefix("reward/"): float(a[i]) for name, a in arrays.items() if name.startswith("reward/")}
+    joints = [joint.name for joint in hand.joints]
+    force = np.linalg.norm(arrays["contact_force"][i], axis=-1)
+    return {
+        "seconds": i * control_dt,
+        "reward": {**terms, "total": sum(terms.values())},
+        "force": {link.name: float(f) for link, f in zip(hand.links, force, strict=True)},
+        "links_in_contact": int((force > _FORCE_LEAST).sum()),
+        "q": dict(zip(joints, map(float, arrays["q"][i]), strict=True)),
+        "q_target": dict(zip(joints, map(float, arrays["q_target"][i]), strict=True)),
+        "wrist": dict(zip(WRIST_JOINTS, map(float, arrays["u"][i]), strict=True)),
+        "wrist_target": dict(zip(WRIST_JOINTS, map(float, arrays["u_target"][i]), strict=True)),
+        "object_height": float(arrays["object_position"][i, 2]),
+        "table": bool(arrays["table"][i]),
+    }
+
+
+def _entity(update: SceneUpdate, name: str, frame: str, now: int, *, lifetime: int = 0) -> SceneEntity:
+    """An entity that moves with its frame; without a lifetime it stays until it is replaced or removed."""
+    entity = update.entities.add(id=name, frame_id=frame, frame_locked=True)
+    entity.timestamp.FromNanoseconds(now)
+    entity.lifetime.FromNanoseconds(lifetime)
+    return entity
+
+
+def _add_capsule(
+    entity: SceneEntity, capsule: Capsule, origin: np.ndarray, place: np.ndarray, turn: Rotation, colour: Colour
+) -> None:
+    """A capsule of a link (`origin`: the link's at zero) whose frame lies at `place`, `turn` in the entity's frame."""
+    start, end = turn.apply(np.subtract([capsule.start, capsule.end], origin)) + place
+    along = end - start
+    length = float(np.linalg.norm(along))
+    if length > 0:
+        cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+        _set_vector(cylinder.pose.position, (start + end) / 2)
+        _set_quaternion(cylinder.pose.orientation, _turn_onto([0.0, 0.0, 1.0], along / length))
+        _set_vector(cylinder.size, [2 * capsule.radius, 2 * capsule.radius, length])
+        _set_colour(cylinder.color, colour)
+        _add_sphere(entity, end, capsule.radius, colour)
+    _add_sphere(entity, start, capsule.radius, colour)
+
+
+def _add_sphere(entity: SceneEntity, center: np.ndarray, radius: float, colour: Colour) -> None:
+    sphere = entity.spheres.add()
+    _set_vector(sphere.pose.position, center)
+    sphere.pose.orientation.w = 1.0
+    _set_vector(sphere.size, [2 * radius] * 3)
+    _set_colour(sphere.color, colour)
+
+
+def _add_arrow(
+    entity: SceneEntity, start: np.ndarray, direction: np.ndarray, length: float, width: float, colour: Colour
+) -> None:
+    arrow = entity.arrows.add(
+        shaft_length=0.7 * length, shaft_diameter=width, head_length=0.3 * length, head_diameter=2 * width
+    )
+    _set_vector(arrow.pose.position, start)
+    _set_quaternion(arrow.pose.orientation, _turn_onto([1.0, 0.0, 0.0], direction))
+    _set_colour(arrow.color, colour)
+
+
+def _turn_onto(axis: list[float], direction: np.ndarray) -> np.ndarray:
+    """A quaternion (w, x, y, z) that turns a unit axis onto a unit direction (3,)."""
+    return Rotation.align_vectors([direction], [axis])[0].as_quat(scalar_first=True)
+
+
+def _set_vector(target: Any, value: Any) -> None:
+    target.x, target.y, target.z = map(float, value)
+
+
+def _set_quaternion(target: Any, value: Any) -> None:
+    target.w, target.x, target.y, target.z = map(float, value)
+
+
+def _set_colour(target: Any, value: Colour) -> None:
+    target.r, target.g, target.b, target.a = value

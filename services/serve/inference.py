@@ -1,0 +1,93 @@
+"""The policy as one compiled function from a batch of flat queries to joint targets."""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from common.config import TaskConfig
+from common.constraints.priority import Request, explain, resolve
+from common.errors import CongraspError
+from common.hands.spec import Hand
+from common.policy.bundle import Acting, mean_action
+from common.task import control, observation
+from common.task.features import features
+from common.task.types import MASKS, Goal, SceneState, Surface
+from services.serve.requests import STATES_LIMIT, Layout, Query
+
+BATCH_SIZES = (1, 8, STATES_LIMIT)
+"""Batches are padded to one of these, so that nothing compiles after the warm-up."""
+
+
+class Answer(NamedTuple):
+    """What the policy says to one query of n states."""
+
+    vectors: np.ndarray
+    """(n, A + F + 6): the policy's mean action in units of action, finger targets (rad), wrist targets (m and rad)."""
+    words: list[list[str]]
+    """For each state which constraints are active, and why."""
+
+
+class PolicyFunction:
+    """The policy of one hand and task, for any weights.
+
+    Attributes:
+      layout: how queries are laid out.
+    """
+
+    def __init__(self, hand: Hand, task: TaskConfig):
+        self.layout = Layout(hand, task)
+        # Waking other threads costs a CPU more than they save here.
+        alone = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
+        self._compiled = jax.jit(self._infer, compiler_options=alone)
+
+    def warm_up(self, weights: Acting) -> None:
+        """Compiles every batch size."""
+        for size in BATCH_SIZES:
+            jax.block_until_ready(self._compiled(weights, np.zeros((size, self.layout.size), np.float32)))
+
+    def __call__(self, weights: Acting, queries: Sequence[Query]) -> list[Answer | Exception]:
+        """Answers queries of at most `BATCH_SIZES[-1]` states; one that cannot be answered gets its own error."""
+        ends = list(itertools.accumulate(len(query.vectors) for query in queries))
+        batch = np.zeros((next(size for size in BATCH_SIZES if size >= ends[-1]), self.layout.size), np.float32)
+        np.concatenate([query.vectors for query in queries], out=batch[: ends[-1]])
+        found = np.asarray(self._compiled(weights, batch))
+        starts = [0, *ends[:-1]]
+        return [self._answer(query, found[a:b]) for query, a, b in zip(queries, starts, ends, strict=True)]
+
+    def _infer(self, weights: Acting, vectors: jax.Array) -> jax.Array:
+        """For states (B, S): answers (A + F + 6), the flags redirected and aligned, and checks (C), in one (B, ...)."""
+        hand, task = self.layout.hand, self.layout.task
+        fields, checks = self.layout.complete(vectors)
+        flags = {name: fields[name] > 0.5 for name in ("contact_found", "table", "surface_minus", "asked")}
+        state = SceneState(**{name: {**fields, **flags}[name] for name in SceneState._fields})
+        surface = Surface(fields["surface_points"], flags["surface_minus"])
+        mask = jnp.zeros((len(vectors), len(MASKS)))
+        asked = Goal(**{name: mask if name == "mask" else fields[name] for name in Goal._fields})
+        resolution = resolve(hand, surface, Request(asked, *jnp.moveaxis(flags["asked"][:, 1:], -1, 0)))
+        seen = features(hand, task, state, surface, resolution.goal)
+        observed = observation.observe(task, state, seen, resolution.goal)
+        mean = mean_action(observation.layout(hand, task), weights, observed)
+        action = control.decode(hand, task.control, state, seen, resolution.goal, mean)
+        notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
+        return jnp.concatenate([mean, action.q_target, action.u_target, notes, checks], -1)
+
+    def _answer(self, query: Query, found: np.ndarray) -> Answer | Exception:
+        size = 2 * len(self.layout.hand.joints) + 12
+        vectors, redirected, aligned, checks = found[:, :size], found[:, size], found[:, size + 1], found[:, size + 2 :]
+        if complaint := self.layout.complaint(query, checks):
+            return complaint
+        if not np.isfinite(vectors).all():
+            return CongraspError("The policy's answer to this query is not finite.", "Check the state's magnitudes.")
+        if not aligned.all():
+            return CongraspError(
+                "The constraints contradict each other: the trajectory ends nearer to O- than to O+ of the affordance.",
+                "Change the trajectory or the affordance.",
+            )
+        asked = {name: name in query.asked for name in ("affordance", "pose", "trajectory")}
+        flags = redirected.tolist()
+        words = {flag: explain(**asked, redirected=flag > 0) for flag in set(flags)}
+        return Answer(vectors, [words[flag] for flag in flags])

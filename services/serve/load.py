@@ -1,0 +1,164 @@
+"""A policy server in a process of its own, a plausible query for it, and a test of its latency."""
+
+import concurrent.futures
+import contextlib
+import os
+import pathlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import psutil
+
+from common.errors import CongraspError, TransportError
+from common.transport.ports import free_port
+from services.ops.shutdown import PARENT_VARIABLE, take_along
+from services.serve.client import PolicyClient
+
+
+@contextlib.contextmanager
+def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]]:
+    """A server of a policy file on this machine while the block runs: its endpoint, and the number of its process.
+
+    It may still be compiling.
+
+    Args:
+      policy: the file.
+      log: takes what the server prints.
+    """
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = [sys.executable, "-m", "services.cli.main", "serve", "--policy", str(policy), "--listen", endpoint]
+    with log.open("wb") as output:
+        server = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
+            start_new_session=True,
+        )
+    take_along(server)
+    try:
+        yield endpoint, server.pid
+    finally:
+        server.terminate()
+        try:
+            server.wait(5.0)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait()
+
+
+def processor_seconds(process: int) -> float:
+    """Processor time that a process has taken, in all its threads."""
+    times = psutil.Process(process).cpu_times()
+    return times.user + times.system
+
+
+def wait_until_ready(client: PolicyClient, seconds: float = 180.0) -> None:
+    """Returns once the server has compiled and answers; a CongraspError after `seconds`."""
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            client.health()
+            return
+        except TransportError:
+            if time.monotonic() > deadline:
+                raise CongraspError(f"The policy server is not ready after {seconds:g} s.") from None
+            time.sleep(0.2)
+
+
+def example_episode(seed: int, hand: str = "human") -> dict[str, Any]:
+    """The start of an episode with a procedural object and one of its headings: arguments of `reset` and of `act`."""
+    import jax
+
+    from actors import environment
+    from actors.taskset import build_taskset
+    from common.config import TaskConfig
+    from common.hands import get_hand
+    from common.objects import procedural
+    from common.objects.pool import sized
+
+    task = TaskConfig(hand=hand, p_affordance=0.0, p_pose=0.0, p_trajectory=0.0)
+    found = get_hand(hand)
+    (obj,) = sized(found, task, [procedural.generate(seed)])
+    env = environment.start(found, task, build_taskset(found, task, [obj], seed), jax.random.key(seed), 1)
+    world = {name: np.asarray(value)[0] for name, value in env.world._asdict().items()}
+    pose = world["object_position"], world["object_quaternion"]
+    return {
+        "hand": found.name,
+        "object": obj.name,
+        "reset": {
+            "q": world["q"],
+            "wrist": (world["base_position"], world["base_quaternion"]),
+            "obj": pose,
+            "surface": np.asarray(env.surface.points)[0],
+            "constraints": ["heading"],
+            "heading_position": np.asarray(env.goal.heading_position)[0],
+            "heading_direction": np.asarray(env.goal.heading_direction)[0],
+            "heading_cross": np.asarray(env.goal.heading_cross)[0],
+        },
+        "state": {"q": world["q"], "u": np.zeros(6), "object_position": pose[0], "object_quaternion": pose[1]},
+    }
+
+
+def measure(
+    connect: str,
+    name: str,
+    episode: dict[str, Any],
+    repeat: int,
+    concurrency: int,
+    timeout: float,
+    certs: pathlib.Path | None = None,
+    states: int = 1,
+) -> dict[str, float]:
+    """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is not counted.
+
+    With more than one of `states` a query holds so many, and each of them counts as an answer.
+    """
+    share = max(1, repeat // concurrency)
+
+    def ask(_: int) -> tuple[list[float], int, int]:
+        times, failed, overloaded, state = [], 0, 0, episode["state"]
+        with PolicyClient(connect, name, hand=episode["hand"], timeout=timeout, certs=certs) as client:
+            client.reset(**episode["reset"])
+            client.act(state)
+            for _ in range(share):
+                try:
+                    answer = client.act(state) if states == 1 else client.act_each([state] * states)[0]
+                    times.append(answer.round_trip_ms)
+                except TransportError as error:
+                    overloaded += "verloaded" in str(error)
+                    failed += "verloaded" not in str(error)
+        return times, failed, overloaded
+
+    began = time.perf_counter()
+    with concurrent.futures.ThreadPoolExecutor(concurrency) as pool:
+        results = list(pool.map(ask, range(concurrency)))
+    spent = time.perf_counter() - began
+    times = np.concatenate([np.array(part) for part, _, _ in results])
+    return {
+        "p50_ms": float(np.percentile(times, 50)) if len(times) else float("nan"),
+        "p99_ms": float(np.percentile(times, 99)) if len(times) else float("nan"),
+        "answers_per_s": states * len(times) / spent,
+        "failed": sum(failed for _, failed, _ in results),
+        "overloaded": sum(overloaded for _, _, overloaded in results),
+    }
+
+
+def one_answer(client: PolicyClient, episode: dict[str, Any]) -> str:
+    """Asks for the first action of an episode; the answer in words."""
+    client.reset(**episode["reset"])
+    answer = client.act(episode["state"])
+    with np.printoptions(precision=3, suppress=True):
+        return (
+            f"object       {episode['object']}, constraints: {', '.join(episode['reset']['constraints'])}\n"
+            f"active       {' '.join(answer.active)}\n"
+            f"q_target     {answer.q_target} rad\n"
+            f"u_target     {answer.u_target} m, rad\n"
+            f"version      {answer.version}\n"
+            f"timing       {answer.round_trip_ms:.2f} ms round trip, {answer.server_ms:.2f} ms in the server"
+        )

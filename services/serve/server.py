@@ -1,0 +1,227 @@
+"""The live policy server: follows a run or a policy file, and answers queries on `policy/act` and `policy/health`."""
+
+import functools
+import pathlib
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from common.errors import CongraspError, TransportError
+from common.hands import get_hand
+from common.policy import bundle as bundles
+from common.policy.bundle import Acting, PolicyBundle, content_hash
+from common.transport.base import Transport
+from common.transport.keys import Keys
+from common.wire.codec import Message, encode
+from services.ops.logs import say
+from services.serve.batching import Batcher, Late, Overloaded
+from services.serve.inference import BATCH_SIZES, Answer, PolicyFunction
+from services.serve.requests import PACKED, STATES_LIMIT, Query
+
+Source = Callable[[int], PolicyBundle | None]
+"""(version that is held, -1 for none) -> a newer bundle, or None."""
+WINDOW = 0.001
+"""Seconds that a query may wait for others to join its batch."""
+DEPTH = 64
+"""Queries that wait for the next batch; one more is refused at once."""
+_MAX_TIMEOUT = 60.0
+_FOLLOW_SECONDS = 0.5
+
+
+class _Held(NamedTuple):
+    """A policy in use."""
+
+    bundle: PolicyBundle
+    hash: str
+    acting: Acting
+
+
+_Answered = tuple[Answer, _Held, float, float]
+"""An answer, the policy it is of, and the seconds that it waited and was computed in."""
+
+
+class PolicyServer:
+    """Answers queries with the newest policy; weights are swapped between two batches."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        run: str,
+        source: Source,
+        *,
+        timeout: float = 1.0,
+        on_answer: Callable[[str, float], None] = lambda outcome, seconds: None,
+        on_batch: Callable[[int], None] = lambda size: None,
+    ):
+        """Loads the first policy, compiles, and begins to serve.
+
+        Args:
+          transport: the server's own endpoint.
+          run: name under which it serves.
+          source: where policies come from.
+          timeout: seconds that a query may wait when it names no deadline.
+          on_answer: given the outcome of every query (answered, refused, overloaded, late), and how long it took.
+          on_batch: given the number of states in every batch.
+
+        Raises:
+          CongraspError: there is no policy yet.
+        """
+        first = source(-1)
+        if first is None:
+            raise CongraspError("There is no policy to serve yet.", "Start the server when the run has published one.")
+        self._source, self._timeout = source, timeout
+        self._on_answer, self._on_batch = on_answer, on_batch
+        self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
+        self._held = _hold(first)
+        self._function.warm_up(self._held.acting)
+        self._answered = 0
+        self._trouble = ""
+        self._closed = threading.Event()
+        self._batcher: Batcher[Query, _Answered] = Batcher(
+            self._infer, weigh=lambda query: len(query.vectors), size=BATCH_SIZES[-1], window=WINDOW, depth=DEPTH
+        )
+        keys = Keys(run)
+        transport.serve(keys.health, lambda key, request: Message({}, self.health()))
+        transport.serve(keys.act, self._act, workers=2, depth=DEPTH)  # one may infer while the other receives
+        self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
+        self._follower.start()
+
+    def health(self) -> dict[str, Any]:
+        """Readiness, version, hand, queue, and why a newer policy was refused, as JSON."""
+        held = self._held
+        return {
+            "ready": True,
+            "version": held.bundle.version,
+            "hash": held.hash,
+            "hand": held.bundle.spec.hand_name,
+            "surface_points": held.bundle.task.surface_points,
+            "trajectory_points": held.bundle.task.trajectory_points,
+            "queue": len(self._batcher),
+            "answered": self._answered,
+            "trouble": self._trouble,
+        }
+
+    def close(self) -> None:
+        """Refuses what waits, and stops following."""
+        self._closed.set()
+        self._batcher.close()
+        self._follower.join(2 * _FOLLOW_SECONDS)
+
+    def _act(self, key: str, request: Message) -> "Future[Message]":
+        began = time.monotonic()
+        try:
+            query = self._function.layout.parse(request)
+            future = self._batcher.submit(query, self._deadline(request.meta.get("timeout", self._timeout)))
+        except CongraspError as error:
+            self._count(error, began)
+            raise
+        answer: Future[Message] = Future()
+        future.add_done_callback(functools.partial(self._finish, request, began, answer))
+        return answer
+
+    def _finish(self, request: Message, began: float, answer: "Future[Message]", done: "Future[_Answered]") -> None:
+        error = done.exception()
+        self._count(error, began)
+        if error is None:
+            answer.set_result(self._message(request, done.result(), time.monotonic() - began))
+        else:
+            answer.set_exception(error)
+
+    def _count(self, error: BaseException | None, began: float) -> None:
+        outcome = type(error).__name__.lower() if isinstance(error, Overloaded | Late) else "refused"
+        self._answered += error is None
+        self._on_answer("answered" if error is None else outcome, time.monotonic() - began)
+
+    def _message(self, request: Message, answered: "_Answered", seconds: float) -> Message:
+        (vectors, words), held, queued, inferred = answered
+        layout = self._function.layout
+        meta: dict[str, Any] = {
+            "version": held.bundle.version,
+            "hash": held.hash,
+            "active": words,
+            "queue_ms": round(1e3 * queued, 3),
+            "infer_ms": round(1e3 * inferred, 3),
+            "total_ms": round(1e3 * seconds, 3),
+        }
+        if PACKED in request.arrays:
+            return Message({PACKED: vectors}, meta)
+        if request.meta.get("layout"):
+            meta |= {"layout": layout.digest, "states": STATES_LIMIT, **layout.description()}
+        fingers = len(layout.hand.joints)
+        parts = np.split(vectors[0], [fingers + 6, 2 * fingers + 6])
+        return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
+
+    @staticmethod
+    def _deadline(seconds: Any) -> float:
+        if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT:
+            raise CongraspError(
+                f"The query's 'timeout' is {ascii(seconds)[:40]}.", f"It must be seconds, at most {_MAX_TIMEOUT:g}."
+            )
+        return float(seconds)
+
+    def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[_Answered | Exception]:
+        held, began = self._held, time.monotonic()
+        self._on_batch(sum(len(query.vectors) for query in queries))
+        answers = self._function(held.acting, queries)
+        spent = time.monotonic() - began
+        return [
+            answer if isinstance(answer, Exception) else (answer, held, waited, spent)
+            for answer, waited in zip(answers, queued, strict=True)
+        ]
+
+    def _follow(self) -> None:
+        """Swaps in newer policies; one that does not fit is refused and the old one stays."""
+        while not self._closed.wait(_FOLLOW_SECONDS):
+            try:
+                newer = self._source(self._held.bundle.version)
+                if newer is not None:
+                    self._swap(newer)
+            except TransportError:
+                continue  # the learner is away; it may come back
+            except CongraspError as error:
+                if str(error) != self._trouble:
+                    say("warning", str(error))
+                self._trouble = str(error)
+
+    def _swap(self, newer: PolicyBundle) -> None:
+        old = self._held.bundle
+        old.spec.require(newer.spec, "that the server was to change to")
+        if newer.task != old.task:
+            raise CongraspError("The newer policy was trained on another task.", "Start the server anew to serve it.")
+        self._held = _hold(newer)
+        self._trouble = ""
+
+
+def _hold(bundle: PolicyBundle) -> _Held:
+    return _Held(bundle, content_hash(encode(bundle.to_message())), bundle.acting)
+
+
+def follow_file(path: pathlib.Path) -> Source:
+    """A source that reads a policy file again whenever it changes."""
+    seen: list[float] = []
+
+    def read(version: int) -> PolicyBundle | None:
+        try:
+            changed = path.stat().st_mtime
+        except OSError:
+            raise CongraspError(f"The policy {path} cannot be read.", "Name a file made by 'congrasp train'.") from None
+        if version >= 0 and seen and seen[-1] == changed:
+            return None
+        seen[:] = [changed]
+        return bundles.load(path)
+
+    return read
+
+
+def follow_run(transport: Transport, run: str) -> Source:
+    """A source that pulls the newest policy from a learner."""
+
+    def pull(version: int) -> PolicyBundle | None:
+        reply = transport.query(Keys(run).weights, Message({}, {"newer_than": version}), timeout=5.0)
+        return PolicyBundle.from_message(reply, "of the learner") if reply.arrays else None
+
+    return pull

@@ -1,0 +1,325 @@
+"""What `congrasp train` does around training: evaluations, progress, a picture, what to look at next."""
+
+import contextlib
+import dataclasses
+import os
+import pathlib
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, Self
+
+import numpy as np
+from rich.console import Console
+
+from common.config import Board, ObjectsConfig, RunConfig
+from common.errors import CongraspError
+from common.objects.pool import HELD_OUT_SEED, load_pool
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle, policy_spec
+from common.policy.pretrained import shipped
+from common.transport.zenoh_transport import DEFAULT_ENDPOINT
+from learner import update as updates
+from learner.run_directory import LOGS, POLICY_FILE, continue_run, create_run
+from services.evaluate.evaluator import Evaluator
+from services.evaluate.scores import Row
+from services.evaluate.showcase import CONSTRAINTS, showcase
+from services.ops.access import check_training
+from services.ops.shutdown import on_signal
+from services.serve.client import PolicyClient
+from services.serve.load import example_episode, one_answer, serving, wait_until_ready
+from services.train.presets import PRESETS, easier
+from services.train.train import engine_of, leave_gpus_to, train, train_in_process
+from services.viz.render import episode_sheet
+from services.viz.sheets import save_png
+
+EPISODE, SHIPPED = "episode.png", "shipped.png"
+_EVALUATION_OBJECTS = 12
+_SEEDS = 3
+_LINE_SECONDS = 10.0
+_SPACE = 64 << 10  # bytes without which a disk is as good as full
+console = Console(highlight=False)
+
+
+def run_training(
+    config: RunConfig,
+    run_dir: pathlib.Path,
+    *,
+    actors: int | None,
+    resume: bool,
+    evaluation: int,
+    initial: pathlib.Path | None = None,
+    boards: Sequence[Board] = ("tensorboard",),
+    metrics_port: int = 0,
+    listen: str | None = None,
+    certs: pathlib.Path | None = None,
+    insecure: bool = False,
+    ranks: int = 1,
+) -> int:
+    """Trains, evaluates and shows; returns the exit code. With no actor processes everything is in this one.
+
+    With several ranks each of them has so many actors.
+    """
+    if actors is not None and actors < 0:
+        raise CongraspError(f"--actors is {actors}.", "Name a number of actor processes, or 0 for none of their own.")
+    if listen is not None or certs is not None:
+        check_training(listen or DEFAULT_ENDPOINT, certs, insecure=insecure)
+        if actors == 0:
+            raise CongraspError("With --actors 0 nothing listens.", "Leave out --listen and --certs, or --actors.")
+        actors = actors or 2
+    if ranks < 1:
+        raise CongraspError(f"--ranks is {ranks}.", "Name a number of learners from 1 on.")
+    gpus = ranks > 1 and leave_gpus_to(ranks)
+    physics = engine_of(config.physics, gpus)
+    if actors is None:
+        actors = 0 if physics == "warp" else 2
+    if resume:
+        continue_run(run_dir, config)
+        if not (run_dir / "checkpoints" / "latest").exists():
+            raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start it anew in another --run-dir.")
+    else:
+        if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / "config.json").exists():
+            raise CongraspError(f"{run_dir} is not empty and is no run.", "Choose another --run-dir.")
+        _check(config)
+        start = None if initial is None else bundles.load(initial)
+        create_run(run_dir, config, start)
+    console.print(
+        f"[bold]{config.name}[/]: {config.updates} updates of {ranks * _steps_per_update(config)} steps, "
+        f"{ranks * (actors or 1)} actor(s) with {config.environments} hands each on '{physics}' in {run_dir}",
+        soft_wrap=True,
+    )
+    if words := easier(config):
+        preset = f"--preset {config.task.hand if config.task.hand in PRESETS else 'human'}"
+        console.print(
+            f"Easier than the full task: {'; '.join(words)}.\nThe full task is {preset}, for a GPU.",
+            soft_wrap=True,
+        )
+    with on_signal() as stop:
+        before = _evaluate(untrained(config), config, evaluation, "before training") if evaluation else []
+        began = time.monotonic()
+        with _Progress(config, ranks) as progress:
+            if actors == 0 and ranks == 1:
+                train_in_process(
+                    run_dir,
+                    config,
+                    physics=physics,
+                    stop=stop,
+                    resume=resume,
+                    boards=boards,
+                    metrics_port=metrics_port,
+                    on_update=lambda values: progress.show(
+                        {"values": values, "actors": 1, "version": int(values["version"])}
+                    ),
+                )
+            else:
+                with _full_disk_said(run_dir):
+                    train(
+                        run_dir,
+                        config,
+                        actors=actors,
+                        physics=physics,
+                        stop=stop,
+                        ranks=ranks,
+                        gpus=gpus,
+                        boards=boards,
+                        metrics_port=metrics_port,
+                        endpoint=listen,
+                        certs=certs,
+                        insecure=insecure,
+                        report=progress.show,
+                        notify=lambda text: console.print(f"  [yellow]{text}[/]", soft_wrap=True),
+                    )
+        if stop.is_set():
+            console.print(f"Stopped. Go on with: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
+            return stop.exit_code
+        console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
+        policy = bundles.load(run_dir / POLICY_FILE)
+        if evaluation:
+            after = _evaluate(policy, config, evaluation, "after training")
+            _compare(before, after)
+            _live_query(run_dir, config.task.hand)
+            _picture(policy, config, run_dir)
+            if words and (best := shipped(config.task.hand)):
+                _shipped_picture(best, run_dir)
+        _next_steps(run_dir)
+    return 0
+
+
+def _check(config: RunConfig) -> None:
+    """Raises `CongraspError` for what would end the run's processes as soon as they have started."""
+    policy_spec(config.task, config.network)
+    load_pool(dataclasses.replace(config.objects, count=min(1, config.objects.count)))
+    if config.environments < 1 or config.rollout_steps < 1:
+        raise CongraspError(f"A rollout of {config.rollout_steps} steps of {config.environments} hands is empty.")
+
+
+@contextlib.contextmanager
+def _full_disk_said(run_dir: pathlib.Path) -> Iterator[None]:
+    """A process that dies of a full disk cannot write its last words into its log: this says them."""
+    try:
+        yield
+    except CongraspError:
+        if shutil.disk_usage(run_dir).free >= _SPACE:
+            raise
+        raise CongraspError(
+            f"The disk of {run_dir} is full, and the run ended.",
+            f"What was written before is whole: free space and add --resume --run-dir {run_dir}.",
+        ) from None
+
+
+def untrained(config: RunConfig) -> PolicyBundle:
+    """The policy that the run starts from."""
+    spec = policy_spec(config.task, config.network)
+    state = updates.init_state(config.seed, spec.layout, spec.action_size, config.network, config.ppo)
+    return PolicyBundle(spec, config.task, state.params, state.observation, state.value, 0, "untrained", 0)
+
+
+class _Progress:
+    """One line that is rewritten on a terminal; elsewhere a line about every ten seconds."""
+
+    def __init__(self, config: RunConfig, ranks: int = 1):
+        self._config, self._steps = config, ranks * _steps_per_update(config)
+        self._began = time.monotonic()
+        self._last = 0.0
+        self._first: tuple[float, float] | None = None
+        self._line = self._printed = ""
+        self._live = console.status("compiling, and filling the first batch") if console.is_terminal else None
+
+    def __enter__(self) -> Self:
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._live:
+            self._live.stop()
+        self._print()
+
+    def show(self, status: dict[str, Any]) -> None:
+        """Shows the learner's newest metrics, if there are any yet, and the number of actors."""
+        now = time.monotonic()
+        if "transitions" in status.get("values", {}):
+            self._line = self._progress(status, now)
+        elif self._first is None:
+            self._line = (
+                f"compiling, and filling the first batch: {now - self._began:.0f} s, {status['actors']} actor(s)"
+            )
+        if self._live:
+            self._live.update(self._line)
+        elif now - self._last >= _LINE_SECONDS:
+            self._last = now
+            self._print()
+
+    def _print(self) -> None:
+        if self._line != self._printed:
+            console.print(f"  {self._line}", soft_wrap=True)
+            self._printed = self._line
+
+    def _progress(self, status: dict[str, Any], now: float) -> str:
+        """One line of numbers; the time left counts from the first update, so that compiling is not part of it."""
+        values, updates = status["values"], self._config.updates
+        update = values["transitions"] / self._steps
+        self._first = self._first or (now, update)
+        pace = (update - self._first[1]) / max(now - self._first[0], 1e-6)
+        left = (updates - update) / pace if pace > 0 else float("nan")
+        return (
+            f"update {update:4.0f}/{updates}  {values['steps_per_second']:6.0f} steps/s  "
+            f"version {status['version']}  lag {values.get('staleness_mean', 0.0):.1f}  "
+            f"success {100 * values.get('episode/success', float('nan')):5.1f} %  "
+            f"links {values.get('episode/links_at_removal', float('nan')):4.1f}  "
+            f"return {values.get('episode/return', float('nan')):6.1f}  actors {status['actors']}  "
+            f"left {_minutes(left)}"
+        )
+
+
+def _steps_per_update(config: RunConfig) -> int:
+    return config.rollout_steps * config.environments * config.ppo.rollouts_per_update
+
+
+def _minutes(seconds: float) -> str:
+    return "?" if not np.isfinite(seconds) else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
+def _evaluator(policy: PolicyBundle, config: RunConfig, seed: int, batch: int) -> Evaluator:
+    objects = load_pool(
+        ObjectsConfig(families=config.objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
+        if not config.objects.folder
+        else config.objects
+    )
+    return Evaluator(
+        policy, objects, physics="native", batch=batch, threads=os.cpu_count() or 1, seed=seed, task=config.task
+    )
+
+
+def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, when: str) -> list[Row]:
+    """Rows of the heading constraint for three draws of episodes, on objects that training never sees."""
+    console.print(f"Evaluating {when}: {_SEEDS} x {episodes} episodes on {_EVALUATION_OBJECTS} held-out objects …")
+    return _evaluator(policy, config, 0, episodes).draws("heading", episodes, _SEEDS)
+
+
+def _compare(before: list[Row], after: list[Row]) -> None:
+    console.print(f"Before and after, mean ± standard deviation over {_SEEDS} draws of episodes:")
+    for name, label, factor in (
+        ("episode_return", "return", 1.0),
+        ("links_at_removal", "links in contact at step 50", 1.0),
+        ("success", "success, %", 100.0),
+    ):
+        old, new = (factor * np.array([getattr(row, name) for row in rows]) for rows in (before, after))
+        clear = abs(new.mean() - old.mean()) > old.std(ddof=1) + new.std(ddof=1)
+        console.print(
+            f"  {label:28s} {old.mean():7.2f} ± {old.std(ddof=1):5.2f}  ->  {new.mean():7.2f} ± {new.std(ddof=1):5.2f}"
+            f"   {'better than the noise' if clear and new.mean() > old.mean() else 'within the noise, or worse'}",
+            soft_wrap=True,
+        )
+
+
+def _live_query(run_dir: pathlib.Path, hand: str) -> None:
+    """Serves the policy from a process of its own, and asks it for one action."""
+    console.print("\n[bold]One live query[/] of a policy server in a process of its own:")
+    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
+        episode = example_episode(HELD_OUT_SEED, hand)
+        with PolicyClient(endpoint, hand=episode["hand"], wait=60.0, timeout=5.0) as client:
+            wait_until_ready(client)
+            console.print(one_answer(client, episode), markup=False, soft_wrap=True)
+
+
+def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> None:
+    """A successful episode if a few tries find one."""
+    evaluator = _evaluator(policy, config, 0, 1)
+    save_png(run_dir / EPISODE, episode_sheet(evaluator.episode("heading", tries=12)))
+
+
+def _shipped_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
+    """What the same kind of policy does after training on the full task."""
+    with console.status("The policy that comes with congrasp …") as status:
+        grasps = showcase(bundles.load(policy), run_dir / SHIPPED, lambda text: status.update(f"{text} …"))
+    console.print(
+        f"The policy that comes with congrasp, trained on the full task: {grasps} of {len(CONSTRAINTS)} grasps, "
+        f"one under each constraint ({', '.join(CONSTRAINTS)}).",
+        soft_wrap=True,
+    )
+
+
+def _next_steps(run_dir: pathlib.Path) -> None:
+    congrasp = _command()
+    pictures = (
+        (EPISODE, "an episode of the trained policy"),
+        (SHIPPED, "a grasp under each of the four constraints, by the policy that comes with congrasp"),
+    )
+    rows = [(str(run_dir / name), why) for name, why in pictures if (run_dir / name).exists()]
+    rows += [
+        (f"{congrasp} plot {run_dir}", "learning curves and reward terms"),
+        (f"{run_dir / LOGS}/*.mcap", "open in Foxglove or Rerun: plots, hand and object in 3-D"),
+        (f"{congrasp} evaluate --policy {run_dir / POLICY_FILE}", "the paper's protocol"),
+        (f"{congrasp} train --resume --run-dir {run_dir}", "go on training"),
+    ]
+    console.print("\n[bold]What to look at next[/]")
+    for what, why in rows:
+        console.print(f"  {what}\n      {why}", soft_wrap=True)
+
+
+def _command() -> str:
+    """How to call the command line from here."""
+    script = pathlib.Path(sys.executable).with_name("congrasp")
+    return "congrasp" if shutil.which("congrasp") or not script.exists() else os.path.relpath(script)

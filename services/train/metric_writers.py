@@ -1,0 +1,151 @@
+"""A learner's figures on TensorBoard and Weights & Biases: sinks beside the recording, which never hold it up."""
+
+import contextlib
+import dataclasses
+import json
+import pathlib
+import secrets
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
+
+from common.config import Board, RunConfig
+from common.transport.base import Transport
+from learner.run_directory import LOGS
+from services.record.channels import Entry, flatten
+from services.record.recorder import Recorder
+
+_TOPIC = "/metrics/learner/"
+
+
+class _Sheet(Protocol):
+    """Where figures are written."""
+
+    def figures(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
+        """Takes the figures of an update."""
+
+    def close(self) -> None:
+        """Finishes."""
+
+
+class Boards:
+    """A sink of `services.record.recorder.Recorder` for the figures of learners; a board that fails is left alone."""
+
+    def __init__(self, sheets: Mapping[str, _Sheet]):
+        """Boards by name."""
+        self._sheets = dict(sheets)
+
+    def write(self, entry: Entry) -> None:
+        """Takes an entry; those that are no figures of a learner are passed over."""
+        if not entry.channel.topic.startswith(_TOPIC):
+            return
+        message = json.loads(entry.data)
+        values = {name: float(value) for name, value in flatten(message["values"]).items()}
+        step = int(message.get("update", message.get("version", 0)))
+        learner = entry.channel.topic.removeprefix(_TOPIC)
+        self._each(lambda sheet: sheet.figures(learner, 1e-9 * entry.time, step, values))
+
+    def close(self) -> None:
+        """Finishes every board."""
+        self._each(lambda sheet: sheet.close())
+
+    def _each(self, action: Callable[[_Sheet], None]) -> None:
+        for name, sheet in list(self._sheets.items()):
+            try:
+                action(sheet)
+            except Exception as error:  # training does not end because a picture of it cannot be drawn
+                del self._sheets[name]
+                text = f"congrasp: {name} gets no more figures ({type(error).__name__}: {error}); the run goes on."
+                print(text, file=sys.stderr, flush=True)
+
+
+class _TensorBoard:
+    """Event files, one folder a learner; written at once, so that there is no thread to wait for."""
+
+    def __init__(self, folder: pathlib.Path):
+        self._folder = folder
+        self._files: dict[str, Any] = {}
+
+    def figures(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
+        """See `_Sheet`."""
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+        from tensorboardX.proto.summary_pb2 import Summary
+
+        file = self._files.get(learner)
+        if file is None:
+            file = self._files[learner] = self._begin(learner)
+            # A resumed run repeats steps: TensorBoard forgets what an earlier file has from here on.
+            file.write_event(Event(wall_time=seconds, step=step, session_log=SessionLog(status=SessionLog.START)))
+        summary = Summary(value=[Summary.Value(tag=name, simple_value=value) for name, value in values.items()])
+        file.write_event(Event(wall_time=seconds, step=step, summary=summary))
+        file.flush()
+
+    def _begin(self, learner: str) -> Any:
+        from tensorboardX.event_file_writer import EventsWriter
+
+        folder = self._folder / f"learner-{learner}"
+        folder.mkdir(parents=True, exist_ok=True)
+        return EventsWriter(str(folder / "events"), f".{secrets.token_hex(4)}")
+
+    def close(self) -> None:
+        """See `_Sheet`."""
+        for file in self._files.values():
+            file.close()
+
+
+class _WeightsAndBiases:
+    """A run of Weights & Biases; offline it lies in the run's folder and goes up with `wandb sync`."""
+
+    def __init__(self, folder: pathlib.Path, run: str, config: Mapping[str, Any], *, offline: bool):
+        import wandb
+
+        settings = wandb.Settings(console="off", silent=True, x_disable_stats=True, init_timeout=20)
+        self._run = wandb.init(
+            project="congrasp",
+            name=run,
+            group=run,
+            dir=str(folder),
+            config=dict(config),
+            mode="offline" if offline else "online",
+            settings=settings,
+        )
+        self._run.define_metric("*", step_metric="update")
+
+    def figures(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
+        """See `_Sheet`."""
+        prefix = "" if learner == "0" else f"learner-{learner}/"
+        self._run.log({**{f"{prefix}{name}": value for name, value in values.items()}, "update": step})
+
+    def close(self) -> None:
+        """See `_Sheet`."""
+        import wandb
+
+        self._run.finish()
+        wandb.teardown()  # waits for the process that writes the file
+
+
+@contextlib.contextmanager
+def recorded(
+    transport: Transport, config: RunConfig, run_dir: pathlib.Path, names: Sequence[Board]
+) -> Iterator[Recorder]:
+    """Records a run in its folder, and shows it on boards, while the block lasts.
+
+    Args:
+      transport: an endpoint of the run.
+      config: the run's configuration.
+      run_dir: the run's folder; TensorBoard's files go to `tensorboard` in it, those of Weights & Biases to `wandb`.
+      names: which boards.
+
+    Raises:
+      ModuleNotFoundError: a board's package is not installed.
+    """
+    sheets: dict[str, _Sheet] = {}
+    for name in dict.fromkeys(names):
+        if name == "tensorboard":
+            sheets[name] = _TensorBoard(run_dir / name)
+        else:
+            offline = name == "wandb-offline"
+            sheets[name] = _WeightsAndBiases(run_dir, config.name, dataclasses.asdict(config), offline=offline)
+    boards = Boards(sheets)
+    with contextlib.closing(boards), Recorder(transport, config.name, run_dir / LOGS, sinks=[boards]) as recorder:
+        yield recorder

@@ -1,0 +1,89 @@
+"""What an import made of a mesh, as a picture: before and after, beside a hand at true scale."""
+
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from common.hands.spec import Hand
+from common.objects.shapes import tessellate
+from common.objects.spec import GraspObject
+from services.assets.objects.repair import MAX_FACES
+from services.assets.objects.sizes import length, size_in_words
+from services.assets.objects.sources import Source, read_mesh
+from services.viz.raster import Raster
+from services.viz.raycast import Shape
+from services.viz.render import OBJECT, SKIN, fit, posed_hand, shape_points, upright
+from services.viz.sheets import contact_sheet
+
+Body = tuple[np.ndarray, np.ndarray, tuple[float, float, float]]
+"""Vertices (V, 3), faces (F, 3) and colour."""
+_SIZE = (460, 360)
+_VIEW = (0.9, -0.6, 0.45)
+_GAP = 0.03  # m between the hand and the object
+_LARGEST, _SMALLEST = 1.5, 0.01  # m; a mesh beyond is drawn at another scale before its import
+_LARGE_FILE = 30 << 20  # bytes
+_COLOURS = ((0.90, 0.45, 0.36), (0.35, 0.63, 0.78), (0.95, 0.72, 0.30), (0.45, 0.70, 0.48), (0.66, 0.52, 0.78))
+
+
+def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -> np.ndarray:
+    """Pictures, each beside the open hand: the file, the object on the table, and its convex pieces.
+
+    Args:
+      hand: the hand.
+      obj: what the import made.
+      before: the mesh of the file, in the file's unit, if it is to be drawn.
+
+    Returns:
+      (H, W, 3) uint8.
+    """
+    rest = Rotation.from_quat(obj.rest_poses[0][3:], scalar_first=True)
+    sides = tuple(np.ptp(obj.visual_vertices, axis=0).tolist())
+    parts: dict[str, list[Body]] = {}
+    if before is not None:
+        size = float(before.extents.max())
+        drawn = size if _SMALLEST <= size <= _LARGEST else max(sides)
+        scaled = "" if drawn == size else " (not drawn to scale)"
+        label = f"the file: {len(before.faces):,} triangles, {length(size)} long in metres{scaled}"
+        parts[label] = [(rest.apply(np.asarray(before.vertices) * drawn / size), np.asarray(before.faces), OBJECT)]
+    parts[f"the object: {size_in_words(sides)}, {1000 * obj.mass:.0f} g"] = [
+        (rest.apply(obj.visual_vertices), obj.visual_faces, OBJECT)
+    ]
+    pieces = enumerate(map(tessellate, obj.pieces))
+    count = len(obj.pieces)
+    parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [
+        (rest.apply(vertices), faces, _COLOURS[i % len(_COLOURS)]) for i, (vertices, faces) in pieces
+    ]
+    raster = Raster()
+    images = []
+    for shapes in (_beside(hand, bodies) for bodies in parts.values()):
+        points = np.concatenate([shape_points(shape) for shape in shapes])
+        images.append(raster.draw(shapes, fit(points, np.array(_VIEW), _SIZE[0] / _SIZE[1]), _SIZE))
+    title = f"{obj.name} beside the {hand.name} hand at true scale"
+    return contact_sheet(images, list(parts), columns=len(parts), title="  |  ".join([title, *obj.notes]))
+
+
+def mesh_of_file(source: Source) -> trimesh.Trimesh | None:
+    """The surface of an object's files as they are, in their own unit; None where reading it twice takes too long."""
+    files = [file.path for file in source.visuals or source.pieces]
+    if sum(path.stat().st_size for path in files) > _LARGE_FILE:
+        return None
+    whole: Any = trimesh.util.concatenate([read_mesh(path) for path in files])
+    return whole if len(whole.faces) <= MAX_FACES else whole.simplify_quadric_decimation(face_count=MAX_FACES)
+
+
+def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
+    """Meshes that stand at height zero, and the open hand, upright, beside them."""
+    points = np.concatenate([vertices for vertices, _, _ in bodies])
+    low, high = points.min(0), points.max(0)
+    middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
+    shapes = [
+        Shape("mesh", (0, 0, 0), colour, vertices=vertices - middle, faces=faces) for vertices, faces, colour in bodies
+    ]
+    turn = upright(hand)
+    standing = posed_hand(hand, hand.q_open, np.zeros(3), turn, SKIN)
+    own = np.concatenate([shape_points(shape) for shape in standing])
+    side = (high[1] - low[1]) / 2 + _GAP - own[:, 1].min()
+    place = np.array([-own[:, 0].mean(), side, -own[:, 2].min()])
+    return shapes + posed_hand(hand, hand.q_open, place, turn, SKIN)

@@ -1,0 +1,130 @@
+"""Puts a studio together from what the command was given, and takes it apart again."""
+
+import contextlib
+import functools
+import pathlib
+import threading
+from collections.abc import Callable, Iterator
+
+from common.errors import CongraspError
+from common.objects import procedural, store
+from common.objects.pool import HELD_OUT_SEED
+from common.objects.spec import GraspObject
+from common.policy.pretrained import policy_file, shipped_hands
+from common.transport.security import check_exposure
+from common.transport.zenoh_transport import ZenohTransport
+from services.assets.objects.meshes import ImportOptions, import_source
+from services.assets.objects.sources import find_sources
+from services.ops.access import credentials
+from services.ops.logs import say
+from services.serve.server import follow_file, follow_run
+from services.viz.studio.grasping import PolicyGrasping
+from services.viz.studio.recordings import Recordings
+from services.viz.studio.server import PageServer
+from services.viz.studio.session import Catalogue, Session
+from services.viz.studio.training import Follower, TrainingWindow
+
+_GUESS = ImportOptions(unit="guess")
+_FIRST = "mug"
+"""Family of the object that a studio without objects begins with."""
+
+
+@contextlib.contextmanager
+def open_view(
+    *,
+    objects: pathlib.Path | None,
+    policy: pathlib.Path | None,
+    connect: str,
+    run: str,
+    recordings: pathlib.Path | None,
+    host: str,
+    port: int,
+    insecure: bool,
+    certs: pathlib.Path | None,
+) -> Iterator[str]:
+    """Offers the page while the block runs; yields its address. For the arguments see `services.cli.view`.
+
+    Raises:
+      CongraspError: something that was named is not there, or the port is busy.
+    """
+    if policy is not None and connect:
+        raise CongraspError(
+            f"The studio can take either {policy} or the weights of {connect}.", "Give one of --policy and --connect."
+        )
+    check_exposure(f"tcp/{f'[{host}]' if ':' in host else host}:{port}", None, insecure=insecure)
+    with contextlib.ExitStack() as stack:
+        window = TrainingWindow(run) if connect or recordings else None
+        if recordings is not None and window is not None:
+            _read(window, recordings)
+        if connect and window is not None:
+            watching = stack.enter_context(
+                ZenohTransport(connect=[connect], credentials=credentials(certs, "observer"))
+            )
+            stack.callback(Follower(watching, window).close)
+            hands = _of_run(connect, run, certs, watching, stack)
+        elif policy is not None:
+            hands = {"of the policy": functools.partial(PolicyGrasping, follow_file(policy), policy.name)}
+        else:
+            hands = _shipped()
+        session = Session(hands, catalogue(objects), take_mesh, window, Recordings(recordings) if recordings else None)
+        stack.callback(session.close)
+        server = PageServer(session.gets, session.posts, host, port)
+        stack.callback(server.close)
+        yield server.url
+
+
+def _of_run(
+    connect: str, run: str, certs: pathlib.Path | None, watching: ZenohTransport, stack: contextlib.ExitStack
+) -> dict[str, Callable[[], PolicyGrasping]]:
+    """The policy of a run; who may only watch it gets those that come with the package."""
+    pulling = watching
+    if certs is not None:
+        try:
+            mine = credentials(certs, "server")
+        except CongraspError as error:
+            say("warning", f"{error} Until then the studio grasps with the policies that come with congrasp.")
+            return _shipped()
+        pulling = stack.enter_context(ZenohTransport(connect=[connect], credentials=mine))
+    return {"of the run": functools.partial(PolicyGrasping, follow_run(pulling, run), f"the run '{run}'")}
+
+
+def _shipped() -> dict[str, Callable[[], PolicyGrasping]]:
+    return {
+        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "shipped policy")
+        for name in shipped_hands()
+    }
+
+
+def catalogue(objects: pathlib.Path | None) -> Catalogue:
+    """The user's objects, then one of each procedural family; none is made or imported yet.
+
+    Raises:
+      CongraspError: there is nothing at the path.
+    """
+    makers: dict[str, Callable[[], GraspObject]] = {}
+    if objects is not None:
+        files = [objects] if objects.suffix == store.SUFFIX else sorted(objects.glob(f"*{store.SUFFIX}"))
+        makers |= {file.name.removesuffix(store.SUFFIX): functools.partial(store.load, file) for file in files}
+        for source in [] if files else find_sources(objects):
+            makers[source.name] = functools.partial(lambda source: import_source(source, _GUESS)[0], source)
+    families = sorted(procedural.FAMILIES, key=lambda family: family != _FIRST)
+    makers |= {family: functools.partial(procedural.generate, HELD_OUT_SEED, family) for family in families}
+    return Catalogue(makers)
+
+
+def take_mesh(path: pathlib.Path) -> tuple[GraspObject, list[str]]:
+    """Imports one mesh; what the user should know about it comes with it."""
+    return import_source(find_sources(path)[0], _GUESS)
+
+
+def _read(window: TrainingWindow, recordings: pathlib.Path) -> None:
+    """Reads curves in the background: a long run's recordings take a while."""
+    Recordings(recordings).check()
+
+    def work() -> None:
+        try:
+            window.load(recordings)
+        except CongraspError as error:
+            say("warning", str(error))
+
+    threading.Thread(target=work, daemon=True, name="curves").start()

@@ -1,0 +1,145 @@
+"""Grasps of a policy as the studio asks for them: exactly as drawn, and a little beside it where that fails."""
+
+import dataclasses
+import os
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from actors.episode import episode_message
+from actors.rollout import Trace, goal_of_world
+from actors.trials import Beginnings, Outcome, Trials
+from common.constraints.priority import Request
+from common.errors import CongraspError, TransportError
+from common.hands import get_hand
+from common.task.types import Goal, Surface
+from common.wire.codec import Message
+from services.grasp.grasper import costs
+from services.serve.server import Source
+from services.viz.studio.jobs import Progress
+from services.viz.studio.state import OPTIONAL, Asked
+
+TRIES = 8
+"""Grasps side by side: the one that was drawn, and others near it."""
+HOLD_SECONDS = 2.0
+_ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
+"""How far the others are from what was drawn: m, rad, rad (one standard deviation)."""
+_OTHER = 2.0
+"""What it costs not to be the one that was drawn, beside the costs of `services.grasp.grasper`."""
+
+
+class PolicyGrasping:
+    """A policy of a file or of a run that is being trained; every grasp is one of its newest weights."""
+
+    def __init__(self, source: Source, name: str, *, threads: int = 0):
+        """Loads the policy; compiles nothing yet.
+
+        Args:
+          source: where its weights come from.
+          name: how the page calls it.
+          threads: of the physics; 0 takes one a core.
+
+        Raises:
+          CongraspError: there is none.
+        """
+        first = source(-1)
+        if first is None:
+            raise CongraspError(
+                f"There is no policy of {name} yet.", "Start the studio when the run has published one."
+            )
+        self._source, self._name, self._policy = source, name, first
+        self._trouble = ""
+        self.hand = get_hand(first.spec.hand)
+        self.task = dataclasses.replace(first.task, end_when_fallen=False)
+        hold = max(self.task.hold_steps, round(HOLD_SECONDS / self.task.control_dt))
+        self._trials = Trials(self.hand, self.task, first, hold=hold, threads=threads or os.cpu_count() or 1)
+        self._compiled = False
+
+    def newest(self) -> dict[str, Any]:
+        """Source and version; `trouble` says why newer weights were not taken."""
+        return {"source": self._name, "version": self._policy.version, "trouble": self._trouble}
+
+    def refresh(self) -> None:
+        """Takes newer weights, if there are any that fit."""
+        try:
+            newer = self._source(self._policy.version)
+            if newer is not None:
+                self._trials.renew(newer)
+                self._policy = newer
+            self._trouble = ""
+        except TransportError:
+            self._trouble = "The learner is away; these are its last weights."
+        except CongraspError as error:
+            self._trouble = str(error)
+
+    def grasp(self, asked: Asked, progress: Progress) -> Message:
+        """The episode of the grasp that was drawn if it holds, else of the best of those near it.
+
+        Its meta `note` says which it is.
+        """
+        first_time = not self._compiled
+        progress("compiling: the first grasp takes some seconds more" if first_time else "newest weights", 0.02)
+        self.refresh()
+        beginnings, aside = _beginnings(asked, self.task.surface_points)
+        steps = self._trials.steps
+        outcome = self._trials.run(asked.obj, beginnings, lambda step: progress("grasping", step / steps))
+        self._compiled = True
+        index = _best(outcome, asked.constraints)
+        metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
+        points = self.task.surface_points
+        return episode_message(
+            self.hand,
+            self.task,
+            Trace(*(field[:, index] for field in outcome.trace)),
+            goal_of_world(outcome.goal, index),
+            Surface(asked.obj.points[:points], asked.obj.non_graspable_points[:points]),
+            asked.obj,
+            {
+                "version": self._policy.version,
+                "actor": "studio",
+                "success": metrics["success"] > 0,
+                "metrics": metrics,
+                "note": _note(outcome, index, aside),
+            },
+        )
+
+
+def _beginnings(asked: Asked, points: int) -> tuple[Beginnings, np.ndarray]:
+    """`TRIES` episodes, the first as drawn; and (B,) metres by which each comes beside that."""
+    rng = np.random.default_rng(0)
+    goal = Goal(*(np.repeat(np.asarray(value, np.float32)[None], TRIES, 0) for value in asked.goal))
+    shift = rng.normal(0.0, _ASIDE, (TRIES, 3)) * (np.arange(TRIES) > 0)[:, None]
+    tilt, roll = (rng.normal(0.0, sigma, TRIES) * (np.arange(TRIES) > 0) for sigma in (_TILT, _ROLL))
+    direction, cross = goal.heading_direction, goal.heading_cross
+    third = np.cross(direction, cross)
+    way = rng.uniform(0.0, 2 * np.pi, TRIES)
+    axis = np.cos(way)[:, None] * cross + np.sin(way)[:, None] * third
+    turn = Rotation.from_rotvec(tilt[:, None] * axis + roll[:, None] * direction)
+    goal = goal._replace(
+        heading_position=goal.heading_position + shift.astype(np.float32),
+        heading_direction=turn.apply(direction).astype(np.float32),
+        heading_cross=turn.apply(cross).astype(np.float32),
+        pose_position=goal.pose_position + shift.astype(np.float32),
+        trajectory_position=goal.trajectory_position + shift[:, None].astype(np.float32),
+    )
+    flags = (np.full(TRIES, name in asked.constraints) for name in OPTIONAL)
+    surface = (asked.obj.points[:points], asked.obj.non_graspable_points[:points])
+    rest = np.repeat(asked.obj.rest_poses[asked.rest][None].astype(np.float32), TRIES, 0)
+    same = Surface(*(np.repeat(np.asarray(field)[None], TRIES, 0) for field in surface))
+    return Beginnings(Request(goal, *flags), same, rest), np.linalg.norm(shift, axis=-1)
+
+
+def _best(outcome: Outcome, constraints: tuple[str, ...]) -> int:
+    """The one that was drawn, unless another is clearly better: it holds, or keeps to the constraints."""
+    return int(np.argmin(costs(outcome, ("heading", *constraints)) + _OTHER * (np.arange(TRIES) > 0)))
+
+
+def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
+    held = outcome.metrics["held"] > 0
+    if not held.any():
+        return f"Neither what was drawn nor {TRIES - 1} others near it held. Try another arrow."
+    if index:
+        why = "did better" if held[0] else "held, which what was drawn did not"
+        return f"Of {TRIES - 1} others near what was drawn, this one {why}: {1000 * aside[index]:.0f} mm beside it."
+    return ""

@@ -1,0 +1,66 @@
+"""Work that takes longer than a click: one at a time, with words about how far it is."""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from common.errors import CongraspError
+from services.ops.logs import say
+
+Progress = Callable[[str, float], None]
+"""(what is being done, how much of it is done from 0 to 1)."""
+
+
+class Jobs:
+    """Runs one job at a time in a thread of its own."""
+
+    def __init__(self) -> None:
+        """Nothing runs."""
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="studio")
+        self._lock = threading.Lock()
+        self._number = 0
+        self._state: dict[str, Any] = _state(0, running=False)
+
+    def start(self, text: str, work: Callable[[Progress], str | None]) -> dict[str, Any]:
+        """Begins a job, which may return the name of what it made; returns its state.
+
+        Raises:
+          CongraspError: another one is still running.
+        """
+        with self._lock:
+            if self._state["running"]:
+                raise CongraspError(f"Please wait: {self._state['text']}.")
+            self._number += 1
+            self._state = _state(self._number, text=text)
+            self._pool.submit(self._run, work)
+            return dict(self._state)
+
+    def state(self) -> dict[str, Any]:
+        """The present job, or the last one: number, running, text, share, error, and what it made."""
+        with self._lock:
+            return dict(self._state)
+
+    def close(self) -> None:
+        """Takes no more jobs, and waits for none."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _run(self, work: Callable[[Progress], str | None]) -> None:
+        error, made = "", None
+        try:
+            made = work(self._progress)
+        except CongraspError as found:
+            error = str(found)
+        except Exception as found:  # whatever goes wrong in a job, the page is told and the studio goes on
+            error = f"This went wrong and is a fault of congrasp: {type(found).__name__}: {found}."
+            say("error", error)
+        with self._lock:
+            self._state |= {"running": False, "share": 1.0, "error": error, "made": made}
+
+    def _progress(self, text: str, share: float) -> None:
+        with self._lock:
+            self._state |= {"text": text, "share": min(1.0, max(0.0, share))}
+
+
+def _state(number: int, *, running: bool = True, text: str = "") -> dict[str, Any]:
+    return {"number": number, "running": running, "text": text, "share": 0.0, "error": "", "made": None}

@@ -1,0 +1,114 @@
+"""Episodes of a moment, from a run's MCAP files."""
+
+import pathlib
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+from mcap.reader import make_reader
+
+from common.errors import CongraspError
+from common.wire.codec import Message, decode
+from services.record.reader import is_complete, log_files, read_records
+from services.record.scene import EPISODE_SCHEMA
+
+MOST = 60
+"""Episodes that one search finds at most; the nearest to the moment."""
+FARTHER = (1.0, 5.0, 25.0)
+"""Factors by which it is looked farther where there is no episode."""
+
+
+class Recordings:
+    """The episodes in a folder of recordings, found by their time.
+
+    What the last search found stays in memory, to be played.
+    """
+
+    def __init__(self, path: pathlib.Path):
+        """Nothing is read before somebody searches: files may come and grow."""
+        self.path = path
+        self._lock = threading.Lock()
+        self._found: dict[str, Message] = {}
+
+    def check(self) -> None:
+        """Raises a CongraspError if there is no folder or file of this name."""
+        if not self.path.exists():
+            raise CongraspError(f"There is no file or folder {self.path}.", "Name a run's folder, or its recordings.")
+
+    def around(self, time: float, seconds: float) -> tuple[float, list[dict[str, Any]]]:
+        """Episodes that were recorded around a time, in the order of their times.
+
+        Args:
+          time: seconds since 1970.
+          seconds: how far from it they may be; where there are none, it is looked farther away.
+
+        Returns:
+          How far it was looked, and for each episode what a list shows of it; its `id` is for `episode`.
+
+        Raises:
+          CongraspError: there are no recordings.
+        """
+        files = log_files(self.path)
+        for farther in FARTHER:
+            begin, end = (int(1e9 * (time + sign * farther * seconds)) for sign in (-1, 1))
+            found = [item for file in files for item in _within(file, begin, end)]
+            if found:
+                break
+        found = sorted(found, key=lambda item: abs(item[0] - 1e9 * time))[:MOST]
+        kept = {f"{when}{topic}": decode(data) for when, topic, data in sorted(found, key=lambda item: item[0])}
+        with self._lock:
+            self._found = kept
+        return farther * seconds, [_row(key, message) for key, message in kept.items()]
+
+    def episode(self, key: str) -> Message:
+        """An episode of the last search.
+
+        Raises:
+          CongraspError: it did not find this one.
+        """
+        with self._lock:
+            if key not in self._found:
+                raise CongraspError("This episode is not among those found last.", "Click the curve again.")
+            return self._found[key]
+
+
+def is_episode(topic: str) -> bool:
+    """Whether a topic is that of an actor's whole episodes."""
+    return topic.startswith("/episode/") and topic.endswith("/raw")
+
+
+def _row(key: str, message: Message) -> dict[str, Any]:
+    time, _, topic = key.partition("/")
+    return {
+        "id": key,
+        "time": int(time) / 1e9,
+        "actor": topic.split("/")[1],
+        "object": message.meta.get("object"),
+        "version": message.meta.get("version"),
+        "success": bool(message.meta.get("success")),
+    }
+
+
+def _within(file: pathlib.Path, begin: int, end: int) -> Iterator[tuple[int, str, bytes]]:
+    """Time (ns), topic and bytes of a file's raw episodes between two times."""
+    if not is_complete(file):  # being written, or cut off: no index, so all of it is read
+        for record in read_records(file, is_episode):
+            if record.schema == EPISODE_SCHEMA and begin <= record.time <= end:
+                yield record.time, record.topic, record.data
+        return
+    try:
+        with file.open("rb") as stream:
+            reader = make_reader(stream)
+            summary = reader.get_summary()
+            if summary is None or summary.statistics is None:
+                return
+            if summary.statistics.message_start_time > end or summary.statistics.message_end_time < begin:
+                return
+            topics = [channel.topic for channel in summary.channels.values() if is_episode(channel.topic)]
+            if not topics:
+                return
+            for schema, channel, message in reader.iter_messages(topics, starting_at=begin, ending_at=end):
+                if schema is not None and schema.name == EPISODE_SCHEMA:
+                    yield message.log_time, channel.topic, message.data
+    except OSError as error:
+        raise CongraspError(f"{file} cannot be read: {error.strerror}.") from None

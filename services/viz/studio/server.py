@@ -1,0 +1,203 @@
+"""Offers a studio over HTTP to browsers on this machine: files, JSON, and messages of arrays."""
+
+import http.server
+import json
+import pathlib
+import socket
+import threading
+import urllib.parse
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from common.errors import CongraspError, TransportError
+from common.wire.codec import Message, encode
+from services.ops.logs import say
+
+STATIC = pathlib.Path(__file__).with_name("static")
+MOST_BYTES = 128 << 20
+"""Of one request's body: an uploaded mesh."""
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+_POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
+_TIMEOUT = 30.0  # seconds that a request may take to arrive
+
+
+class Download:
+    """Bytes that a browser saves under a name."""
+
+    def __init__(self, name: str, data: bytes):
+        self.name, self.data = name, data
+
+
+Answer = dict[str, Any] | list[Any] | Message | Download
+Get = Callable[[Mapping[str, str]], Answer]
+"""Query parameters to answer."""
+Post = Callable[[Mapping[str, str], bytes], Answer]
+"""Query parameters and body to answer."""
+
+
+class PageServer:
+    """Serves the page and the routes of a studio until it is closed."""
+
+    def __init__(self, gets: Mapping[str, Get], posts: Mapping[str, Post], host: str, port: int):
+        """Listens.
+
+        Args:
+          gets: what answers GET requests, by path.
+          posts: the same for POST.
+          host: interface; requests by another name than that of loopback are only answered on others.
+          port: TCP port; 0 takes a free one (see `port`).
+
+        Raises:
+          CongraspError: the port is busy, or there is no such interface.
+        """
+        server = self
+
+        class Handler(_Handler):
+            routes = (gets, posts)
+
+            def allowed(self) -> bool:
+                return server._allowed(self)
+
+        try:
+            self._server = _Server((host, port), Handler)
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise CongraspError(
+                f"The page cannot be offered at {host}:{port} ({reason}).",
+                "Choose another --port, or end what uses it.",
+            ) from None
+        self.host, self.port = host, int(self._server.server_address[1])
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True, name="page")
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """Where a browser on this machine finds the page."""
+        host = "127.0.0.1" if self.host in ("0.0.0.0", "::", "") else self.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
+
+    def close(self) -> None:
+        """Stops to listen."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(2.0)
+
+    def _allowed(self, request: http.server.BaseHTTPRequestHandler) -> bool:
+        """Whether a request comes from the page itself: other sites that the browser shows must not reach it.
+
+        A site can have its name point to this machine, so the name that was asked for must be this machine's own.
+        """
+        host = request.headers.get("Host", "")
+        origin = request.headers.get("Origin")
+        names = {f"{name}:{self.port}" for name in ("127.0.0.1", "localhost", "[::1]")}
+        own = self.host not in ("127.0.0.1", "localhost", "::1") or host in names
+        return own and origin in (None, f"http://{host}")
+
+
+class _Server(http.server.ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int], handler: Any):
+        if ":" in address[0]:
+            self.address_family = socket.AF_INET6
+        super().__init__(address, handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that goes away in the middle of an answer is no error."""
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    timeout = _TIMEOUT
+    routes: tuple[Mapping[str, Get], Mapping[str, Post]]
+
+    def allowed(self) -> bool:
+        """Whether the request may be answered."""
+        raise NotImplementedError
+
+    def do_GET(self) -> None:
+        path, query = self._asked()
+        if self._refused():
+            return
+        if path in self.routes[0]:
+            self._answer(lambda: self.routes[0][path](query))
+        else:
+            self._file("index.html" if path == "/" else path.removeprefix("/static/"))
+
+    def do_POST(self) -> None:
+        path, query = self._asked()
+        length = int(self.headers.get("Content-Length") or -1)
+        if not 0 <= length <= MOST_BYTES:
+            self.close_connection = True
+            words = "The request says no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
+            self._send(413, "application/json", json.dumps({"error": words}).encode())
+            return
+        body = self.rfile.read(length)
+        # What a form of another site can send has none of these types.
+        kind = (self.headers.get("Content-Type") or "").partition(";")[0]
+        if self._refused(kind not in ("application/json", "application/octet-stream")):
+            return
+        if path in self.routes[1]:
+            self._answer(lambda: self.routes[1][path](query, body))
+        else:
+            self._send(404, "application/json", b'{"error": "There is nothing of this name."}')
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Requests are not logged."""
+
+    def _asked(self) -> tuple[str, dict[str, str]]:
+        parts = urllib.parse.urlsplit(self.path)
+        return parts.path, dict(urllib.parse.parse_qsl(parts.query))
+
+    def _refused(self, more: bool = False) -> bool:
+        if not more and self.allowed():
+            return False
+        self._send(403, "application/json", b'{"error": "This page answers only to itself."}')
+        return True
+
+    def _file(self, name: str) -> None:
+        file = STATIC / name
+        if "/" in name or file.suffix not in _TYPES or not file.is_file():
+            self._send(404, "text/plain", b"There is nothing of this name.")
+            return
+        self._send(200, _TYPES[file.suffix], file.read_bytes())
+
+    def _answer(self, work: Callable[[], Answer]) -> None:
+        try:
+            found = work()
+        except (CongraspError, TransportError) as error:
+            self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
+            return
+        except Exception as error:  # whatever a page asks for, the server goes on
+            say("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
+            words = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
+            self._send(500, "application/json", json.dumps({"error": words}).encode())
+            return
+        if isinstance(found, Message):
+            self._send(200, "application/octet-stream", encode(found))
+        elif isinstance(found, Download):
+            name = urllib.parse.quote(found.name)
+            more = {"Content-Disposition": f"attachment; filename*=UTF-8''{name}"}
+            self._send(200, "application/octet-stream", found.data, more)
+        else:
+            self._send(200, "application/json", json.dumps(found, allow_nan=False).encode())
+
+    def _send(self, code: int, kind: str, data: bytes, more: Mapping[str, str] | None = None) -> None:
+        self.send_response(code)
+        headers = {
+            "Content-Type": kind,
+            "Content-Length": str(len(data)),
+            "Cache-Control": "no-store",
+            "Content-Security-Policy": _POLICY,
+            "X-Content-Type-Options": "nosniff",
+            **(more or {}),
+        }
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(data)

@@ -1,0 +1,375 @@
+"""What the user of the studio asks for, without any browser: object, constraints, and what the priority rules do."""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from actors.environment import initial_wrist
+from common import rotations
+from common.config import TaskConfig
+from common.constraints.headings import BACK_OFF, INWARD
+from common.constraints.poses import Poses, closed_poses
+from common.constraints.priority import Request, Resolution, explain, resolve
+from common.errors import CongraspError
+from common.hands import kinematics
+from common.hands.spec import Hand
+from common.objects.shapes import matrix
+from common.objects.spec import GraspObject
+from common.task.types import MASKS, Goal, Surface, first
+from common.wire.codec import Message
+from services.grasp.constraint_sets import make_sets
+from services.grasp.grasper import with_minus
+from services.viz.studio.canvas import Canvas
+
+OPTIONAL = ("affordance", "pose", "trajectory")
+"""Constraints that can be asked for; the heading always is."""
+_LEAST_PATH = 0.03  # m
+
+
+class Arrow(NamedTuple):
+    """A heading in the object frame."""
+
+    position: np.ndarray
+    """(3,) where the middle of the grasping hand should be, m."""
+    direction: np.ndarray
+    """(3,) unit, the way the hand comes."""
+    cross: np.ndarray
+    """(3,) unit, orthogonal to the direction: along the hand's cross-finger axis."""
+
+
+class Path(NamedTuple):
+    """Waypoints of the wrist in the object frame."""
+
+    position: np.ndarray
+    """(K, 3) m."""
+    quaternion: np.ndarray
+    """(K, 4) w x y z."""
+
+
+class Asked(NamedTuple):
+    """What is to be grasped, and how."""
+
+    obj: GraspObject
+    """With the painted labels."""
+    rest: int
+    """Which of its resting poses."""
+    goal: Goal
+    """Values without a batch axis; those of absent constraints are finite and mean nothing."""
+    constraints: tuple[str, ...]
+    """Some of `OPTIONAL`."""
+
+
+class Studio:
+    """One user's request: every method is something that the user does, and raises a CongraspError if it cannot be.
+
+    Attributes:
+      obj: the object as it came.
+      rest: index of its resting pose.
+      asked: names of the optional constraints that are switched on.
+      arrow: the heading.
+      canvas: the object's surface, with what is painted on it as O-.
+    """
+
+    def __init__(self, hand: Hand, task: TaskConfig, obj: GraspObject):
+        """Begins with an object, and a heading that the table leaves room for."""
+        self.hand, self.task = hand, dataclasses.replace(task, object_scale=1.0)  # objects as large as they are
+        self.take(obj)
+
+    def take(self, obj: GraspObject) -> None:
+        """Another object: what was asked of the one before is gone."""
+        self.obj, self.rest = obj, 0
+        self.asked: set[str] = set()
+        self.canvas = Canvas(obj)
+        self.pose: Poses | None = None
+        self.path: Path | None = None
+        self._sets: tuple[bytes, Message] | None = None
+        self._next = {"heading": 0, "pose": 0, "trajectory": 0}
+        self.arrow = self._from_above()
+
+    def lay(self, rest: int) -> None:
+        """Another resting pose."""
+        if not 0 <= rest < len(self.obj.rest_poses):
+            raise CongraspError(f"The object '{self.obj.name}' has no resting pose {rest + 1}.")
+        self.rest = rest
+        self.arrow = self._from_above()
+
+    def ask(self, constraint: str, on: bool) -> None:
+        """Switches an optional constraint; what it needs and is not there yet is suggested."""
+        if constraint not in OPTIONAL:
+            raise CongraspError(f"There is no constraint '{constraint}'.", f"Choose from: {', '.join(OPTIONAL)}.")
+        if on and constraint == "affordance" and not self.canvas.minus.any():
+            self.canvas.take_parts()
+        if on and constraint == "pose" and self.pose is None:
+            self.close_hand()
+        if on and constraint == "trajectory" and self.path is None:
+            self.suggest("trajectory")
+        (self.asked.add if on else self.asked.discard)(constraint)
+
+    def point(self, position: Any, direction: Any, cross: Any = None) -> None:
+        """Puts the approach arrow somewhere.
+
+        Args:
+          position: (3,) target in the object frame, m.
+          direction: (3,) of any length but zero.
+          cross: (3,) along the cross-finger axis; the present one, made orthogonal, if not given.
+        """
+        position, direction = _vector("arrow's position", position), _vector("arrow's direction", direction)
+        length = np.linalg.norm(direction)
+        if length < 1e-6:
+            raise CongraspError("The arrow has no direction.", "Drag its tail away from its tip.")
+        direction = direction / length
+        wanted = self.arrow.cross if cross is None else _vector("arrow's roll", cross)
+        self.arrow = Arrow(position, direction, _orthogonal(wanted, direction))
+
+    def aim(self, surface: Any, direction: Any) -> None:
+        """Puts the arrow through a point (3,) of the surface: its target is as deep inside as in training."""
+        surface, direction = _vector("point", surface), _vector("arrow's direction", direction)
+        self.point(surface + INWARD * direction / max(1e-6, float(np.linalg.norm(direction))), direction)
+
+    def roll(self, angle: float) -> None:
+        """Turns the hand around the arrow, by an angle in rad."""
+        angle = float(_vector("angle", [angle, 0.0, 0.0])[0])
+        other = np.cross(self.arrow.direction, self.arrow.cross)
+        self.arrow = self.arrow._replace(cross=np.cos(angle) * self.arrow.cross + np.sin(angle) * other)
+
+    def paint(self, points: Any, radius: float, minus: bool) -> None:
+        """Brushes over points (N, 3) of the surface: the hand must not touch there, or may again.
+
+        Paint asks for the affordance; without any it is asked for no longer.
+        """
+        self.canvas.brush(points, radius, minus)
+        self._repainted()
+
+    def fill(self, minus: bool) -> None:
+        """Paints everything in one colour."""
+        self.canvas.fill(minus)
+        self._repainted()
+
+    def close_hand(self) -> None:
+        """A reference pose: the hand at the arrow, closed around the object."""
+        arrow = (np.asarray(part, np.float32)[None] for part in self.arrow)
+        pose = closed_poses(self.hand, np.asarray(self.obj.points), np.asarray(self.obj.normals), *arrow)
+        self.pose = Poses(*(np.asarray(field)[0] for field in pose))
+
+    def draw(self, points: Any) -> None:
+        """A wrist path through points (N, 3) of the object frame, from far to near.
+
+        It is moved little by little along its way, so that it ends where the wrist of the reference pose is, or of the
+        hand closed at the arrow; the wrist is turned as there all the way.
+        """
+        drawn = np.asarray(points, float)
+        if drawn.ndim != 2 or drawn.shape[1:] != (3,) or not 2 <= len(drawn) <= 2000 or not np.isfinite(drawn).all():
+            raise CongraspError("A path must be 2 to 2000 points of three numbers.")
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(drawn, axis=0), axis=-1))])
+        if along[-1] < _LEAST_PATH:
+            raise CongraspError(
+                f"The path is {100 * along[-1]:.1f} cm long.", f"Draw {100 * _LEAST_PATH:.0f} cm or more."
+            )
+        if self.pose is None:
+            self.close_hand()
+        assert self.pose is not None
+        share = np.linspace(0.0, 1.0, self.task.trajectory_points)
+        even = np.stack([np.interp(share * along[-1], along, drawn[:, i]) for i in range(3)], -1)
+        position = even + share[:, None] * (self.pose.position - even[-1])
+        self.path = Path(position, np.tile(self.pose.quaternion, (len(share), 1)))
+
+    def suggest(self, constraint: str) -> None:
+        """The next of the headings, reference poses or wrist paths that training would draw for this object.
+
+        Raises:
+          CongraspError: there are none in this resting pose.
+        """
+        if constraint not in self._next:
+            raise CongraspError(f"Nothing can be suggested for '{constraint}'.", "Choose heading, pose or trajectory.")
+        sets = self._constraint_sets().arrays
+        variant = int("affordance" in self.asked and bool(self.canvas.minus.any()))
+        allowed = sets["heading/allowed" if constraint == "heading" else "pose/allowed"][variant, self.rest]
+        found = np.flatnonzero(allowed)
+        if not len(found):
+            raise CongraspError(
+                f"The table leaves no room for a {constraint} in this resting pose.",
+                "Take another resting pose, or paint less.",
+            )
+        pick = found[(self._next[constraint] * 7919) % len(found)]
+        self._next[constraint] += 1
+        at = (variant, pick)
+        if constraint == "heading":
+            direction = sets["heading/direction"][at]
+            position = sets["heading/position"][at] - sets["heading/back"][variant, self.rest, pick] * direction
+            self.point(position, direction, sets["heading/cross"][at])
+            return
+        self.pose = Poses(*(sets[f"pose/{name}"][at] for name in Poses._fields))
+        if constraint == "trajectory":
+            self.path = Path(sets["trajectory/position"][at], sets["trajectory/quaternion"][at])
+
+    @property
+    def labelled(self) -> GraspObject:
+        """The object with the painted regions as its parts."""
+        return with_minus(self.obj, self.canvas.minus)
+
+    @property
+    def request(self) -> Asked:
+        """What a policy is asked for.
+
+        Raises:
+          CongraspError: it cannot be asked for; see `trouble`.
+        """
+        if trouble := self.trouble:
+            raise CongraspError(trouble)
+        names = tuple(name for name in OPTIONAL if name in self.asked)
+        return Asked(self.labelled, self.rest, self._goal(), names)
+
+    @property
+    def resolution(self) -> Resolution:
+        """What the priority rules make of it, without batch axes."""
+        flags = (np.array([name in self.asked]) for name in OPTIONAL)
+        goal = Goal(*(np.asarray(value, np.float32)[None] for value in self._goal()))
+        surface = Surface(np.asarray(self.obj.points, np.float32)[None], self.canvas.minus[None])
+        found = _resolve(self.hand, surface, Request(goal, *flags))
+        return Resolution(first(found.goal), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0])
+
+    @property
+    def words(self) -> list[str]:
+        """What the priority rules do, strongest constraint first."""
+        flags: dict[str, bool] = {name: name in self.asked for name in OPTIONAL}
+        return explain(**flags, redirected=bool(self.resolution.redirected))
+
+    @property
+    def trouble(self) -> str:
+        """Why this cannot be asked for, and what to do; empty if it can."""
+        if "affordance" in self.asked and (self.canvas.minus.all() or not self.canvas.minus.any()):
+            what = "Everything is" if self.canvas.minus.any() else "Nothing is"
+            return f"{what} painted as not to be touched. Paint a part of the object with the brush."
+        found = self.resolution
+        if not found.aligned:
+            return "The wrist path ends nearer to what must not be touched. Draw another path, or paint elsewhere."
+        start = self._world(found.goal.heading_position - BACK_OFF * found.goal.heading_direction)
+        if "trajectory" not in self.asked and start[2] < 0:
+            return "The approach begins under the table. Turn the arrow so that it comes from above."
+        if "trajectory" in self.asked and min(self._world(p)[2] for p in found.goal.trajectory_position) < 0:
+            return "The wrist path goes through the table. Draw it higher, or take another suggestion."
+        return ""
+
+    def view(self) -> dict[str, Any]:
+        """Everything that a page shows of it, as JSON; object frame but for the resting pose."""
+        resolution = self.resolution
+        goal = resolution.goal
+        bits = dict(zip(MASKS, (bool(bit > 0) for bit in goal.mask), strict=True))
+        size = np.ptp(self.obj.visual_vertices, axis=0)
+        return {
+            "hand": self.hand.name,
+            "object": {
+                "name": self.obj.name,
+                "size_cm": [round(100 * float(side), 1) for side in size],
+                "mass_g": round(1000 * self.obj.mass),
+                "faces": len(self.canvas.faces),
+                "rests": len(self.obj.rest_poses),
+            },
+            "rest": {"index": self.rest, **_pose(self.obj.rest_poses[self.rest])},
+            "asked": sorted(self.asked),
+            "arrow": {name: part.tolist() for name, part in self.arrow._asdict().items()},
+            "active": {
+                "masks": bits,
+                "position": goal.heading_position.tolist(),
+                "direction": goal.heading_direction.tolist(),
+                "overruled": bool(resolution.redirected) or not self.asked.isdisjoint(("pose", "trajectory")),
+            },
+            "words": self.words,
+            "trouble": self.trouble,
+            "start": self._start(goal),
+            "pose": None if self.pose is None else self._ghost(self.pose),
+            "path": None if self.path is None else np.asarray(self.path.position).tolist(),
+            "painted": self.canvas.version,
+            "minus": round(float(self.canvas.minus.mean()), 3),
+        }
+
+    def _repainted(self) -> None:
+        (self.asked.add if self.canvas.minus.any() else self.asked.discard)("affordance")
+
+    def _goal(self) -> Goal:
+        waypoints = self.task.trajectory_points
+        rest = np.array([1.0, 0.0, 0.0, 0.0])
+        pose = self.pose or Poses(self.hand.q_open, np.zeros(3), rest)
+        path = self.path or Path(np.zeros((waypoints, 3)), np.tile(rest, (waypoints, 1)))
+        return Goal(*self.arrow, *pose, *path, np.zeros(len(MASKS)))
+
+    def _start(self, goal: Goal) -> dict[str, Any]:
+        """Link frames (L, 3), (L, 4) in the world from which a grasp would begin."""
+        one = Goal(*(np.asarray(value, np.float32)[None] for value in goal))
+        flags = (np.array([name in self.asked]) for name in ("pose", "trajectory"))
+        rest = np.asarray(self.obj.rest_poses[self.rest], np.float32)[None]
+        position, quaternion = _begin(self.hand, self.task, one, *flags, rest)
+        return {"position": np.asarray(position).tolist(), "quaternion": np.asarray(quaternion).tolist()}
+
+    def _ghost(self, pose: Poses) -> dict[str, Any]:
+        """Link frames (L, 3), (L, 4) of a reference pose in the object frame."""
+        position, quaternion = _links(self.hand, *(np.asarray(field, np.float32) for field in pose))
+        return {"position": np.asarray(position).tolist(), "quaternion": np.asarray(quaternion).tolist()}
+
+    def _constraint_sets(self) -> Message:
+        key = self.canvas.minus.tobytes()
+        if self._sets is None or self._sets[0] != key:
+            self._sets = key, make_sets(self.hand, self.task, [self.labelled], seed=0)[0]
+        return self._sets[1]
+
+    def _world(self, point: np.ndarray) -> np.ndarray:
+        rest = self.obj.rest_poses[self.rest]
+        return rest[:3] + matrix(rest[3:]) @ point
+
+    def _from_above(self) -> Arrow:
+        """Straight down onto the object's top, across its narrower side."""
+        turn = matrix(self.obj.rest_poses[self.rest][3:])
+        world = self.obj.points @ turn.T
+        near = np.linalg.norm(world[:, :2] - (world[:, :2].max(0) + world[:, :2].min(0)) / 2, axis=-1)
+        top = world[near.argsort()[: len(world) // 8], 2].max()
+        middle = (world.max(0) + world.min(0)) / 2
+        narrow = np.eye(3)[int(np.ptp(world[:, :2], axis=0).argmin())]
+        height = max(top - INWARD, world[:, 2].min() + 0.012)
+        target = np.array([middle[0], middle[1], height])
+        return Arrow(target @ turn, np.array([0.0, 0.0, -1.0]) @ turn, narrow @ turn)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _resolve(hand: Hand, surface: Surface, request: Request) -> Resolution:
+    return resolve(hand, surface, request)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _begin(
+    hand: Hand, task: TaskConfig, goal: Goal, pose: jax.Array, trajectory: jax.Array, rest: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    q = jnp.where(pose[:, None], goal.pose_q, jnp.array(hand.q_open))
+    position, quaternion = initial_wrist(hand, task, goal, q, trajectory, rest[:, :3], rest[:, 3:])
+    return _links(hand, q[0], position[0], quaternion[0])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _links(hand: Hand, q: jax.Array, position: jax.Array, quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
+    local = kinematics.link_poses(hand, q)
+    turn = jnp.broadcast_to(quaternion, local[1].shape)
+    return rotations.compose_pose(jnp.broadcast_to(position, local[0].shape), turn, *local)
+
+
+def _vector(what: str, value: Any) -> np.ndarray:
+    try:
+        vector = np.asarray(value, float)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise CongraspError(f"The {what} must be three numbers, not {ascii(value)[:60]}.")
+    return vector
+
+
+def _orthogonal(wanted: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    cross = wanted - wanted @ direction * direction
+    if np.linalg.norm(cross) < 1e-3:
+        cross = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    return cross / np.linalg.norm(cross)
+
+
+def _pose(row: np.ndarray) -> dict[str, list[float]]:
+    return {"position": row[:3].tolist(), "quaternion": row[3:].tolist()}

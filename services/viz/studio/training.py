@@ -1,0 +1,260 @@
+"""What is known of a run while it trains: curves, events, the ledger, and every actor's newest episode.
+
+Fed with log messages and with the learner's status, by whoever receives them; it knows no network and no browser.
+"""
+
+import bisect
+import collections
+import dataclasses
+import json
+import pathlib
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from common.errors import CongraspError, TransportError
+from common.transport.base import Transport
+from common.transport.keys import Keys
+from common.wire.codec import Message, decode
+from services.ops import status as statuses
+from services.record.channels import flatten
+from services.record.reader import Record, log_files, read_records
+from services.viz.studio.recordings import is_episode
+
+FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
+"""Curves that a page shows first."""
+CONSTRAINTS = ("heading", "affordance", "pose", "trajectory")
+_EVENTS = 100
+_TREND = 200  # points of an actor's own history that are kept
+_STALE = 15.0  # seconds after which an actor that nobody lists any more is forgotten
+
+
+@dataclasses.dataclass
+class Curve:
+    """A number over the updates of a run; where a run went back to a checkpoint, the later value counts."""
+
+    steps: list[float] = dataclasses.field(default_factory=list)
+    values: list[float] = dataclasses.field(default_factory=list)
+    times: list[float] = dataclasses.field(default_factory=list)
+    """Seconds since 1970."""
+
+    def add(self, step: float, value: float, time: float) -> None:
+        """One more point."""
+        if self.steps and step <= self.steps[-1]:
+            first = bisect.bisect_left(self.steps, step)
+            del self.steps[first:], self.values[first:], self.times[first:]
+        self.steps.append(step)
+        self.values.append(value)
+        self.times.append(time)
+
+    def thinned(self, most: int) -> dict[str, list[float]]:
+        """At most `most` points for a page: of each stretch the lowest, the highest and the most sudden."""
+        index = np.arange(len(self.steps))
+        if len(index) > most:
+            values = np.array(self.values)
+            sudden = np.abs(np.diff(np.pad(values, 1, "edge"), 2))
+            parts = np.array_split(index, most // 3)
+            index = np.unique([[p[values[p].argmin()], p[values[p].argmax()], p[sudden[p].argmax()]] for p in parts])
+        return {name: [getattr(self, name)[i] for i in index] for name in ("steps", "values", "times")}
+
+
+@dataclasses.dataclass
+class Actor:
+    """One actor, as its messages show it."""
+
+    seen: float
+    figures: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Its newest metrics."""
+    episode: Message | None = None
+    """Its newest episode."""
+    episodes: int = 0
+    recent: collections.deque[bool] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=_TREND))
+    """Whether its last episodes succeeded."""
+
+
+class TrainingWindow:
+    """Takes what comes from any thread, and gives a page what it shows."""
+
+    def __init__(self, run: str):
+        """Nothing is known yet."""
+        self.run = run
+        self._lock = threading.Lock()
+        self._curves: dict[str, Curve] = {}
+        self._actors: dict[str, Actor] = {}
+        self._events: collections.deque[dict[str, Any]] = collections.deque(maxlen=_EVENTS)
+        self._status: Mapping[str, Any] | None = None
+        self._away = True
+        self.damaged = 0
+        """Messages that were not what their key says."""
+
+    def take(self, key: str, message: Message, now: float) -> None:
+        """One log message, as published under `log/**`; `now` in seconds since 1970."""
+        try:
+            *_, kind, role, name = key.split("/")
+            with self._lock:
+                if kind == "metrics":
+                    self._metrics(role, name, message.meta, now)
+                elif kind == "event":
+                    text, level = str(message.meta["text"]), str(message.meta["level"])
+                    self._events.append({"time": float(message.meta.get("time", now)), "level": level, "text": text})
+                elif kind == "episode":
+                    self._episode(name, message, now)
+        except (AttributeError, KeyError, TypeError, ValueError):
+            self.damaged += 1
+
+    def take_status(self, found: Mapping[str, Any] | None, now: float) -> None:
+        """What the learner says of itself; None while it is away."""
+        with self._lock:
+            self._away = found is None
+            if found is None:
+                return
+            self._status = found
+            listed = {role["id"] for role in found["roles"] if role["role"] == "actor"}
+            for name in listed:
+                self._actors.setdefault(name, Actor(now)).seen = now
+            for name in [name for name, actor in self._actors.items() if name not in listed]:
+                if now - self._actors[name].seen > _STALE:
+                    del self._actors[name]
+
+    def load(self, path: pathlib.Path) -> None:
+        """Curves of a run's recordings, and every actor's newest episode there.
+
+        Raises:
+          CongraspError: there are none.
+        """
+        newest: dict[str, Record] = {}
+        for file in log_files(path):
+            for record in read_records(file, lambda topic: topic.startswith("/metrics/") or is_episode(topic)):
+                _, kind, role, name = record.topic.split("/", 3)
+                if kind == "episode":
+                    newest[role] = record
+                    continue
+                meta = json.loads(record.data)
+                with self._lock:
+                    self._metrics(role, name, {**meta, "values": flatten(meta["values"])}, record.time / 1e9)
+        for name, record in newest.items():
+            with self._lock:
+                if name not in self._actors or self._actors[name].episode is None:
+                    self._episode(name, decode(record.data), time.time())
+
+    def episode(self, actor: str) -> Message:
+        """The newest episode of an actor.
+
+        Raises:
+          CongraspError: none has come.
+        """
+        with self._lock:
+            known = self._actors.get(actor)
+            if known is None or known.episode is None:
+                raise CongraspError(f"No episode of the actor '{actor}' has come yet.", "Actors send one now and then.")
+            return known.episode
+
+    def curve(self, name: str) -> Curve:
+        """A curve by its name.
+
+        Raises:
+          CongraspError: there is none of this name.
+        """
+        with self._lock:
+            if name not in self._curves:
+                raise CongraspError(f"There is no curve '{name}'.", "The page lists those that there are.")
+            return self._curves[name]
+
+    def view(self, names: Sequence[str] = (), points: int = 300) -> dict[str, Any]:
+        """Everything that a page shows of it, as JSON; of the curves those that are named."""
+        with self._lock:
+            found, roles = self._status, {}
+            if found is not None:
+                roles = {role["id"]: role for role in found["roles"] if role["role"] == "actor"}
+            wanted = [name for name in names if name in self._curves] or [n for n in FIRST if n in self._curves]
+            return {
+                "run": self.run,
+                "away": self._away,
+                "version": None if found is None else found["version"],
+                "rates": {} if found is None else found["rates"],
+                "queue": None if found is None else found["queue"],
+                "ledger": {} if found is None else found["ledger"],
+                "warnings": [] if found is None else found["warnings"],
+                "finished": bool(found and found["finished"]),
+                "curves": {name: self._curves[name].thinned(points) for name in wanted},
+                "names": sorted(self._curves),
+                "constraints": {
+                    name: self._curves[f"success/{name}"].values[-1]
+                    for name in CONSTRAINTS
+                    if f"success/{name}" in self._curves
+                },
+                "actors": [self._row(name, roles.get(name)) for name in sorted(self._actors)],
+                "events": list(self._events)[-20:][::-1],
+            }
+
+    def _metrics(self, role: str, name: str, meta: Mapping[str, Any], now: float) -> None:
+        when = float(meta.get("time", now))
+        values = {key: float(value) for key, value in meta["values"].items()}
+        if role == "actor":
+            actor = self._actors.setdefault(name, Actor(now))
+            actor.seen, actor.figures = now, values
+            return
+        if role != "learner" or name != "0":
+            return  # every rank of a learner says the same
+        step = float(meta.get("update", meta.get("version", 0)))
+        for key, value in values.items():
+            if np.isfinite(value):
+                self._curves.setdefault(key, Curve()).add(step, value, when)
+
+    def _episode(self, name: str, message: Message, now: float) -> None:
+        if "link_position" not in message.arrays or "success" not in message.meta:
+            raise ValueError("not an episode")
+        actor = self._actors.setdefault(name, Actor(now))
+        actor.seen, actor.episode, actor.episodes = now, message, actor.episodes + 1
+        actor.recent.append(bool(message.meta["success"]))
+
+    def _row(self, name: str, role: Mapping[str, Any] | None) -> dict[str, Any]:
+        actor = self._actors[name]
+        said = role or {}
+        row: dict[str, Any] = {"id": name, "alive": role is not None, "episodes": actor.episodes}
+        row |= {key: said.get(key) for key in ("version", "lag", "rollouts", "steps_per_second")}
+        if actor.recent:
+            row["success"] = sum(actor.recent) / len(actor.recent)
+        if actor.episode is not None:
+            row["object"] = actor.episode.meta.get("object")
+            row["last"] = bool(actor.episode.meta["success"])
+        return row
+
+
+class Follower:
+    """Feeds a window from a run, in two threads of its own, until it is closed."""
+
+    def __init__(self, transport: Transport, window: TrainingWindow, every: float = 1.0):
+        """Subscribes and begins; the transport stays the caller's."""
+        self._transport, self._window, self._every = transport, window, every
+        self._stop = threading.Event()
+        self._subscription = transport.subscribe(Keys(window.run).logs, depth=1024)
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._receive, self._ask)]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self._stop.set()
+        self._subscription.close()
+        for thread in self._threads:
+            thread.join(2.0)
+
+    def _receive(self) -> None:
+        while not self._stop.is_set():
+            received = self._subscription.receive(0.5)
+            if received is not None:
+                self._window.take(*received, time.time())
+
+    def _ask(self) -> None:
+        while True:
+            try:
+                found = statuses.ask(self._transport, self._window.run)
+            except TransportError:
+                found = None
+            self._window.take_status(found, time.time())
+            if self._stop.wait(self._every):
+                return

@@ -1,0 +1,212 @@
+"""OakInk-Image's annotations, with tensors as PyTorch pickles them: a known answer, affordance, and what is wrong."""
+
+import collections
+import io
+import json
+import pickle
+import struct
+import sys
+import types
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from services.assets.captures.oakink import read
+from services.assets.captures.objects import Meshes
+from tests.services.assets.captures import known
+
+STAMP = "2021-09-26-19-59-58"
+
+
+def _load_from_bytes(data):
+    raise AssertionError("a file was unpickled")
+
+
+def _rebuild_tensor_v2(*arguments):
+    raise AssertionError("a file was unpickled")
+
+
+class FloatStorage:
+    """PyTorch's name for 32-bit floats in a row; pickled by reference, as PyTorch does, before its numbers."""
+
+    def __init__(self, values):
+        self.values = values
+
+    def __reduce__(self):
+        class Referring(pickle.Pickler):
+            def persistent_id(self, thing):
+                if isinstance(thing, FloatStorage):
+                    return ("storage", FloatStorage, "94", "cpu", thing.values.size, None)
+                return None
+
+        machine = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"short": 2, "int": 4, "long": 4}}
+        stream = io.BytesIO()
+        for part in (0x1950A86A20F9469CFC6C, 1001, machine):
+            pickle.dump(part, stream, 2)
+        Referring(stream, 2).dump(self)
+        pickle.dump(["94"], stream, 2)
+        stream.write(struct.pack("<q", self.values.size) + self.values.tobytes())
+        return _load_from_bytes, (stream.getvalue(),)
+
+
+class Tensor:
+    """What PyTorch's tensors are pickled as."""
+
+    def __init__(self, values):
+        self.values = np.ascontiguousarray(values, np.float32)
+
+    def __reduce__(self):
+        strides = tuple(stride // 4 for stride in self.values.strides)
+        storage = FloatStorage(self.values.ravel())
+        return _rebuild_tensor_v2, (storage, 0, self.values.shape, strides, False, collections.OrderedDict())
+
+
+def dumps(value):
+    """`pickle.dumps` where PyTorch were installed, under whose names the tensors are written."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, members in {
+            "torch": (FloatStorage,),
+            "torch._utils": (_rebuild_tensor_v2,),
+            "torch.storage": (_load_from_bytes,),
+        }.items():
+            module = types.ModuleType(name)
+            for member in members:
+                patch.setattr(member, "__module__", name)
+                setattr(module, member.__name__, member)
+            patch.setitem(sys.modules, name, module)
+        return pickle.dumps(value)
+
+
+def write(case, root, *, cameras=(3, 1), every=1, change=lambda frame, info: info):
+    """Annotations of one sequence, seen by some cameras; its name is `<object>_<intent>_<subject>`."""
+    folder = root / "anno" / "general_info"
+    folder.mkdir(parents=True, exist_ok=True)
+    index = root / "anno" / "seq_all.json"
+    rows = json.loads(index.read_text()) if index.is_file() else []
+    rotations = known.mano_rotations(case.fingers)
+    roots = known.mano_root(case.wrist_rotation).as_matrix()
+    middle = case.object_position + case.object_rotation.apply(known.ORIGIN)  # OakInk centres the mesh first
+    for frame in range(0, len(rotations), every):
+        turns = Rotation.from_matrix(np.concatenate([roots[frame][None], rotations[frame]]))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = case.object_rotation[frame].as_matrix(), middle[frame]
+        hand = {
+            "hand_pose": Tensor(turns.as_quat(scalar_first=True).reshape(64)),
+            "hand_shape": Tensor(np.zeros(10)),
+            "hand_tsl": Tensor(case.wrist_position[frame]),
+        }
+        info = change(
+            frame, {"hand_anno": hand, "obj_anno": Tensor(pose), "cam_extr": Tensor(np.eye(4)), "cam_intr": np.eye(3)}
+        )
+        for camera in cameras:
+            rows.append([f"{case.name}/{STAMP}", 0, frame, camera])
+            if info is not None:
+                (folder / f"{case.name}__{STAMP}__0__{frame}__{camera}.pkl").write_bytes(dumps(info))
+    index.write_text(json.dumps(rows))
+    known.write_mesh(case, root / "obj" / f"{case.object_name}.obj")
+
+
+def write_parts(case, root, border):
+    """OakBase's parts of the box: what lies above a height in its own frame, and the rest."""
+    points, _ = trimesh.sample.sample_surface(case.mesh(), 4000, seed=1)
+    above = (points - known.ORIGIN)[:, 2] > border
+    folder = root / "OakBase" / "bottle" / case.object_name
+    folder.mkdir(parents=True)
+    for i, (name, chosen) in enumerate((("grip", above), ("rest", ~above))):
+        trimesh.PointCloud(points[chosen]).export(folder / f"part_{i}.ply")
+        (folder / f"part_{i}.json").write_text(json.dumps({"name": name, "attr": ["held_by_hand"]}))
+
+
+def test_a_known_answer_comes_back_with_its_affordance(run_import, tmp_path):
+    case = known.make("A01001_0001_0000", "A01001", 9, tail=0.08)
+    write(case, tmp_path)
+    border = case.size[2] / 2 - 0.045
+    write_parts(case, tmp_path, border)
+    sets, report = run_import("oakink", tmp_path)
+    assert not report.dropped and [row["frame"] for row in report.kept] == [known.GRASP]
+    arrays = sets["A01001-grip"].arrays
+    known.check(arrays, 0, case)
+    below = arrays["surface/points"][:, 2] < border
+    assert (arrays["surface/minus"] == below).mean() > 0.98 and 0.2 < below.mean() < 0.8
+
+
+def test_an_affordance_of_less_than_a_tenth_is_dropped(run_import, tmp_path):
+    case = known.make("A01001_0001_0000", "A01001", 9, tail=0.8)
+    write(case, tmp_path)
+    write_parts(case, tmp_path, case.size[2] / 2 - 0.045)
+    _, report = run_import("oakink", tmp_path, code=2)
+    assert report.dropped[0]["rule"] == "O+ too small" and "% of its surface" in report.dropped[0]["reason"]
+    _, report = run_import("oakink", tmp_path, "--affordance", "none")
+    assert [row["object"] for row in report.kept] == ["A01001"]
+
+
+def test_one_camera_counts_and_frames_are_sorted(tmp_path):
+    case = known.make("A01001_0001_0000", "A01001", 10)
+    write(case, tmp_path, cameras=(3, 1), every=2)
+    index = tmp_path / "anno" / "seq_all.json"
+    rows = json.loads(index.read_text())
+    index.write_text(json.dumps(rows[::-1]))
+    (sequence,) = read(tmp_path, Meshes(()), None)
+    np.testing.assert_allclose(sequence.wrist_position, case.wrist_position[::2], atol=1e-6)
+
+
+def test_what_is_wrong_with_annotations_is_said(run_import, tmp_path):
+    case = known.make("right", "A01001", 11)
+
+    def variant(name, change):
+        case.name = f"A01001_{name}_0000"
+        write(case, tmp_path, cameras=(0,), every=1, change=change)
+
+    def without(key, inside=None):
+        def change(frame, info):
+            (info[inside] if inside else info).pop(key)
+            return info
+
+        return change
+
+    def millimetres(frame, info):
+        info["obj_anno"] = Tensor(info["obj_anno"].values * np.array([[1, 1, 1, 1000]] * 3 + [[1] * 4]))
+        return info
+
+    variant("0001", lambda frame, info: None if frame in (20, 21, 22) else info)
+    variant("nokey", without("obj_anno"))
+    variant("nopose", without("hand_pose", "hand_anno"))
+    variant("gone", lambda frame, info: None)
+    variant("lefthand", lambda frame, info: info | {"hand_anno": None})
+    variant("millimetres", millimetres)
+    case.object_name = "C90001"
+    case.name = "C90001_0001_0000"
+    write(case, tmp_path, cameras=(0,))
+    (tmp_path / "obj" / "C90001.obj").unlink()
+    sets, report = run_import("oakink", tmp_path)
+    assert [row["sequence"] for row in report.kept] == [f"A01001_0001_0000/{STAMP}"]
+    known.check(sets["A01001"].arrays, 0, case)
+    assert {"_".join(row["sequence"].split("_")[:2]): row["rule"] for row in report.dropped} == {
+        "A01001_nokey": "wrong layout",
+        "A01001_nopose": "wrong layout",
+        "A01001_gone": "frames missing",
+        "A01001_lefthand": "frames missing",
+        "A01001_millimetres": "wrong units",
+        "C90001_0001": "no mesh",
+    }
+
+
+def test_a_file_that_would_run_something_is_not_unpickled(run_import, tmp_path):
+    class Hostile:
+        def __reduce__(self):
+            return (tmp_path / "it ran").mkdir, ()
+
+    case = known.make("A01001_0001_0000", "A01001", 12)
+    write(case, tmp_path, cameras=(0,), change=lambda frame, info: info | {"obj_anno": Hostile()})
+    _, report = run_import("oakink", tmp_path, code=2)
+    assert report.dropped[0]["rule"] == "unreadable"
+    assert "stands for no array" in report.dropped[0]["reason"]
+    assert not (tmp_path / "it ran").exists()
+
+
+def test_a_folder_without_annotations_is_refused(run_import, tmp_path):
+    with pytest.raises(CongraspError, match="seq_all"):
+        run_import("oakink", tmp_path)

@@ -1,0 +1,195 @@
+"""Hands of one's own: from URDF and MJCF to a file, and from the file to everywhere."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from common.config import TaskConfig, run_config_from_json, to_json
+from common.errors import CongraspError
+from common.hands import VARIABLE, get_hand
+from common.hands.files import hand_from_text, hand_text, read_hand
+from common.hands.kinematics import grasp_frame
+from common.hands.mjcf import add_hand
+from common.policy.bundle import policy_spec
+from services.assets.hands.model_files import Choices, describe, import_hand
+from services.cli import main
+from services.train.presets import get_preset, with_hand
+from services.viz.hand_sheets import hands_sheet, joints_sheet
+
+HANDS = pathlib.Path(__file__).parents[3] / "hands"
+ENDS = {"left_root": -0.96, "left_middle": -1.28, "opposing_root": 0.96, "opposing_middle": 1.28}
+
+
+@pytest.fixture(scope="module")
+def claw():
+    return import_hand(HANDS / "claw.urdf")
+
+
+@pytest.fixture(autouse=True)
+def _no_own_hands(tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "own"))
+    get_hand.cache_clear()
+    yield
+    get_hand.cache_clear()
+
+
+def test_a_urdf_is_understood(claw):
+    hand = claw.hand
+    assert [link.name for link in hand.links] == [
+        "palm",
+        *(f"{finger}_{part}" for finger in ("left", "right", "opposing") for part in ("lower", "upper")),
+    ]
+    joints = {joint.name: joint for joint in hand.joints}
+    assert len(joints) == 6
+    root = joints["left_root"]
+    assert (root.lower, root.upper, root.torque_limit) == (-1.2, 0.5, 1.5)
+    np.testing.assert_allclose(root.anchor, (0.04, 0.025, 0.04), atol=1e-9)
+    np.testing.assert_allclose(root.axis, (0.0, 1.0, 0.0), atol=1e-9)
+    lean = 0.06 * np.array([np.sin(0.4), 0.0, np.cos(0.4)])
+    np.testing.assert_allclose(joints["left_middle"].anchor, np.add(root.anchor, lean), atol=1e-9)
+    masses = {link.name: link.mass for link in hand.links}
+    assert masses["left_upper"] == pytest.approx(0.035)  # with the pad, which a fixed joint holds
+    assert sum(masses.values()) == pytest.approx(0.545)
+
+
+def test_thumb_tips_poses_and_frame_are_proposed(claw):
+    hand = claw.hand
+    assert hand.thumb == "opposing_upper" and len(hand.tip_links) == 3
+    assert hand.closed_pose.items() >= ENDS.items()
+    assert {name: x / hand.closed_pose[name] for name, x in hand.open_pose.items()} == pytest.approx(
+        dict.fromkeys(hand.open_pose, 0.2)
+    )
+    frame = grasp_frame(hand)
+    np.testing.assert_allclose(frame.heading, (0.0, 0.0, 1.0), atol=0.06)
+    np.testing.assert_allclose(frame.cross, (1.0, 0.0, 0.0), atol=0.06)
+    words = "\n".join(describe(claw))
+    assert "opposing_lower - opposing_upper" in words and "no torque limit" not in words
+
+
+def test_the_same_hand_as_mjcf_on_an_arm_is_the_same(claw):
+    other = import_hand(HANDS / "claw.xml", Choices(name="claw")).hand
+    hand = claw.hand
+    assert [link.name for link in other.links] == [link.name for link in hand.links]  # the wrist joint is left out
+    for a, b in zip(hand.joints, other.joints, strict=True):
+        assert a.name == b.name
+        np.testing.assert_allclose(
+            [*a.anchor, *a.axis, a.lower, a.upper], [*b.anchor, *b.axis, b.lower, b.upper], atol=1e-9
+        )
+        assert (b.kp, b.torque_limit) == (5.0, 1.2)  # of its motors
+    np.testing.assert_allclose(hand.q_closed, other.q_closed)
+    for a, b in zip(hand.links, other.links, strict=True):
+        assert a.mass == pytest.approx(b.mass)
+
+
+@pytest.mark.parametrize("name", ["allegro", "sharpa"])
+def test_a_dexterous_hand_comes_back_from_mjcf(name, tmp_path):
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    add_hand(spec, get_hand(name))
+    spec.compile()
+    (tmp_path / "hand.xml").write_text(spec.to_xml())
+    original, found = get_hand(name), import_hand(tmp_path / "hand.xml").hand
+    assert found.thumb == original.thumb
+    for a, b in zip(original.joints, found.joints, strict=True):
+        np.testing.assert_allclose(
+            [*a.anchor, *a.axis, a.lower, a.upper, a.kp, a.torque_limit],
+            [*b.anchor, *b.axis, b.lower, b.upper, b.kp, b.torque_limit],
+            atol=1e-4,
+        )
+    # The proposed frame is near the one that was chosen by hand.
+    angle = np.degrees(np.arccos(grasp_frame(original).heading @ grasp_frame(found).heading))
+    assert angle < 30
+
+
+def test_a_hand_file_is_a_hand_by_path_by_name_and_by_its_text(claw, tmp_path):
+    path = tmp_path / "own" / "claw.json"
+    path.parent.mkdir()
+    path.write_text(hand_text(claw.hand))
+    assert get_hand(str(path)) is get_hand("claw") is get_hand(claw.hand.reference) is claw.hand
+    config = with_hand(get_preset("quickstart"), "claw")
+    path.unlink()  # actors elsewhere do not have the file
+    travelled = run_config_from_json(to_json(config))
+    assert get_hand(travelled.task.hand) is claw.hand
+    spec = policy_spec(travelled.task, travelled.network)
+    assert spec.hand_name == "claw" and spec.action_size == 12
+    assert spec.schema != policy_spec(TaskConfig(), travelled.network).schema
+
+
+def test_wrong_hand_files_are_one_line(claw, tmp_path):
+    path = tmp_path / "bad.json"
+    fields = json.loads(hand_text(claw.hand))
+
+    def refused(word, **changes):
+        path.write_text(json.dumps({**fields, **changes}))
+        with pytest.raises(CongraspError, match=word) as raised:
+            read_hand(path)
+        assert str(path) in str(raised.value) and "\n" not in str(raised.value)
+
+    links = fields["links"]
+    refused("format 2", format=2)
+    refused("the thumb must be a link with a tip", thumb="palm")
+    refused("first link must be the palm", links=links[1:])
+    refused("parent 'palm' of|does not come before", links=[links[0], links[2], links[1], *links[3:]])
+    refused("more than once", links=[*links, links[-1]])
+    refused("is no joint", open_pose={"elbow": 1.0})
+    refused("outside of its limits in the closed pose", closed_pose={"left_root": 3.0})
+    refused("no hand", links=3)
+    refused("'wings'|wings", wings=2)
+    refused("mass above zero", links=[{**links[0], "mass": 0.0}, *links[1:]])
+    joint = {**links[1]["joints"][0], "axis": [0.0, 2.0, 0.0]}
+    refused("not a unit vector", links=[links[0], {**links[1], "joints": [joint]}, *links[2:]])
+    path.write_text("not json")
+    with pytest.raises(CongraspError, match="is not JSON"):
+        read_hand(path)
+    with pytest.raises(CongraspError, match="cannot be read"):
+        get_hand(str(tmp_path / "none.json"))
+    with pytest.raises(CongraspError, match="the hand file has the format None"):
+        hand_from_text("{}")
+
+
+def test_what_is_no_hand_is_refused_with_the_reason(tmp_path):
+    def refused(name, text, word, **choices):
+        path = tmp_path / name
+        path.write_text(text)
+        with pytest.raises(CongraspError, match=word) as raised:
+            import_hand(path, Choices(**choices))
+        assert "\n" not in str(raised.value)
+
+    urdf = (HANDS / "claw.urdf").read_text()
+    refused("a.txt", urdf, "neither URDF nor MJCF")
+    refused("a.xml", "<mujoco", "cannot be read")
+    refused("b.xml", "<mujoco/>", "0 finger")
+    refused(
+        "c.urdf", urdf.replace('name="left_middle" type="revolute"', 'name="left_middle" type="prismatic"'), "hinge"
+    )
+    mjcf = (HANDS / "claw.xml").read_text()
+    refused("d.xml", mjcf.replace('name="left_middle" axis="0 1 0" range="-1.6 0"', 'name="left_middle"'), "limits")
+    refused("e.urdf", urdf, "no body 'hand'.*mount", palm="hand")
+    refused("f.urdf", urdf, "'mount' is not the last link of a finger.*opposing_upper", thumb="mount")
+    with pytest.raises(CongraspError, match="no file"):
+        import_hand(tmp_path / "none.urdf")
+
+
+def test_the_commands_import_list_and_draw(tmp_path, capsys):
+    assert main.run(["hands", "import", str(HANDS / "claw.urdf"), "--name", "gripper"]) == 0
+    said = capsys.readouterr().out
+    assert "6 joints, 7 links" in said and "congrasp train --hand gripper" in said
+    assert (tmp_path / "own" / "gripper.json").exists() and (tmp_path / "own" / "gripper.png").stat().st_size > 10_000
+    assert main.run(["hands", "list"]) == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO"))
+    with pytest.raises(CongraspError, match="'allegro' is a hand of congrasp"):
+        main.run(["hands", "import", str(HANDS / "claw.urdf"), "--name", "allegro"])
+    with pytest.raises(CongraspError, match=r"does not end in \.json"):
+        main.run(["hands", "import", str(HANDS / "claw.urdf"), "--out", "a.txt"])
+
+
+def test_sheets_show_every_hand_and_every_joint(claw):
+    image = hands_sheet([claw.hand], size=(40, 40))
+    rows = joints_sheet(claw.hand, size=(40, 40))
+    assert image.shape[1] > 3 * 40 and rows.shape[0] > 2 * 40 and rows.shape[1] > 8 * 40
+    assert len(np.unique(rows.reshape(-1, 3), axis=0)) > 100

@@ -1,0 +1,103 @@
+"""Partitions from part meshes, painted vertices and half-spaces: the known halves of a box, and what is refused."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from common.errors import CongraspError
+from common.objects import store
+from services.assets.objects.affordance import in_half_space, on_part_mesh, painted, two_parts
+from services.assets.objects.meshes import ImportOptions, import_paths
+from services.cli.main import load
+
+EDGES, SHIFT = np.array([0.05, 0.05, 0.12]), np.array([0.01, 0.02, 0.06])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A box, its lower part, and the box with its lower vertices painted green, in millimetres."""
+    folder = tmp_path_factory.mktemp("box")
+    mesh = trimesh.creation.box(EDGES * 1000).apply_translation(SHIFT * 1000)
+    mesh = mesh.subdivide().subdivide().subdivide()
+    mesh.export(folder / "box.stl")
+    low = trimesh.creation.box(EDGES * [1000, 1000, 500]).apply_translation(SHIFT * 1000 - [0, 0, 30])
+    low.export(folder / "low.stl")
+    colours = np.where((mesh.vertices[:, 2] < 60)[:, None], [0, 255, 0, 255], [255, 0, 0, 255])
+    trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False).export(folder / "painted.ply")
+    mesh.export(folder / "plain.ply")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def box(folder):
+    (obj,) = import_paths([folder / "box.stl"], ImportOptions(unit="mm", cache_dir=str(folder / "cache")))
+    return obj
+
+
+def test_each_source_finds_the_lower_half(box, folder):
+    below = box.points[:, 2] < 0
+    near = np.abs(box.points[:, 2]) < 0.009  # a border lies between two vertices, or on the part's own lid
+    for plus in (
+        in_half_space(box, (0, 0, -2), 0.0),
+        on_part_mesh(box, folder / "low.stl"),
+        painted(box, folder / "painted.ply", (0, 255, 0)),
+    ):
+        assert plus.shape == (512,) and np.array_equal(plus[~near], below[~near])
+    labelled = two_parts(box, below, "half")
+    np.testing.assert_array_equal(labelled.non_graspable_points, ~below)
+    assert labelled.name == "half" and labelled.part_names == ("grasp", "avoid")
+
+
+def test_what_cannot_be_an_affordance_is_refused(box, folder):
+    with pytest.raises(CongraspError, match=r"is \d% of its surface.*10%"):
+        two_parts(box, in_half_space(box, (0, 0, 1), 0.058) & (box.points[:, 0] > 0.01))
+    with pytest.raises(CongraspError, match="has no length"):
+        in_half_space(box, (0, 0, 0), 0.0)
+    with pytest.raises(CongraspError, match="#0000ff"):
+        painted(box, folder / "painted.ply", (0, 0, 255))
+    with pytest.raises(CongraspError, match="no coloured vertices"):
+        painted(box, folder / "plain.ply", (0, 255, 0))
+    trimesh.creation.box([10, 10, 10]).apply_translation([500, 0, 0]).export(folder / "elsewhere.stl")
+    with pytest.raises(CongraspError, match="cm from the surface"):
+        on_part_mesh(box, folder / "elsewhere.stl")
+    for offset in (20.0, float("nan")):
+        with pytest.raises(CongraspError, match=r"misses 'box', which reaches 0\.0\d+ m .* in metres"):
+            in_half_space(box, (0, 0, 1), offset)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda vertices: vertices / 1000, "does not show 'box'"),
+        (lambda vertices: vertices + np.array([300, 0, 0]), "off by 30 cm"),
+        (lambda vertices: vertices * np.nan, "no vertex of finite numbers"),
+    ],
+)
+def test_a_painted_file_must_show_the_object(box, folder, tmp_path, change, complaint):
+    mesh = trimesh.load(folder / "painted.ply", process=False)
+    colours = mesh.visual.vertex_colors
+    trimesh.PointCloud(change(np.asarray(mesh.vertices)), colors=colours).export(tmp_path / "other.ply")
+    with pytest.raises(CongraspError, match=complaint):
+        painted(box, tmp_path / "other.ply", (0, 255, 0))
+    with pytest.raises(CongraspError, match="There is no file"):
+        painted(box, tmp_path / "none.ply", (0, 255, 0))
+
+
+def test_the_command_stores_the_new_object(box, folder, tmp_path, capsys):
+    catalogue = store.Catalogue(tmp_path)
+    catalogue.add(box)
+    run = ["affordance", "box", "--folder", str(tmp_path)]
+    assert load("objects")([*run, "--painted", str(folder / "painted.ply"), "--name", "low"])() == 0
+    assert load("objects")([*run, "--half-space", "0", "0", "1", "0", "--invert", "--name", "also-low"])() == 0
+    assert "may be grasped" in capsys.readouterr().out
+    for name in ("low", "also-low"):
+        obj = catalogue.get(name)
+        assert obj.points[~obj.non_graspable_points][:, 2].max() < 0.009
+    with pytest.raises(CongraspError, match="Set one of"):
+        load("objects")([*run])()
+    with pytest.raises(CongraspError, match="--colour is 'pink'"):
+        load("objects")([*run, "--painted", str(folder / "painted.ply"), "--colour", "pink"])()
+    with pytest.raises(CongraspError, match="has 3 numbers, not four"):
+        load("objects")([*run, "--half-space", "0", "0", "1"])()
+    with pytest.raises(CongraspError, match="nothing is divided"):
+        load("objects")([*run, "--half-space", "0", "0", "1", "-0.062"])()

@@ -1,0 +1,293 @@
+"""Import of meshes: known solids, every kind of source, and one line for every kind of bad input."""
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+
+from common.errors import CongraspError
+from common.objects import shapes
+from common.objects.resting import settle
+from common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES
+from common.objects.store import digest
+from services.assets.objects import decompose, meshes
+from services.assets.objects.meshes import ImportOptions, import_paths, import_source
+from services.assets.objects.sources import find_sources
+
+SIDES = np.array([0.04, 0.06, 0.08])
+
+
+@pytest.fixture
+def options(tmp_path):
+    return ImportOptions(cache_dir=str(tmp_path / "cache"))
+
+
+def block(sides=SIDES, center=(0.0, 0.0, 0.0)):
+    mesh = trimesh.creation.box(sides)
+    mesh.apply_translation(center)
+    return mesh
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb"])
+def test_a_solid_block_gets_the_mass_properties_worked_out(tmp_path, options, suffix):
+    block(center=(0.5, 0.1, -0.2)).export(tmp_path / f"block.{suffix}")
+    (obj,) = import_paths([tmp_path / f"block.{suffix}"], options)
+    assert (obj.name, obj.family, len(obj.pieces), obj.primitive) == ("block", "imported", 1, False)
+    # 192 cm^3 of 500 kg/m^3; I = m/12 (b^2 + c^2).
+    np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-5)
+    np.testing.assert_allclose(np.sort(np.ptp(obj.visual_vertices, axis=0)), SIDES, rtol=1e-5)
+    sides = np.ptp(obj.visual_vertices.astype(float), axis=0)
+    expected = 0.096 / 12 * (np.sum(sides**2) - sides**2)
+    np.testing.assert_allclose(obj.inertia, np.diag(expected), rtol=1e-4, atol=1e-10)
+    np.testing.assert_allclose(obj.visual_vertices.mean(0), 0, atol=1e-6)
+    distance = np.abs(np.abs(obj.points) - sides / 2).min(-1)
+    np.testing.assert_allclose(distance, 0, atol=1e-6)
+    assert (np.einsum("ij,ij->i", obj.points, obj.normals) > 0.019).all()
+    assert sorted(obj.graspable.tolist()) == [False, True]
+    assert 0.4 < obj.non_graspable_points.mean() < 0.6
+    np.testing.assert_allclose(sorted(obj.rest_poses[:, 2]), np.repeat(SIDES / 2, 2), atol=1e-3)
+
+
+def test_units_scale_density_and_mass(tmp_path, options):
+    block(1000 * SIDES).export(tmp_path / "block.stl")
+    with pytest.raises(CongraspError, match=r"block\.stl is 80 m long .*too large.*--unit mm' \(8 cm\)") as error:
+        import_paths([tmp_path / "block.stl"], options)
+    assert "\n" not in str(error.value)
+    with pytest.raises(CongraspError, match=r"is 0\.08 mm long.*too small.*--scale 0\.00125"):
+        import_paths([tmp_path / "block.stl"], ImportOptions("m", 1e-6, cache_dir=options.cache_dir))
+    made = ImportOptions("mm", 0.5, density=3000.0, cache_dir=options.cache_dir)
+    (obj,) = import_paths([tmp_path / "block.stl"], made)
+    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), SIDES / 2, rtol=1e-5)
+    np.testing.assert_allclose(obj.mass, 3000 * np.prod(SIDES / 2), rtol=1e-5)
+    (heavy,) = import_paths([tmp_path / "block.stl"], ImportOptions("mm", mass=0.7, cache_dir=options.cache_dir))
+    assert heavy.mass == 0.7
+    (light,) = import_paths([tmp_path / "block.stl"], ImportOptions("mm", density=1.0, cache_dir=options.cache_dir))
+    assert light.mass == 0.05
+    np.testing.assert_allclose(light.inertia / 0.05, heavy.inertia / 0.7, rtol=1e-6)
+
+
+def test_a_second_import_comes_from_the_cache_unless_something_changed(tmp_path, options, monkeypatch):
+    path = tmp_path / "block.stl"
+    block().export(path)
+    (first,) = import_paths([path], options)
+    monkeypatch.setattr(meshes, "_build", lambda *_: pytest.fail("built again"))
+    (second,) = import_paths([path], options)
+    assert digest(second) == digest(first)
+    monkeypatch.undo()
+    (denser,) = import_paths([path], ImportOptions(density=900.0, cache_dir=options.cache_dir))
+    assert denser.mass > first.mass
+    block(1.5 * SIDES).export(path)
+    (larger,) = import_paths([path], options)
+    np.testing.assert_allclose(np.ptp(larger.visual_vertices, axis=0), 1.5 * SIDES, rtol=1e-5)
+    for cached in (tmp_path / "cache").iterdir():
+        cached.write_bytes(b"damaged")
+    assert digest(import_paths([path], options)[0]) == digest(larger)
+
+
+@pytest.mark.parametrize("names", [("graspable", "non_graspable"), ("top_watertight_tiny", "bottom_watertight_tiny")])
+def test_part_files_become_the_parts(tmp_path, options, names):
+    folder = tmp_path / "tool"
+    folder.mkdir()
+    block((0.02, 0.02, 0.1), (0, 0, 0.05)).export(folder / f"{names[0]}.obj")
+    block((0.06, 0.02, 0.03), (0, 0, 0.115)).export(folder / f"{names[1]}.obj")
+    (obj,) = import_paths([folder], options)
+    assert (obj.name, obj.part_names) == ("tool", ("graspable", "non-graspable"))
+    assert obj.graspable.tolist() == [True, False]
+    top = 0.115 - 0.015 - (0.02 * 0.02 * 0.1 * 0.05 + 0.06 * 0.02 * 0.03 * 0.115) / (0.02**2 * 0.1 + 0.06 * 0.02 * 0.03)
+    clear = np.abs(obj.points[:, 2] - top) > 1e-4
+    np.testing.assert_array_equal(obj.non_graspable_points[clear], obj.points[clear, 2] > top)
+    assert [piece.part for piece in obj.pieces] == [0, 1]
+
+
+def test_a_stand_in_for_no_part_is_left_out(tmp_path, options):
+    folder = tmp_path / "ball"
+    folder.mkdir()
+    block().export(folder / "top.obj")
+    block((0.01,) * 3, (0.346408,) * 3).export(folder / "bottom.obj")
+    (obj,) = import_paths([folder], options)
+    assert obj.part_names == ("graspable",)
+    assert not obj.non_graspable_points.any()
+    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), SIDES, rtol=1e-5)
+
+
+def test_contact_pieces_are_used_as_they_are(tmp_path, options):
+    folder = tmp_path / "ell"
+    folder.mkdir()
+    first, second = block((0.08, 0.02, 0.02)), block((0.02, 0.02, 0.06), (0.03, 0, 0.04))
+    trimesh.util.concatenate([first, second]).export(folder / "ell.stl")
+    first.export(folder / "contact0.stl")
+    second.export(folder / "contact1.stl")
+    first.export(folder / "ell_handle.stl")
+    second.export(folder / "ell_blade.stl")
+    (obj,) = import_paths([folder], options)
+    assert obj.part_names == ("blade", "handle")
+    assert obj.graspable.tolist() == [False, True]
+    volumes = sorted(shapes.volume(piece) for piece in obj.pieces)
+    np.testing.assert_allclose(volumes, [24e-6, 32e-6], rtol=1e-4)
+    assert [piece.part for piece in sorted(obj.pieces, key=shapes.volume)] == [0, 1]
+    (folder / "ell.stl").unlink()
+    with pytest.raises(CongraspError, match="not clear which mesh shows the whole"):
+        import_paths([folder], options)
+    (folder / "ell_handle.stl").unlink()
+    (folder / "ell_blade.stl").unlink()
+    (bare,) = import_paths([folder], options)
+    np.testing.assert_allclose(bare.mass, obj.mass, rtol=1e-4)
+
+
+def test_folders_of_meshes_and_of_folders(tmp_path):
+    for name in ("b", "a"):
+        block().export(tmp_path / f"{name}.stl")
+    assert [source.name for source in find_sources(tmp_path)] == ["a", "b"]
+    outer = tmp_path / "outer"
+    for name in ("y", "x 1"):
+        (outer / name).mkdir(parents=True)
+        block().export(outer / name / f"{name}.stl")
+    assert [source.name for source in find_sources(outer)] == ["x_1", "y"]
+
+
+def test_an_open_mesh_counts_its_hull_and_says_so(tmp_path, options):
+    mesh = block()
+    mesh.update_faces(np.arange(12) > 1)
+    mesh.export(tmp_path / "open.stl")
+    quick = dataclasses.replace(options, time_limit=0.01)
+    obj, notes = import_source(find_sources(tmp_path / "open.stl")[0], quick)
+    assert any("surface is open" in note and "convex hull" in note for note in notes)
+    np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-4)
+
+
+def nan_obj(path):
+    path.write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
+
+
+def flat_obj(path):
+    path.write_text("v 0 0 0\nv .1 0 0\nv .1 .1 0\nv 0 .1 0\nv .05 .05 0\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n")
+
+
+def slanted_obj(path):
+    path.write_text("v 0 0 0\nv .1 0 .1\nv .1 .1 .1\nv 0 .1 0\nv .05 .05 .05\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n")
+
+
+BAD = {
+    "empty.stl": (lambda path: path.write_bytes(b""), "is empty"),
+    "text.stl": (lambda path: path.write_text("not a mesh"), "no triangles"),
+    "text.ply": (lambda path: path.write_text("not a mesh"), "cannot be read as PLY"),
+    "text.glb": (lambda path: path.write_text("not a mesh"), "cannot be read as GLB"),
+    "points.obj": (lambda path: path.write_text("v 0 0 0\nv 1 0 0\n"), "no triangles"),
+    "nan.obj": (nan_obj, "1 vertices that are not finite"),
+    "flat.obj": (flat_obj, "is flat: it is 0 mm thick"),
+    "slanted.obj": (slanted_obj, "points lie in a plane"),
+    "triangle.obj": (lambda path: path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "only 1 proper triangles"),
+    "packed.stl": (lambda path: path.write_bytes(b"PK\x03\x04rest"), "is a zip archive.*Unpack"),
+    "drawing.step": (lambda path: path.write_text("ISO"), "not an STL, OBJ, PLY or GLB"),
+    "folder": (lambda path: path.mkdir(), "holds no STL, OBJ, PLY or GLB"),
+    "missing.stl": (lambda path: None, "no file or folder"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_meshes_get_one_line_that_names_them(tmp_path, options, name):
+    make, expected = BAD[name]
+    make(tmp_path / name)
+    with pytest.raises(CongraspError, match=expected) as error:
+        import_paths([tmp_path / name], options)
+    assert name in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize("bad", [{"scale": 0.0}, {"density": -1.0}, {"mass": 0.0}, {"time_limit": float("nan")}])
+def test_bad_options_are_named(tmp_path, bad):
+    block().export(tmp_path / "block.stl")
+    with pytest.raises(CongraspError, match=f"--{next(iter(bad)).replace('_', '-')} is"):
+        import_paths([tmp_path / "block.stl"], ImportOptions(**bad))
+
+
+def ell():
+    """An L of two blocks, as one closed mesh."""
+    outline = np.array([[0, 0], [0.08, 0], [0.08, 0.02], [0.02, 0.02], [0.02, 0.08], [0, 0.08]])
+    caps = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
+    vertices = [[*xy, z] for z in (0.0, 0.02) for xy in outline]
+    faces = [face[::-1] for face in caps] + [[6 + i for i in face] for face in caps]
+    for i in range(6):
+        j = (i + 1) % 6
+        faces += [[i, j, 6 + j], [i, 6 + j, 6 + i]]
+    mesh = trimesh.Trimesh(vertices, faces)
+    assert mesh.is_volume
+    return mesh
+
+
+def test_coacd_cuts_an_ell_in_two():
+    mesh = ell()
+    result = decompose.decompose(mesh.vertices, mesh.faces, fill=mesh.volume, time_limit=60)
+    assert result.method == "coacd"
+    assert 2 <= len(result.pieces) <= 3
+    np.testing.assert_allclose(sum(shapes.hull_of(piece).volume for piece in result.pieces), mesh.volume, rtol=0.05)
+
+
+def test_vhacd_takes_over_when_coacd_runs_out_of_time_and_the_hull_when_both_do(monkeypatch):
+    mesh = ell()
+    result = decompose.decompose(mesh.vertices, mesh.faces, fill=mesh.volume, time_limit=0.01)
+    assert result.method == "vhacd"
+    assert result.notes == ["coacd took longer than 0.01 s"]
+    assert sum(shapes.hull_of(piece).volume for piece in result.pieces) < 1.2 * mesh.volume
+    monkeypatch.setattr(decompose, "_FALLBACK_LIMIT", 0.01)
+    result = decompose.decompose(mesh.vertices, mesh.faces, fill=mesh.volume, time_limit=0.01)
+    assert (result.method, len(result.pieces)) == ("hull", 1)
+    np.testing.assert_allclose(shapes.hull_of(result.pieces[0]).volume, 0.08**2 * 0.02 - 0.06**2 / 2 * 0.02, rtol=1e-6)
+    assert "hull" in result.notes[-1]
+
+
+def test_a_decomposer_that_dies_is_reported(monkeypatch):
+    mesh = ell()
+    pieces, failure = decompose._in_child("no such method", mesh.vertices, np.zeros((1, 3), int), 8, 20)
+    assert pieces == []
+    assert failure.startswith("f")
+
+
+def test_merging_joins_the_pieces_that_fit():
+    # Two pairs of touching blocks far apart: joining a pair adds nothing.
+    blocks = [block((0.01, 0.01, 0.01), (x, 0, 0)).vertices for x in (0, 0.01, 0.1, 0.11)]
+    merged = decompose.merge([np.asarray(b) for b in blocks], 2)
+    volumes = [shapes.hull_of(piece).volume for piece in merged]
+    np.testing.assert_allclose(volumes, 2e-6, rtol=1e-6)
+    assert decompose.merge(merged, 2) == merged
+
+
+def test_simplified_pieces_keep_shape_and_volume():
+    ball = np.random.default_rng(0).normal(size=(800, 3)) * [1, 1.5, 0.5]
+    ball = 0.03 * ball / np.linalg.norm(ball / [1, 1.5, 0.5], axis=-1, keepdims=True)
+    few, lost = decompose.simplify(ball)
+    assert len(few) <= MAX_MESH_VERTICES
+    assert 0.02 < lost < 0.25
+    np.testing.assert_allclose(shapes.hull_of(few).volume, shapes.hull_of(ball).volume, rtol=1e-9)
+    np.testing.assert_allclose(np.ptp(few, axis=0), np.ptp(ball, axis=0), rtol=0.12)
+    cube = np.array(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3)).reshape(3, -1).T
+    corners, lost = decompose.simplify(cube)
+    assert lost == 0
+    assert {tuple(abs(corner)) for corner in corners} == {(1.0, 1.0, 1.0)}
+
+
+def test_all_scanned_objects_import_and_rest(shared_objects, options):
+    objects = import_paths([shared_objects], options)
+    assert len(objects) == 24
+    assert {obj.name for obj in objects} == {path.name for path in shared_objects.iterdir() if path.is_dir()}
+    by_name = {obj.name: obj for obj in objects}
+    assert by_name["hammer"].part_names == ("head", "neck")
+    assert by_name["knife"].graspable.tolist() == [False, True]
+    for obj in objects:
+        assert len(obj.pieces) <= MAX_MESH_PIECES
+        assert all(len(piece.vertices) <= MAX_MESH_VERTICES for piece in obj.pieces)
+        assert 0.1 <= obj.non_graspable_points.mean() <= 0.9
+        settled = settle(obj, obj.rest_poses[0], 5.0)
+        assert settled.speed < 0.01, obj.name
+        assert settled.moved < 0.01, obj.name
+
+
+def test_a_copy_of_a_scanned_folder_needs_no_model_files(shared_objects, tmp_path, options):
+    folder = tmp_path / "apple"
+    folder.mkdir()
+    for file in (shared_objects / "apple").glob("*.stl"):
+        shutil.copy(file, folder)
+    assert import_paths([folder], options)[0].name == "apple"

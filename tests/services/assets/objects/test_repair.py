@@ -1,0 +1,196 @@
+"""Ten broken meshes: each is mended with a line that says so, or refused with a line that says what to do."""
+
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+import trimesh
+
+from common.errors import CongraspError
+from services.assets.objects import repair
+from services.assets.objects.meshes import ImportOptions, import_source
+from services.assets.objects.repair import closed, largest_body, reduced
+from services.assets.objects.sources import find_sources
+
+RADIUS = 0.03
+
+
+def ball(**options):
+    return trimesh.creation.icosphere(subdivisions=2, radius=RADIUS, **options)
+
+
+@pytest.fixture
+def brought(tmp_path):
+    """Imports a mesh, or bytes, from a file of a name; returns the object and what was said of it."""
+
+    def bring(content, name="thing.stl", **options):
+        path = tmp_path / name
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            content.export(path)
+        (source,) = find_sources(path)
+        return import_source(source, ImportOptions(unit="guess", cache_dir=str(tmp_path / "cache"), **options))
+
+    return bring
+
+
+def test_a_whole_mesh_is_left_alone(brought):
+    obj, notes = brought(ball())
+    assert not [note for note in notes if "32 vertices" not in note] and obj.notes == tuple(notes)
+
+
+def test_millimetres_for_metres(brought):
+    mesh = ball()
+    mesh.apply_scale(1000)
+    obj, notes = brought(mesh)
+    assert notes[0] == (
+        "it would be 60 m long in metres, so its numbers are taken as millimetres: 6 cm "
+        "(if that is wrong, add --unit or --scale)"
+    )
+    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), 2 * RADIUS, rtol=0.01)
+    mesh.apply_scale(0.1)  # 6 of what may be centimetres or inches
+    with pytest.raises(CongraspError, match=r"'--unit cm' \(6 cm\); if inches, add '--unit in' \(15.2 cm\)"):
+        brought(mesh, "unclear.stl")
+
+
+def test_inside_out(brought):
+    mesh = ball()
+    mesh.invert()
+    obj, notes = brought(mesh)
+    assert "it was inside out and was turned" in notes
+    assert (obj.normals * obj.points).sum(-1).min() > 0
+
+
+def test_some_triangles_inside_out(brought):
+    mesh = ball()
+    mesh.faces[::7] = np.asarray(mesh.faces)[::7, ::-1]
+    obj, notes = brought(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
+    assert "some of its triangles faced inwards and were turned" in notes
+    assert (obj.normals * obj.points).sum(-1).min() > 0
+
+
+def test_a_small_hole_is_closed_and_an_opening_is_left(brought):
+    mesh = ball()
+    mesh.update_faces(np.arange(len(mesh.faces)) > 1)  # two triangles that meet in one corner
+    obj, notes = brought(mesh)
+    assert "2 holes in its surface were closed" in notes
+    np.testing.assert_allclose(obj.mass, max(500 * ball().volume, 0.05), rtol=0.02)
+    half = ball()
+    half.update_faces(half.triangles_center[:, 2] < 0)
+    said: list[str] = []
+    assert len(closed(half, said).faces) == len(half.faces) and not said  # a bowl stays a bowl
+
+
+def test_empty(brought):
+    with pytest.raises(CongraspError, match=r"thing.stl is empty \(0 bytes\). Export or download it again."):
+        brought(b"")
+    with pytest.raises(CongraspError, match=r"points.obj has no triangles: it holds nothing that can be read as"):
+        brought(b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "points.obj")
+
+
+def test_planar(brought):
+    grid = trimesh.Trimesh([(0, 0, 0), (0.1, 0, 0), (0.1, 0.1, 0), (0, 0.1, 0), (0.05, 0.05, 0)],
+                           [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)])  # fmt: skip
+    with pytest.raises(CongraspError, match=r"thing.stl is flat: it is 0 mm thick. Give it a thickness in a modelling"):
+        brought(grid)
+
+
+def test_two_bodies(brought):
+    far = ball()
+    far.apply_scale(0.5)
+    far.apply_translation([0.2, 0, 0])
+    obj, notes = brought(trimesh.util.concatenate([far, ball()]))
+    assert notes[0].startswith("it holds 2 separate bodies; the largest was taken (80% of the surface)")
+    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), 2 * RADIUS, rtol=0.01)
+    touching = ball()
+    touching.apply_translation([2 * RADIUS, 0, 0])
+    said: list[str] = []
+    assert len(largest_body(trimesh.util.concatenate([touching, ball()]), said).faces) == 2 * len(ball().faces)
+    assert not said
+
+
+def test_millions_of_triangles(brought, monkeypatch):
+    monkeypatch.setattr(repair, "_REDUCED", 20_000)
+    monkeypatch.setattr(repair, "MAX_FACES", 2_000)
+    fine = trimesh.creation.icosphere(subdivisions=6, radius=RADIUS)
+    obj, notes = brought(fine)
+    assert notes[0] == "its 81,920 triangles were reduced to 2,000: a hand does not feel the rest"
+    assert len(obj.visual_faces) <= 2_000 and not [note for note in notes if "open" in note]
+    np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.02)
+    soup = fine.vertices[fine.faces].reshape(-1, 3)  # as STL files have it: no triangle shares a corner
+    vertices, faces = reduced(soup, np.arange(len(soup)).reshape(-1, 3), [])
+    assert trimesh.Trimesh(vertices, faces).is_watertight
+
+
+def test_points_that_are_no_numbers(brought):
+    mesh = ball()
+    mesh.vertices[3] = np.nan
+    obj, notes = brought(mesh, "thing.ply")
+    assert notes[0] == "1 of its points is not a number and was left out"
+    assert "1 hole in its surface was closed" in notes and np.isfinite(obj.visual_vertices).all()
+    mesh.vertices[:40] = np.nan
+    with pytest.raises(CongraspError, match=r"bad.ply has 40 vertices that are not finite numbers. Repair or export"):
+        brought(mesh, "bad.ply")
+
+
+def test_a_wrong_extension(brought):
+    for name in ("thing.obj", "thing.txt", "thing"):
+        _, notes = brought(ball().export(file_type="stl"), name)
+        assert notes[0] == "its content is STL, whatever its name says, and was read as that"
+    text = ball().export(file_type="stl_ascii")
+    assert "STL" in brought(text if isinstance(text, bytes) else text.encode(), "text.ply")[1][0]
+    assert "GLB" in brought(ball().export(file_type="glb"), "thing.stl")[1][0]
+    for start, complaint in (
+        (b"Kaydara FBX Binary  \x00", "is an FBX file. Open it in Blender and export it as GLB or OBJ."),
+        (b"<!DOCTYPE html><html>", "is a web page, not a mesh. Download the file itself again."),
+        (b"ISO-10303-21;\n", "is a STEP file (surfaces, no triangles). Open it in FreeCAD and export it as STL."),
+        (b"anything else", "is not an STL, OBJ, PLY or GLB file. Convert it to STL, OBJ, PLY or GLB."),
+    ):
+        with pytest.raises(CongraspError) as caught:
+            brought(start, "thing.xyz")
+        assert str(caught.value).endswith(f"thing.xyz {complaint}")
+
+
+def test_a_zip(brought, tmp_path):
+    with zipfile.ZipFile(tmp_path / "made.zip", "w") as archive:
+        archive.writestr("models/mug.obj", "v 0 0 0")
+        archive.writestr("licence.txt", "free")
+    data = (tmp_path / "made.zip").read_bytes()
+    for name in ("mug.zip", "mug.stl"):
+        with pytest.raises(CongraspError, match=rf"{name} is a zip archive with models/mug.obj in it. Unpack it and"):
+            brought(data, name)
+
+
+def test_what_was_mended_is_said_again_from_the_cache(brought):
+    mesh = ball()
+    mesh.invert()
+    assert brought(mesh)[1] == brought(mesh)[1] != []
+
+
+def test_a_binary_stl_may_begin_with_solid(brought):
+    data = ball().export(file_type="stl")
+    (count,) = struct.unpack("<I", data[80:84])
+    assert count == len(ball().faces)
+    obj, notes = brought(b"solid ".ljust(80) + data[80:])
+    assert obj.name == "thing" and not [note for note in notes if "content" in note]
+
+
+def test_a_body_that_cannot_be_turned_outwards_stays_as_it_is():
+    strip = trimesh.Trimesh(*_moebius())
+    said: list[str] = []
+    assert closed(strip, said).faces.shape == strip.faces.shape
+    assert not said
+
+
+def _moebius():
+    turns = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    rim = [(np.cos(t) * (1 + s * np.cos(t / 2)), np.sin(t) * (1 + s * np.cos(t / 2)), s * np.sin(t / 2))
+           for t in turns for s in (-0.2, 0.2)]  # fmt: skip
+    faces = []
+    for i in range(24):
+        a, b = 2 * i, 2 * i + 1
+        c, d = (2 * i + 2, 2 * i + 3) if i < 23 else (1, 0)
+        faces += [(a, b, c), (b, d, c)]
+    return rim, faces

@@ -1,0 +1,47 @@
+"""Failures are drawn, and their causes said, from what was simulated."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from common.objects.procedural import generate_many
+from common.wire.codec import Message
+from services.evaluate.evaluator import Evaluator
+from services.evaluate.failures import cause, failure_sheets
+from services.train.command import untrained
+from services.train.presets import get_preset
+
+
+def episode(heights, **metrics) -> Message:
+    """Two steps with the table, then one without for every further height."""
+    position = np.zeros((len(heights), 3))
+    position[:, 2] = heights
+    table = np.arange(len(heights)) < 2
+    known = {"bad": 0.0, "held": 0.0, "moved_at_removal": 0.01, "links_at_removal": 3.0}
+    return Message({"object_position": position, "table": table}, {"metrics": known | metrics, "control_dt": 0.01})
+
+
+@pytest.mark.parametrize(
+    ("metrics", "said"),
+    [
+        ({"held": 1.0}, "held"),
+        ({"bad": 1.0, "links_at_removal": 0.0}, "the physics diverged"),
+        ({"moved_at_removal": 0.06}, "pushed away before the table went"),
+        ({"links_at_removal": 0.0}, "not touched when the table went"),
+        ({}, "slipped 0.03 s after the table went"),
+    ],
+)
+def test_causes_in_words(metrics, said):
+    assert cause(episode([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics), 0.05) == said
+
+
+def test_failures_of_an_untrained_policy_are_drawn():
+    config = get_preset("quickstart")
+    policy = untrained(dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,))))
+    evaluator = Evaluator(policy, generate_many(2, 0, ("box",)), batch=4)
+    sample = evaluator.samples(["heading"], 3, keep=True)["heading"]
+    assert not sample.values["held"].any()
+    ((name, sheet, causes),) = failure_sheets(evaluator, policy, ["heading"], successes=2, failures=2)
+    assert name == "heading" and len(causes) == 2 and "held" not in causes
+    assert sheet.shape[0] > 2 * 225 and sheet.shape[1] > 5 * 300

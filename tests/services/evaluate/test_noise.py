@@ -1,0 +1,136 @@
+"""Noise of references: its size and its direction, and the rows of the table."""
+
+import contextlib
+from unittest import mock
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from actors.taskset import build_taskset
+from common.config import NetworkConfig, RunConfig, TaskConfig
+from common.hands import get_hand
+from common.hands.kinematics import grasp_frame
+from common.objects import procedural
+from services.evaluate.evaluator import Evaluator
+from services.evaluate.noise import LEVELS, Noise, disturbed
+from services.evaluate.noise_sheet import draw_curves
+from services.grasp import constraint_sets
+from services.train.command import untrained
+
+HAND = get_hand("human")
+OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
+
+
+@pytest.fixture(scope="module")
+def taskset():
+    return build_taskset(HAND, TaskConfig(), OBJECTS, 3)
+
+
+def test_joint_noise_has_its_size_and_stays_within_the_limits(taskset):
+    noisy = disturbed(HAND, taskset, Noise("pose", "joints", 0.1), 0)
+    q = np.asarray(taskset.pose_q)
+    away = (noisy.pose_q - q)[(q > HAND.lower + 0.4) & (q < HAND.upper - 0.4)]
+    assert 0.095 < away.std() < 0.105 and abs(away.mean()) < 0.005
+    assert np.all(noisy.pose_q >= HAND.lower) and np.all(noisy.pose_q <= HAND.upper)
+    np.testing.assert_array_equal(noisy.pose_position, taskset.pose_position)
+
+
+def test_poses_sink_along_the_heading(taskset):
+    noisy = disturbed(HAND, taskset, Noise("pose", "depth", 0.01), 0)
+    moved = np.asarray(noisy.pose_position) - np.asarray(taskset.pose_position)
+    w, *v = np.moveaxis(np.asarray(taskset.pose_quaternion, float), -1, 0)
+    axis = np.broadcast_to(grasp_frame(HAND).heading, moved.shape)
+    v = np.stack(v, -1)
+    heading = axis + 2 * np.cross(v, np.cross(v, axis) + w[..., None] * axis)
+    depth = (moved * heading).sum(-1)
+    assert depth.min() >= 0 and 0.0095 < depth.max() <= 0.01001
+    np.testing.assert_allclose(moved, depth[..., None] * heading, atol=1e-6)
+
+
+def test_jitter_moves_every_waypoint(taskset):
+    noisy = disturbed(HAND, taskset, Noise("trajectory", "jitter", 0.01), 0)
+    away = np.asarray(noisy.trajectory_position) - np.asarray(taskset.trajectory_position)
+    assert 0.0098 < away.std() < 0.0102 and np.all(np.abs(away).max((0, 1, 2, 4)) > 0)
+    np.testing.assert_array_equal(noisy.trajectory_quaternion, taskset.trajectory_quaternion)
+
+
+def test_the_same_references_are_disturbed_in_every_row(taskset, monkeypatch, tmp_path):
+    config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
+    evaluator = Evaluator(untrained(config), OBJECTS, taskset=taskset)
+    worker, told = mock.Mock(), []
+    monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
+
+    def gather(worker, names, episodes, progress):
+        progress(episodes)
+        return {names[0]: names[0]}
+
+    monkeypatch.setattr(evaluator, "_gather", gather)
+    monkeypatch.setattr(evaluator, "row", lambda constraint, sample, group: (constraint, sample, group))
+    rows = evaluator.rows_under_noise(told.append, 5)
+    assert rows == [(noise.constraint, noise.constraint, noise.label) for noise in LEVELS]
+    assert told == [5 * (i + 1) for i in range(len(LEVELS))]
+    given = [call.args[1] for call in worker.replace_objects.call_args_list]
+    for noise, seen in zip(LEVELS, given, strict=True):
+        expected = disturbed(HAND, taskset, noise, 0)
+        for name in ("pose_q", "pose_position", "trajectory_position"):
+            np.testing.assert_array_equal(getattr(seen, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("most", [20, 5])
+def test_references_are_renewed_until_their_places_are_filled_or_none_is_added(taskset, monkeypatch, most):
+    config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
+    flat = taskset._replace(has_affordance=np.array([[True], [False]]).repeat(taskset.rest.shape[1], 1))
+    evaluator = Evaluator(untrained(config), OBJECTS, taskset=flat)
+    worker, told = mock.Mock(taskset=flat), []
+
+    def forget():
+        worker.taskset = flat._replace(pose_valid=np.zeros_like(flat.pose_valid))
+
+    def renew():
+        valid = np.array(worker.taskset.pose_valid)
+        valid[:, :, 0, min(valid[0, 0].any(0).sum(), most - 1)] = True
+        worker.taskset = flat._replace(pose_valid=valid)
+
+    worker.forget_references.side_effect, worker.renew_references.side_effect = forget, renew
+    monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
+    made = evaluator.references(lambda *counts: told.append(counts))
+    # Two whole surfaces and one O+; 40 episodes for each of the three, 64 a batch, are two batches.
+    idle = [(15, 60)] * 2 if most < 20 else []
+    assert told == [(3 * (i + 1), 60) for i in range(most)] + idle
+    sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 0, made)
+    assert [int(one.arrays["pose/allowed"][0].any(0).sum()) for one in sets] == [most, most]
+    np.testing.assert_array_equal(sets[0].arrays["pose/q"], flat.pose_q[0])
+
+
+def test_curves_show_every_kind_of_noise(tmp_path):
+    errors = {"pose_rad": 0.1, "pose_m": 0.01, "traj_rad": 0.1, "traj_m": 0.01}
+    row = mock.Mock(success=0.9, success_low=0.8, success_high=0.95, errors=errors)
+    row.held_2s, row.held_2s_low, row.held_2s_high = 0.8, 0.7, 0.9
+    draw_curves([row] * len(LEVELS), tmp_path / "noise.png", "made up")
+    picture = np.asarray(Image.open(tmp_path / "noise.png").convert("RGB")).astype(int)
+    thirds = np.array_split(picture, 3, axis=1)
+    for part in thirds:  # the lines of success in each panel
+        red, _, blue = part.reshape(-1, 3).T
+        assert (blue - red > 100).sum() > 50
+
+
+def test_a_task_set_comes_back_from_its_files(taskset):
+    sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 3)
+    back = constraint_sets.taskset_of(sets)
+    for name in ("points", "minus", "heading_position", "pose_q", "trajectory_position", "pose_quaternion"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(taskset, name))
+    for n in range(len(OBJECTS)):
+        rests = len(sets[n].arrays["rest"])
+        np.testing.assert_array_equal(back.pose_valid[n, :, :rests], taskset.pose_valid[n, :, :rests])
+        for v, r in np.ndindex(2, rests):
+            if v == 0 or taskset.has_affordance[n, r]:
+                asked, found = taskset.heading_index[n, v, r], back.heading_index[n, v, r]
+                assert set(np.asarray(asked)) == set(np.asarray(found))
+                back_of = dict(zip(np.asarray(asked), np.asarray(taskset.heading_back[n, v, r]), strict=True))
+                np.testing.assert_allclose([back_of[i] for i in found], back.heading_back[n, v, r])
+        np.testing.assert_array_equal(back.has_affordance[n, :rests], taskset.has_affordance[n, :rests])
+    held = constraint_sets.taskset_of(sets, "held-out")
+    training = constraint_sets.taskset_of(sets, "training")
+    assert not np.any(held.pose_valid[:, 0, 0] & training.pose_valid[:, 0, 0])
+    assert 0 < held.pose_valid[:, 0].any(1).mean() < training.pose_valid[:, 0].any(1).mean()

@@ -1,0 +1,99 @@
+"""A report is one file that needs nothing beside it, and says where a policy is better or worse than the paper's."""
+
+import base64
+import dataclasses
+import html
+import html.parser
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from services.cli.report import curves_of
+from services.evaluate.report import Made, Picture, causes_in_words, write_report
+from services.evaluate.scores import PAPER, Row
+from services.record.channels import JsonChannels
+from services.record.writer import LogWriter
+from services.train.command import untrained
+from services.train.presets import get_preset
+from services.viz.sheets import save_png
+
+
+class Reader(html.parser.HTMLParser):
+    """Cells with their class, sources of pictures, and that every element is closed."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.cells, self.sources, self.links, self.open = [], [], [], []
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        if tag == "img":
+            self.sources.append(attributes["src"])
+        elif tag not in ("meta", "link", "br"):
+            self.open.append(tag)
+        self.links += [attributes[name] for name in ("href", "action") if name in attributes]
+        if tag == "td":
+            self.cells.append([attributes.get("class", ""), ""])
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] == "td":
+            self.cells[-1][1] += data
+
+
+def row(constraint, success, low, high):
+    errors = {"heading_rad": 0.07, "heading_m": 0.013}
+    forces = {f"{name}_{of}": 1.0 for name in ("link_force", "force_sum", "torque_share") for of in ("mean", "p95")}
+    paper = PAPER["human"][constraint]
+    return Row(constraint, "human", "ours", "", 100, 8, success, low, high, None, None, None, errors, forces,
+               0.0, 5.0, 0.0, paper)  # fmt: skip
+
+
+@pytest.fixture
+def policy():
+    config = get_preset("quickstart")
+    return untrained(dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,))))
+
+
+def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
+    save_png(tmp_path / "p.png", np.full((6, 8, 3), 200, np.uint8))
+    png = (tmp_path / "p.png").read_bytes()
+    rows = [row("heading", 0.99, 0.975, 0.995), row("pose", 0.9, 0.85, 0.95), row("trajectory", 0.96, 0.93, 0.98)]
+    out = tmp_path / "report.html"
+    made = Made("congrasp evaluate --policy <mine>", "", "congrasp plot x")
+    sheets = [Picture("heading", png, "2 held, 1 slipped <b>")]
+    write_report(out, policy, "p & q.safetensors", rows, "100 episodes", sheets, [Picture("Learning", png)], made)
+    found = Reader(text := out.read_text())
+    cells = {content: kind for kind, content in found.cells}
+    # The paper has 96.9, 96.4 and 95.5 %: above it, below it, and within the interval.
+    assert cells["99.0 % (97.5-99.5)"] == "better" and cells["90.0 % (85.0-95.0)"] == "worse"
+    assert cells["96.0 % (93.0-98.0)"] == ""
+    assert cells["96.9 %"] == "paper" and "0.137 rad 0.020 m" in cells and "p & q.safetensors" in cells
+    assert "300 episodes in simulation. Success is at or above the paper's in 2 of the 3 rows" in html.unescape(text)
+    assert "slipped &lt;b&gt;" in text and "--policy &lt;mine&gt;" in text
+    assert len(found.sources) == 2 and not found.links
+    for source in found.sources:
+        kind, content = source.split(",")
+        assert kind == "data:image/png;base64"
+        assert Image.open(io.BytesIO(base64.b64decode(content))).size == (8, 6)
+
+
+def test_a_runs_curves_are_pictures(tmp_path):
+    assert list(curves_of(tmp_path)) == []
+    writer, channels = LogWriter(tmp_path / "logs", "log"), JsonChannels()
+    for update in range(3):
+        values = {"update": update, "values": {"episode": {"success": 0.5}}}
+        writer.write(channels.entry("/metrics/learner/0", update, values))
+    writer.close()
+    (learning,) = curves_of(tmp_path)
+    assert learning.title == "Learning" and Image.open(io.BytesIO(learning.png)).width > 300
+
+
+def test_causes_are_counted():
+    assert causes_in_words(["held", "slipped", "held"]) == "2 held, 1 slipped"

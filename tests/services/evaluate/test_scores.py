@@ -1,0 +1,134 @@
+"""Rows of an evaluation, against numbers worked out by hand."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from common.task.types import MASKS
+from services.evaluate.scores import (
+    PROBED_EPISODES,
+    TABLES,
+    Sample,
+    active_mask,
+    joined,
+    matching,
+    object_groups,
+    summarise,
+    tables_of,
+    wilson,
+    write_json,
+)
+
+REQUIRED = (
+    *("constraint", "hand", "method", "episodes", "success", "heading_rad", "heading_m", "pose_rad", "pose_m"),
+    *("traj_rad", "traj_m", "affordance_ratio"),
+)
+
+
+def _sample(success, held, **columns) -> Sample:
+    count = len(success)
+    names = ("return", "links_at_removal", "bad", "object_index", "heading_rad", "heading_m", "pose_rad", "pose_m")
+    names += ("trajectory_rad", "trajectory_m", "affordance_ratio", *(f"mask_{name}" for name in MASKS))
+    values = {name: np.zeros(count, np.float32) for name in names}
+    values |= {"success": np.array(success, np.float32), "held": np.array(held, np.float32)}
+    values |= {name: np.array(column, np.float32) for name, column in columns.items()}
+    return Sample(values, np.zeros((count, 1, 2), np.float16), np.zeros((count, 1, 3), np.float16))
+
+
+def test_wilson_interval():
+    # n = 10, p = 0.8, z = 1.96: centre (0.8 + 0.19207) / 1.38415, half width 1.96 sqrt(0.016 + 0.0096036) / 1.38415.
+    assert wilson(8, 10) == pytest.approx((0.49016, 0.94332), abs=1e-5)
+    # No success: 0 to z^2 / (n + z^2).
+    assert wilson(0, 10) == pytest.approx((0.0, 3.84146 / 13.84146), abs=1e-5)
+    low, high = wilson(1000, 1000)
+    assert high == pytest.approx(1.0) and low == pytest.approx(1000 / 1003.84146, abs=1e-6)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("constraint", "mask"),  # affordance, fingers of the pose, wrist of the pose, trajectory
+    [
+        ("heading", (0, 0, 0, 0)),
+        ("pose", (0, 1, 1, 0)),
+        ("trajectory", (0, 0, 0, 1)),
+        ("affordance", (1, 0, 0, 0)),
+        ("pose+trajectory", (0, 1, 0, 1)),
+        ("trajectory+affordance", (1, 0, 0, 1)),
+    ],
+)
+def test_only_episodes_with_exactly_the_rows_constraints_count(constraint, mask):
+    assert active_mask(constraint) == tuple(map(bool, mask))
+    every = np.array([[(i >> bit) & 1 for bit in range(4)] for i in range(16)])
+    values = {f"mask_{name}": every[:, i].astype(np.float32) for i, name in enumerate(MASKS)}
+    (found,) = np.flatnonzero(matching(values, constraint))
+    np.testing.assert_array_equal(every[found], mask)
+
+
+def test_a_row_averages_over_successful_episodes():
+    sample = _sample(
+        [1, 1, 0, 1],
+        [1, 0, 0, 1],
+        pose_rad=[0.1, 0.3, 9.0, 0.2],
+        pose_m=[0.01, 0.03, 9.0, 0.02],
+        trajectory_rad=[0.4, 0.5, 9.0, 0.6],
+        heading_rad=[7.0, 7.0, 7.0, 7.0],
+        object_index=[3, 3, 5, 4],
+        bad=[0, 0, 1, 0],
+    )
+    sample.link_force[:, 0] = [[2, 0], [4, 6], [100, 100], [0, 0]]
+    sample.torque[:, 0] = [[0.5, 0.5, 0.5], [0.0, 0.0, 1.0], [1, 1, 1], [0.0, 0.0, 0.5]]
+    row = summarise("pose+trajectory", "human", sample, held_2s=True)
+    assert (row.episodes, row.objects, row.success, row.held_2s, row.diverged) == (4, 3, 0.75, 0.5, 0.25)
+    assert (row.success_low, row.success_high) == wilson(3, 4) and (row.held_2s_low, row.held_2s_high) == wilson(2, 4)
+    assert row.errors["pose_rad"] == pytest.approx(0.2) and row.errors["pose_m"] == pytest.approx(0.02)
+    assert row.errors["traj_rad"] == pytest.approx(0.5)
+    assert row.errors["heading_rad"] is None and row.errors["affordance_ratio"] is None
+    assert row.forces["link_force_mean"] == pytest.approx(4.0)  # of the links that touch: 2, 4, 6
+    assert row.forces["link_force_p95"] == pytest.approx(5.8)
+    assert row.forces["force_sum_mean"] == pytest.approx(4.0)  # 2, 10, 0
+    assert row.forces["torque_share_mean"] == pytest.approx(3.0 / 9)
+    assert row.paper is not None and row.paper.success == 0.865
+
+
+def test_a_row_without_success_has_no_errors_and_short_episodes_no_hold():
+    row = summarise("heading", "human", _sample([0, 0], [0, 0]), held_2s=False)
+    assert row.success == 0 and row.held_2s is None and row.held_2s_low is None
+    assert set(row.errors.values()) == {None} and set(row.forces.values()) == {None}
+
+
+def test_joined_samples_keep_forces_beside_their_episodes():
+    parts = [_sample([1] * 3, [1] * 3).first(2), _sample([1] * (PROBED_EPISODES + 5), [1] * (PROBED_EPISODES + 5))]
+    parts[0].link_force[:] = 1.0
+    whole = joined(parts)
+    assert len(whole.values["success"]) == PROBED_EPISODES + 7 and len(whole.link_force) == PROBED_EPISODES
+    assert whole.link_force[:2].min() == 1.0 and whole.link_force[2:].max() == 0.0
+    # What follows a sample without all its forces must not move up to another episode's place.
+    late = joined([whole, parts[0]])
+    assert len(late.values["success"]) == PROBED_EPISODES + 9 and len(late.link_force) == PROBED_EPISODES
+    odd = late.where(np.arange(PROBED_EPISODES + 9) % 2 == 1)
+    assert len(odd.link_force) == PROBED_EPISODES // 2 and odd.link_force[0].min() == 1.0
+
+
+def test_objects_are_grouped_by_thirds_and_family():
+    sizes, masses = np.array([0.03, 0.09, 0.06, 0.12, 0.15, 0.18]), np.array([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
+    groups = dict(object_groups(sizes, masses, np.array(["mug", "ball", "mug", "mug", "ball", "ball"])))
+    by_word = {label.split(" (")[0]: set(np.flatnonzero(members).tolist()) for label, members in groups.items()}
+    assert by_word["small"] == {0, 2} and by_word["medium"] == {1, 3} and by_word["large"] == {4, 5}
+    assert by_word["light"] == {4, 5} and by_word["heavy"] == {0, 1}
+    assert by_word["family mug"] == {0, 2, 3} and by_word["family ball"] == {1, 4, 5}
+
+
+def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
+    rows = [
+        summarise(name, "human", _sample([1, 0], [1, 0]), held_2s=True) for names in TABLES.values() for name in names
+    ]
+    rows.append(dataclasses.replace(rows[0], group="small (up to 8 cm)", paper=None))
+    write_json(rows, tmp_path / "new" / "rows.json", {"seed": 0})
+    read = json.loads((tmp_path / "new" / "rows.json").read_text())
+    assert read["seed"] == 0 and len(read["rows"]) == 7
+    for row in read["rows"]:
+        assert set(REQUIRED) <= set(row) and row["method"] == "ours"
+    assert read["rows"][0]["pose_rad"] is None and read["rows"][0]["heading_rad"] == 0.0
+    assert all(table.row_count == 7 for table in tables_of(rows, "title"))

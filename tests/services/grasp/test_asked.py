@@ -1,0 +1,131 @@
+"""Constraints as people write them down."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from common.errors import CongraspError
+from common.hands import get_hand
+from services.assets.objects.meshes import ImportOptions, import_paths
+from services.export.motion_file import motion_of_episode, save_motion
+from services.grasp.asked import read_asked
+from tests.episodes import HEIGHT, episode
+
+HAND = get_hand("human")
+CENTER = np.array([0.1, -0.2, 0.3])
+SIDES = (0.04, 0.05, 0.12)
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mesh")
+    mesh = trimesh.creation.box(SIDES)
+    mesh.apply_translation(CENTER)
+    mesh.apply_scale(1000)
+    mesh.export(folder / "block.stl")
+    return import_paths([folder / "block.stl"], ImportOptions(unit="mm", cache_dir=str(folder / "cache")))[0]
+
+
+def asked(obj, **constraints):
+    return read_asked(obj, HAND, 15, **constraints)
+
+
+def test_an_object_remembers_where_its_file_has_its_origin(block):
+    np.testing.assert_allclose(block.origin, -CENTER, atol=1e-6)
+    assert block.file_scale == 0.001
+
+
+def test_headings_are_numbers_or_a_word(block):
+    given = asked(block, heading="0 0 -2", at="0.1, -0.2, 0.34")
+    np.testing.assert_allclose(given.direction, [0, 0, -1])
+    np.testing.assert_allclose(given.position, [0, 0, 0.04], atol=1e-6)
+    assert asked(block, heading="above").above and asked(block, heading="above").direction is None
+    with pytest.raises(CongraspError, match=r"--at lies 39.* m from 'block'"):
+        asked(block, at="0 0 40")
+    for text, complaint in (("down", "'down', not 3 numbers"), ("1 2", "'1 2', not 3"), ("0 0 0", "has no direction")):
+        with pytest.raises(CongraspError, match=complaint):
+            asked(block, heading=text)
+
+
+def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
+    upper = trimesh.creation.box((0.04, 0.05, 0.05))
+    upper.apply_translation(CENTER + np.array([0, 0, 0.035]))
+    upper.apply_scale(1000)
+    upper.export(tmp_path / "upper.ply")
+    high = block.points[:, 2] > 0.01
+    clear = np.abs(block.points[:, 2] - 0.01) > 0.005
+    np.testing.assert_array_equal(asked(block, affordance=str(tmp_path / "upper.ply")).minus[clear], ~high[clear])
+    np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "upper.ply")).minus[clear], high[clear])
+    trimesh.PointCloud(np.asarray(upper.sample(4000))).export(tmp_path / "cloud.ply")
+    np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "cloud.ply")).minus[clear], high[clear])
+    np.testing.assert_array_equal(asked(block, affordance="near half").minus, block.labels == 1)
+    with pytest.raises(CongraspError, match=r"has no part 'handle'\. Its parts are: near half, far half"):
+        asked(block, affordance="handle")
+    with pytest.raises(CongraspError, match=r"there is no file .*none\.ply"):
+        asked(block, affordance=str(tmp_path / "none.ply"))
+    trimesh.creation.box(SIDES).export(tmp_path / "metres.ply")
+    with pytest.raises(CongraspError, match=r"Nothing of .*metres\.ply' lies on the surface of 'block'"):
+        asked(block, affordance=str(tmp_path / "metres.ply"))
+
+
+def test_references_come_from_motions_json_and_csv(block, tmp_path):
+    motion = motion_of_episode(episode())
+    save_motion(tmp_path / "grasp.npz", motion)
+    given = asked(block, pose=str(tmp_path / "grasp.npz"), trajectory=str(tmp_path / "grasp.npz"))
+    last = 7  # the last moment with the table
+    np.testing.assert_array_equal(given.pose.q, motion.joint_position[last])
+    np.testing.assert_allclose(given.pose.position, motion.wrist_position[last] - [0, 0, HEIGHT / 2], atol=1e-6)
+    path, turns = given.trajectory
+    assert path.shape == (15, 3) and turns.shape == (15, 4)
+    np.testing.assert_allclose(path[[0, -1]], motion.wrist_position[[0, last]] - [0, 0, HEIGHT / 2], atol=1e-6)
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=-1)
+    np.testing.assert_allclose(steps, steps[0], rtol=1e-4)
+
+    wrist = {"position": [0.1, -0.2, 0.5], "quaternion": [2, 0, 0, 0]}
+    (tmp_path / "pose.json").write_text(json.dumps({**wrist, "joints": {HAND.joints[3].name: 0.3}}))
+    pose = asked(block, pose=str(tmp_path / "pose.json")).pose
+    np.testing.assert_allclose(pose.position, [0, 0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(pose.quaternion, [1, 0, 0, 0])
+    assert pose.q[3] == pytest.approx(0.3) and not pose.q[:3].any()
+
+    (tmp_path / "path.csv").write_text("x,y,z,w,x,y,z\n0.1,-0.2,0.7,1,0,0,0\n0.1,-0.2,0.5,-1,0,0,0\n")
+    path, turns = asked(block, trajectory=str(tmp_path / "path.csv")).trajectory
+    np.testing.assert_allclose(path[:, 2], np.linspace(0.4, 0.2, 15), atol=1e-6)
+    np.testing.assert_allclose(np.abs(turns[:, 0]), 1)
+    assert (turns[:, 0] > 0).all() or (turns[:, 0] < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("nothing", "is not JSON"),
+        ("{}", "lacks 'joints'"),
+        ('{"joints": {"elbow": 1}, "position": [0,0,0], "quaternion": [1,0,0,0]}', "has no joint 'elbow'"),
+        ('{"joints": {}, "position": [0,0], "quaternion": [1,0,0,0]}', "'position' of .* must be 3 finite"),
+        ('{"joints": {}, "position": [0,0,500], "quaternion": [1,0,0,0]}', "the wrist of .* lies 5.* m from 'block'"),
+        ('{"joints": {"index_pip": 45}, "position": [0,0,0], "quaternion": [1,0,0,0]}', "is at 45. Angles are in rad"),
+        ('{"joints": {}, "position": [0,0,0], "quaternion": [0,0,0,0]}', "quaternion has no direction"),
+    ],
+)
+def test_what_is_wrong_with_a_pose_is_said(block, tmp_path, text, complaint):
+    path = tmp_path / "pose.json"
+    path.write_text(text)
+    with pytest.raises(CongraspError, match=complaint):
+        asked(block, pose=str(path))
+
+
+def test_what_is_wrong_with_a_trajectory_is_said(block, tmp_path):
+    path = tmp_path / "path.csv"
+    path.write_text("0,0,0,1,0,0,0\n0,0,0,1,0,0,0\n")
+    with pytest.raises(CongraspError, match="wrist does not move"):
+        asked(block, trajectory=str(path))
+    path.write_text("0,0,300,1,0,0,0\n0,0,200,1,0,0,0\n")
+    with pytest.raises(CongraspError, match=r"the end of .* lies 2.* m from 'block'. Give metres"):
+        asked(block, trajectory=str(path))
+    path.write_text("0,0,0\n0,0,1\n")
+    with pytest.raises(CongraspError, match="must be 2 x 7 finite numbers"):
+        asked(block, trajectory=str(path))
+    with pytest.raises(CongraspError, match="cannot be read"):
+        asked(block, trajectory=str(tmp_path / "none.csv"))

@@ -1,0 +1,121 @@
+"""Constraint sets: what the files hold, and the two commands."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from actors.taskset import build_taskset
+from common.config import TaskConfig
+from common.constraints.headings import Headings, clear_table, feasible
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects import procedural, store
+from common.wire.codec import Message
+from services.cli.main import load
+from services.grasp import constraint_sets
+from services.grasp.asked import read_asked
+
+HAND = get_hand("human")
+OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
+
+
+@pytest.fixture(scope="module")
+def sets():
+    return constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 3)
+
+
+@pytest.fixture(scope="module")
+def file(sets, tmp_path_factory):
+    return constraint_sets.save(sets[0], tmp_path_factory.mktemp("sets"))
+
+
+def test_every_array_is_explained_and_has_the_shape_that_is_written_down(sets):
+    for constraints in sets:
+        arrays, meta = constraints.arrays, constraints.meta
+        assert set(arrays) == set(meta["arrays"])
+        sizes: dict[str, int] = {"V": 2, "F": len(meta["finger_joints"]), "H": 256, "M": 20}
+        for name, words in meta["arrays"].items():
+            letters = words[1 : words.index(")")].replace(",", " ").split()
+            assert len(letters) == arrays[name].ndim, name
+            for letter, size in zip(letters, arrays[name].shape, strict=True):
+                assert size == (int(letter) if letter.isdigit() else sizes.setdefault(letter, size)), name
+        assert get_hand(meta["hand_reference"]) is HAND
+        assert meta["finger_joints"][0] == HAND.joints[0].name and meta["quaternions"] == "(w, x, y, z)"
+
+
+def test_a_set_is_what_training_draws_from(sets):
+    taskset = build_taskset(HAND, TaskConfig(), OBJECTS, 3)
+    for n, constraints in enumerate(sets):
+        arrays = constraints.arrays
+        np.testing.assert_array_equal(arrays["heading/position"], taskset.heading_position[n])
+        np.testing.assert_array_equal(arrays["pose/q"], taskset.pose_q[n])
+        rest = arrays["rest"]
+        assert len(np.unique(rest, axis=0)) == len(rest) <= taskset.rest.shape[1]
+        for r, pose in enumerate(rest):
+            headings = Headings(*(arrays[f"heading/{name}"][0] for name in Headings._fields))
+            cleared = clear_table(headings, pose)
+            np.testing.assert_array_equal(arrays["heading/allowed"][0, r], feasible(cleared, pose, back_off=0.15))
+            moved = np.linalg.norm(cleared.position - headings.position, axis=-1)
+            allowed = arrays["heading/allowed"][0, r]
+            np.testing.assert_allclose(arrays["heading/back"][0, r][allowed], moved[allowed], atol=1e-6)
+        np.testing.assert_allclose(arrays["trajectory/position"][:, :, -1], arrays["pose/position"], atol=1e-4)
+
+
+def test_files_come_back_whole_and_others_are_refused(sets, file, tmp_path):
+    read = constraint_sets.load(file)
+    assert file.name == "mug_7.constraints.safetensors" and dict(read.meta) == dict(sets[0].meta)
+    for name, array in sets[0].arrays.items():
+        np.testing.assert_array_equal(read.arrays[name], array)
+    store.save(OBJECTS[0], tmp_path / "object.safetensors")
+    with pytest.raises(CongraspError, match="not a constraint set"):
+        constraint_sets.load(tmp_path / "object.safetensors")
+    (tmp_path / "text").write_text("not a set")
+    with pytest.raises(CongraspError, match="cannot be read as a constraint set"):
+        constraint_sets.load(tmp_path / "text")
+    with pytest.raises(CongraspError, match="cannot be read"):
+        constraint_sets.load(tmp_path / "absent")
+
+
+def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("services.viz.constraint_sheet._SIZE", (48, 36))
+    picture = tmp_path / "sheet.png"
+    assert load("constraints")(["show", str(file), "--png", str(picture)])() == 0
+    words = capsys.readouterr().out
+    assert "human, 20 finger joints" in words and "mug_7" in words and "resting pose 1" in words
+    colours = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3).astype(int)
+    red, _, blue = colours.T
+    assert (blue - red > 60).sum() > 20  # arrows
+    assert (red - blue > 100).sum() > 100  # the object
+    with pytest.raises(CongraspError, match="--rest is 99"):
+        load("constraints")(["show", str(file), "--rest", "99"])()
+
+
+def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        constraint_sets,
+        "make_sets",
+        lambda hand, task, objects, seed, taskset: made.extend(obj.name for obj in objects) or [],
+    )
+    store.Catalogue(tmp_path / "objects").add(OBJECTS[1])
+    folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]
+    file = tmp_path / "objects" / "box_0.safetensors"
+    arguments = ["box_0", "mug:7", str(file), "--count", "1", "--families", "ball"]
+    assert load("constraints")(["generate", *arguments, *folder])() == 0
+    assert made == ["box_0", "mug_7", "box_0", "ball_0"]
+    with pytest.raises(CongraspError, match="no object to make constraints for"):
+        load("constraints")(["generate"])()
+    with pytest.raises(CongraspError, match="no object 'nothing'"):
+        load("constraints")(["generate", "nothing", *folder])()
+
+
+def test_a_reference_is_refused_for_another_object_or_size(sets, file, tmp_path):
+    mug, box = OBJECTS
+    pose = read_asked(mug, HAND, 15, pose=f"{file}:3").pose
+    np.testing.assert_array_equal(pose.q, sets[0].arrays["pose/q"][0, 3])
+    with pytest.raises(CongraspError, match=r"is for an object of .* cm, .*; 'box_0' has .*Name the set of this"):
+        read_asked(box, HAND, 15, trajectory=str(file))
+    larger = Message(sets[0].arrays, {**sets[0].meta, "object_scale": 1.4})
+    file = constraint_sets.save(larger, tmp_path)
+    with pytest.raises(CongraspError, match=r"1\.4 times as large, as the human hand is trained: add --scale 1\.4"):
+        read_asked(mug.scaled(1 / 1.4), HAND, 15, pose=str(file))

@@ -1,0 +1,179 @@
+"""Grasps of one's own objects: a real one by the shipped policy, and the command around made-up ones."""
+
+import dataclasses
+import json
+import pathlib
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from common.errors import CongraspError
+from common.policy import bundle as bundles
+from common.policy.pretrained import policy_file
+from common.rotations import rotate
+from services.assets.objects.meshes import ImportOptions
+from services.assets.objects.named import one_object
+from services.cli.main import load
+from services.export.motion_file import load_motion, motion_of_episode
+from services.grasp.asked import Asked, Reference, read_asked
+from services.grasp.files import MOTION, OBJECT, PICTURE, RECORDING, RESULT, save_grasp
+from services.grasp.grasper import Grasp, Grasper
+from services.record.reader import read_episodes
+from tests.episodes import episode
+
+SIDES = (0.05, 0.06, 0.14)
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mesh")
+    trimesh.creation.box(SIDES).export(folder / "block.stl")
+    return one_object(folder / "block.stl", ImportOptions(cache_dir=str(folder)))
+
+
+@pytest.fixture(scope="module")
+def grasper():
+    grasper = Grasper(bundles.load(policy_file(None)), tries=4, seconds=0.25, threads=2)
+    yield grasper
+    grasper.close()
+
+
+def test_the_shipped_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
+    told = []
+    minus = block.points[:, 2] < 0
+    asked = Asked(direction=np.array([0.0, 0.0, -1.0]), minus=minus)
+    found = grasper.grasp(block, asked, lambda what, done, total: told.append((what, done, total)))
+    assert told[0][0].startswith("Compiling") and told[1] == ("Trying", 1, 75) and told[-1][1:] == (75, 75)
+    assert 1 <= found.held <= found.tries <= 12 and found.success
+    motion = found.motion
+    assert motion.constraints == ("heading", "affordance") and motion.about["tries"] == found.tries
+    assert len(motion.time) == 75 and motion.table.sum() == 49  # the table goes with the fiftieth step
+    np.testing.assert_allclose(motion.heading_direction, [0, 0, -1], atol=1e-6)
+    np.testing.assert_array_equal(motion.surface_minus, minus[:256])
+    # The hand came along the block's own z axis: from its start to its end the wrist moved mostly that way.
+    way = motion.wrist_position[48] - motion.wrist_position[0]
+    axis = np.asarray(rotate(motion.object_quaternion[0], np.array([0.0, 0.0, -1.0])))
+    assert way @ axis > 0.8 * np.linalg.norm(way) > 0.05
+    # What it holds stays where it is although nothing is below it.
+    assert abs(motion.object_position[-1, 2] - motion.object_position[49, 2]) < 0.05
+    facts = found.facts()
+    assert facts["heading_rad"] < 0.5 and {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
+
+    again = grasper.grasp(block, asked).motion
+    np.testing.assert_array_equal(again.joint_position, motion.joint_position)
+
+
+def test_what_cannot_be_is_said_before_anything_is_simulated(block, grasper):
+    lying = dataclasses.replace(block, rest_poses=block.rest_poses[:1])
+    down = -np.asarray(rotate(block.rest_poses[0][3:] * [1, -1, -1, -1], np.array([0.0, 0.0, 1.0])))
+    words = " ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)
+    with pytest.raises(CongraspError, match=f'come through the table.* straight down is --heading "{words}"'):
+        grasper.grasp(lying, Asked(direction=-down))
+    below = Reference(grasper.hand.q_open, down, np.array([1.0, 0, 0, 0]))
+    with pytest.raises(CongraspError, match="would be in the table in every resting pose of 'block'"):
+        grasper.grasp(lying, Asked(pose=below))
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """The command with grasps that are made up; the list of objects that were grasped."""
+    calls = []
+
+    def grasp(self, obj, asked=None, progress=lambda what, done, total: None):
+        calls.append(obj.name)
+        made = episode(success=obj.name != "loose")
+        made.meta.update(object=obj.name)
+        made.meta["metrics"] |= dict.fromkeys(
+            ("heading_rad", "heading_m", "pose_rad", "pose_m", "trajectory_rad", "trajectory_m"), 0.01
+        )
+        made.meta["metrics"] |= {"affordance_ratio": 0.0, "moved_at_removal": 0.0, "force_link_max": 3.0}
+        made.meta["metrics"]["held"] = float(made.meta["success"])
+        return Grasp(made, motion_of_episode(made), 4, 3, 0, ("The heading guides the wrist.",))
+
+    monkeypatch.setattr(Grasper, "grasp", grasp)
+    return calls
+
+
+def command(*arguments) -> int:
+    return load("grasp")([*map(str, arguments), "--no-pictures"])()
+
+
+def meshes(folder: pathlib.Path, *names: str) -> pathlib.Path:
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        trimesh.creation.box(SIDES).export(folder / f"{name}.stl")
+    return folder
+
+
+def test_a_folder_is_grasped_once_and_bad_meshes_do_not_stop_it(tmp_path, capsys, monkeypatch, made_up):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder, out = meshes(tmp_path / "things", "a", "b"), tmp_path / "out"
+    (folder / "bad.obj").write_text("no mesh")
+    assert command(folder, "--out", out) == 2
+    captured = capsys.readouterr()
+    assert made_up == ["a", "b"]
+    assert "bad.obj" in captured.err and captured.err.count("congrasp: error:") == 1
+    line = next(line for line in captured.out.splitlines() if line.startswith("a:"))
+    assert "5.0 x 6.0 x 14.0 cm, about as long as a phone; held; best of 4 tries, 3 of which hold it" in line
+    assert "2 of 3 objects are held; 1 could not be used" in captured.out
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["objects"], summary["succeeded"]) == (3, 2)
+    assert load_motion(out / "a" / MOTION).object == "a"
+    assert next(read_episodes(out / "a" / RECORDING)).meta["object"] == "a"
+    assert sorted(path.name for path in (out / "a").iterdir()) == [RECORDING, MOTION, RESULT]
+
+    (folder / "bad.obj").unlink()
+    meshes(folder, "c")
+    (out / "b" / RESULT).unlink()  # as if it had been interrupted while b was written
+    assert command(folder, "--out", out) == 0
+    assert made_up == ["a", "b", "b", "c"] and "a (done before)" in capsys.readouterr().out
+    assert command(folder, "--out", out, "--heading", "above") == 0  # something else is asked for
+    assert command(folder, "--out", out, "--heading", "above") == 0
+    assert made_up[4:] == ["a", "b", "c"]
+    trimesh.creation.box((0.05, 0.05, 0.05)).export(folder / "c.stl")  # another mesh under its name
+    assert command(folder, "--out", out, "--heading", "above") == 0
+    assert made_up[7:] == ["c"]
+    assert command(folder, "--out", out, "--heading", "above", "--again") == 0
+    assert made_up[8:] == ["a", "b", "c"]
+
+
+def test_what_is_not_held_is_told_by_the_exit_code(tmp_path, capsys, monkeypatch, made_up):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = meshes(tmp_path / "things", "loose")
+    assert command(folder / "loose.stl", "--out", tmp_path / "out") == 1
+    assert "not held" in capsys.readouterr().out
+    assert command(tmp_path / "nothing.stl", "--out", tmp_path / "out") == 2
+    assert "There is no file or folder" in capsys.readouterr().err
+    assert command(folder / "loose.stl", "--out", tmp_path / "out", "--heading", "up there", "--again") == 2
+    assert "--heading is 'up there', not 3 numbers" in capsys.readouterr().err
+
+
+def test_pictures_show_the_import_beside_a_hand_and_the_grasp(tmp_path, monkeypatch, made_up):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    path = meshes(tmp_path / "things", "a") / "a.stl"
+    assert load("grasp")([str(path), "--out", str(tmp_path / "out")])() == 0
+    for name, columns in ((OBJECT, 3), (PICTURE, 4)):
+        image = np.asarray(Image.open(tmp_path / "out" / "a" / name).convert("RGB")).astype(int)
+        orange = (image[..., 0] - image[..., 2] > 80) & (image[..., 1] > 60)
+        skin = (np.ptp(image, axis=-1) < 45) & (image[..., 2] > image[..., 0] + 8) & (image[..., 0] < 200)
+        for part in np.array_split(np.arange(image.shape[1]), columns)[: 2 if name == OBJECT else columns]:
+            assert orange[:, part].sum() > 400 and skin[:, part].sum() > 400, name
+    assert (tmp_path / "out" / "summary.png").exists()
+
+
+def test_nothing_to_grasp(tmp_path):
+    with pytest.raises(CongraspError, match="nothing to grasp"):
+        command()
+    with pytest.raises(CongraspError, match="--tries is 0"):
+        command(tmp_path, "--tries", "0")
+
+
+def test_files_of_a_grasp_are_constraints_of_the_next(tmp_path, block, grasper, monkeypatch, made_up):
+    found = Grasper.grasp(grasper, block)
+    save_grasp(tmp_path, found, video=False, pictures=False, about={"key": "k"})
+    text = str(tmp_path / MOTION)
+    asked = read_asked(block, grasper.hand, 15, pose=text, trajectory=text)
+    assert asked.pose is not None and asked.trajectory is not None
+    np.testing.assert_array_equal(asked.pose.q, found.motion.joint_position[7])

@@ -1,0 +1,113 @@
+"""Wrist paths from CSV, NPZ and BVH: one path, written three ways, comes back."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from services.grasp.wrist_paths import read_bvh, read_wrist_path
+
+FRAMES = 12
+T = np.linspace(0, 1, FRAMES)
+POSITION = np.stack([0.3 * T, 0.1 * np.sin(3 * T), 0.2 + 0.1 * T], -1)
+ROTATION = Rotation.from_rotvec(np.outer(T, [0.4, -0.3, 0.8]))
+
+
+def bvh(path, order="ZXY", unit=0.01):
+    """A skeleton of three joints, y up, whose hand follows the path; the arm's angles are whatever they are."""
+    up = Rotation.from_euler("X", -90, degrees=True)
+    place, turn = up.apply(POSITION) / unit, up * ROTATION
+    shoulder = Rotation.from_rotvec(np.outer(T, [0.2, 0.5, -0.1]))
+    arm, hand = np.array([3.0, -20.0, 1.0]), np.array([0.0, -25.0, 2.0])
+    elbow = Rotation.from_rotvec(np.outer(T, [-0.3, 0.0, 0.6]))
+    root = place - shoulder.apply(arm) - (shoulder * elbow).apply(hand)
+    turns = [shoulder, elbow, (shoulder * elbow).inv() * turn]
+    names = " ".join(f"{axis}rotation" for axis in order)
+    text = f"""HIERARCHY
+ROOT Shoulder
+{{
+  OFFSET 1 2 3
+  CHANNELS 6 Xposition Yposition Zposition {names}
+  JOINT Arm
+  {{
+    OFFSET {" ".join(map(str, arm))}
+    CHANNELS 3 {names}
+    JOINT Hand
+    {{
+      OFFSET {" ".join(map(str, hand))}
+      CHANNELS 3 {names}
+      End Site
+      {{
+        OFFSET 0 -10 0
+      }}
+    }}
+  }}
+  JOINT Head
+  {{
+    OFFSET 0 30 0
+    CHANNELS 3 {names}
+  }}
+}}
+MOTION
+Frames: {FRAMES}
+Frame Time: 0.02
+"""
+    angles = [turn.as_euler(order, degrees=True) for turn in turns]
+    rows = np.concatenate([root, *angles, np.zeros((FRAMES, 3))], 1)
+    path.write_text(text + "\n".join(" ".join(f"{x:.6f}" for x in row) for row in rows) + "\n")
+    return path
+
+
+def check(found):
+    np.testing.assert_allclose(found.position, POSITION, atol=1e-6)
+    assert (found.rotation * ROTATION.inv()).magnitude().max() < 1e-6
+
+
+@pytest.mark.parametrize("order", ["".join(axes) for axes in itertools.permutations("XYZ")])
+def test_a_joint_of_a_skeleton_is_followed_in_any_order_of_its_channels(tmp_path, order):
+    found = read_wrist_path(bvh(tmp_path / "motion.bvh", order), joint="Hand")
+    check(found)
+    assert found.seconds == 0.02
+
+
+def test_tables_and_archives_say_the_same(tmp_path):
+    quaternion = ROTATION.as_quat(scalar_first=True)
+    np.savez(tmp_path / "a.npz", position=POSITION, quaternion=quaternion)
+    np.savez(tmp_path / "b.npz", wrist_position=POSITION, wrist_quaternion=quaternion)
+    rows = np.concatenate([POSITION, quaternion], 1)
+    np.savetxt(tmp_path / "c.csv", rows, delimiter=",", header="x,y,z,w,x,y,z", comments="")
+    for name in ("a.npz", "b.npz", "c.csv"):
+        check(read_wrist_path(tmp_path / name))
+
+
+def test_another_wrist_frame_is_turned_into_ours(tmp_path):
+    # Fingers towards +x and the back of the hand +y: the thumb of a right hand then points to -z.
+    own = Rotation.from_matrix(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]))
+    quaternion = (ROTATION * own.inv()).as_quat(scalar_first=True)
+    np.savez(tmp_path / "a.npz", position=POSITION, quaternion=quaternion)
+    check(read_wrist_path(tmp_path / "a.npz", fingers="+x", back="+y"))
+
+
+def test_what_cannot_be_read_is_said(tmp_path):
+    file = bvh(tmp_path / "motion.bvh")
+    with pytest.raises(CongraspError, match="no joint 'RightHand'"):
+        read_wrist_path(file)
+    file.write_text(file.read_text()[:-200])
+    with pytest.raises(CongraspError, match="cannot be read as BVH"):
+        read_bvh(file, "Hand")
+    with pytest.raises(CongraspError, match="There is no file"):
+        read_wrist_path(tmp_path / "absent.bvh")
+    (tmp_path / "a.fbx").write_text("")
+    with pytest.raises(CongraspError, match="neither CSV, NPZ nor BVH"):
+        read_wrist_path(tmp_path / "a.fbx")
+    np.savez(tmp_path / "a.npz", position=POSITION, quaternion=2 * ROTATION.as_quat())
+    with pytest.raises(CongraspError, match="length one"):
+        read_wrist_path(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", position=POSITION)
+    with pytest.raises(CongraspError, match="needs 'position' and 'quaternion'"):
+        read_wrist_path(tmp_path / "b.npz")
+    with pytest.raises(CongraspError, match="do not fit"):
+        np.savez(tmp_path / "c.npz", position=POSITION, quaternion=ROTATION.as_quat())
+        read_wrist_path(tmp_path / "c.npz", fingers="+x", back="-x")

@@ -1,0 +1,136 @@
+"""The authority and its certificates, as files and as OpenSSL sees them."""
+
+import datetime
+import shutil
+import stat
+import subprocess
+
+import pytest
+
+from common.errors import CongraspError
+from common.transport.security import NUMBERS, Credentials, check_exposure, secured
+from services.ops.certificates import certificates, create_authority, find_credentials, issue, read
+
+
+@pytest.fixture
+def folder(tmp_path):
+    create_authority(tmp_path / "certs")
+    return tmp_path / "certs"
+
+
+def test_a_certificate_says_role_number_hosts_and_end(folder):
+    made = read(issue(folder, "learner", hosts=["10.0.0.5", "gpu.example", "10.0.0.5"], days=30) / "tls.crt")
+    assert (made.name, made.role, made.number) == ("learner.0", "learner", 0)
+    assert made.hosts == ("localhost", "127.0.0.1", "10.0.0.5", "gpu.example")
+    assert made.expires.utcoffset() == datetime.timedelta(0) and 29.99 < made.days <= 30
+    assert read(issue(folder, "learner") / "tls.crt").name == "learner.1"
+    assert read(issue(folder, "actor", days=7000) / "tls.crt").expires <= read(folder / "ca.crt").expires
+    assert [one.name for one in certificates(folder)] == ["ca", "actor.0", "learner.0", "learner.1"]
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="the command openssl is not here")
+def test_openssl_agrees_who_may_listen(folder, tmp_path):
+    create_authority(tmp_path / "other")
+
+    def verify(ca, certificate, purpose):
+        command = ["openssl", "verify", "-x509_strict", "-purpose", purpose, "-CAfile", ca, certificate]
+        return subprocess.run(command, capture_output=True, check=False, timeout=20).returncode == 0
+
+    learner, actor = issue(folder, "learner") / "tls.crt", issue(folder, "actor") / "tls.crt"
+    ca = folder / "ca.crt"
+    assert verify(ca, learner, "sslserver") and verify(ca, learner, "sslclient") and verify(ca, actor, "sslclient")
+    assert not verify(ca, actor, "sslserver")
+    assert not verify(tmp_path / "other" / "ca.crt", actor, "sslclient")
+
+
+def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
+    made = issue(folder, "actor")
+    for key in (folder / "ca.key", made / "tls.key"):
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(CongraspError, match=r"an authority already.*--force"):
+        create_authority(folder)
+    with pytest.raises(CongraspError, match=r"there already.*--force"):
+        issue(folder, "actor", number=0)
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    issue(folder, "actor", number=0, force=True)
+    assert (made / "tls.key").read_bytes() != before[made / "tls.key"]
+    create_authority(folder, force=True)
+    assert (folder / "ca.key").read_bytes() != before[folder / "ca.key"]
+
+
+@pytest.mark.parametrize(
+    ("role", "options", "words"),
+    [
+        ("boss", {}, "no role 'boss'"),
+        ("actor", {"hosts": ["gpu"]}, "names no hosts"),
+        ("server", {"hosts": ["a b"]}, "neither a host name nor an address"),
+        ("server", {"hosts": [""]}, "neither a host name nor an address"),
+        ("server", {"hosts": ["../x"]}, "neither a host name nor an address"),
+        ("actor", {"number": NUMBERS}, "0 to 255"),
+        ("actor", {"number": -1}, "0 to 255"),
+        ("actor", {"days": 1e9}, "days"),
+        ("actor", {"days": float("nan")}, "days"),
+    ],
+)
+def test_what_makes_no_sense_is_not_issued(folder, role, options, words):
+    with pytest.raises(CongraspError, match=words):
+        issue(folder, role, **options)
+    assert [one.name for one in certificates(folder)] == ["ca"]
+
+
+def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
+    issue(folder, "actor")
+    other = issue(folder, "actor")
+    assert find_credentials(folder, "actor")[0] == Credentials(folder / "actor.0", "actor")
+    assert find_credentials(other, "actor")[1].number == 1
+    with pytest.raises(CongraspError, match=r"for the role actor, not learner.*--role learner"):
+        find_credentials(other, "learner")
+    with pytest.raises(CongraspError, match="missing"):
+        find_credentials(folder, "client")
+    with pytest.raises(CongraspError, match=r"expired on .* UTC"):
+        find_credentials(issue(folder, "actor", number=7, days=-1), "actor")
+    (other / "tls.key").write_bytes((folder / "actor.0" / "tls.key").read_bytes())
+    with pytest.raises(CongraspError, match="is not the key of"):
+        find_credentials(other, "actor")
+    (other / "tls.crt").write_text("nonsense")
+    with pytest.raises(CongraspError, match="is no certificate"):
+        find_credentials(other, "actor")
+    (other / "tls.crt").write_bytes((folder / "ca.crt").read_bytes())
+    with pytest.raises(CongraspError, match="for the role ca"):
+        find_credentials(other, "actor")
+
+
+def test_with_credentials_every_endpoint_is_tls(tmp_path):
+    some = Credentials(tmp_path, "actor")
+    assert secured("tcp/10.0.0.5:7447", some) == secured("tls/10.0.0.5:7447", some) == "tls/10.0.0.5:7447"
+    assert secured("tcp/10.0.0.5:7447", None) == "tcp/10.0.0.5:7447"
+    with pytest.raises(CongraspError, match="does not go with certificates"):
+        secured("udp/10.0.0.5:7447", some)
+    with pytest.raises(CongraspError, match="needs certificates"):
+        secured("tls/10.0.0.5:7447", None)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "inside"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/localhost:7447", True),
+        ("tcp/[::1]:7447", True),
+        ("tcp/127.8.9.1:7447", True),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/[::]:7447", False),
+        ("tcp/10.0.0.5:7447", False),
+        ("tcp/localhost.example:7447", False),
+        ("udp/0.0.0.0:7447", False),
+        ("nonsense", False),
+    ],
+)
+def test_without_certificates_only_loopback_is_listened_on(endpoint, inside, tmp_path):
+    check_exposure(endpoint, Credentials(tmp_path, "learner"), insecure=False)
+    check_exposure(endpoint, None, insecure=True)
+    if inside:
+        check_exposure(endpoint, None, insecure=False)
+    else:
+        with pytest.raises(CongraspError, match="--certs"):
+            check_exposure(endpoint, None, insecure=False)

@@ -1,0 +1,168 @@
+"""Metrics as Prometheus scrapes them, and what roles say in their logs."""
+
+import contextlib
+import datetime
+import errno
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from common.errors import CongraspError, TransportError
+from common.transport.ports import free_port
+from services.ops.logs import logging_as, say
+from services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
+
+STATUS = {
+    "version": 7,
+    "finished": False,
+    "warnings": [],
+    "queue": {"length": 1, "limit": 64},
+    "rates": {"rollouts_per_second": 0.5, "steps_per_second": 100.0},
+    "ledger": {"granted": 9, "redeemed": 8, "accepted": 8, "consumed": 7, "running": 1, "queued": 1, "capacity": 3},
+    "roles": [
+        {"role": "actor", "id": "a", "incarnation": "1", "version": 6, "lag": 1, "rollouts": 8, "steps_per_second": 9},
+        {"role": "learner", "id": "0", "incarnation": "2"},
+    ],
+}
+
+
+def scrape(port: int) -> dict[tuple[str, ...], float]:
+    """Samples by their name and the values of their labels."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as reply:
+        families = text_string_to_metric_families(reply.read().decode())
+        return {(one.name, *one.labels.values()): one.value for family in families for one in family.samples}
+
+
+def test_a_learner_shows_its_status_and_its_last_update():
+    metrics, port = LearnerMetrics(lambda: STATUS), free_port()
+    metrics.update({"episode/success": 0.5, "update_seconds": 0.25})
+    with exposed(port, "127.0.0.1", metrics):
+        found = scrape(port)
+    assert found["congrasp_learner_version",] == 7 and found["congrasp_learner_ready",] == 1
+    assert found["congrasp_learner_rollouts_total", "consumed"] == 7
+    assert found["congrasp_learner_tickets_total", "granted"] == 9
+    assert found["congrasp_learner_tickets_running",] + found["congrasp_learner_tickets_capacity",] == 4
+    assert found["congrasp_learner_actor_lag", "a", "1"] == 1 and found["congrasp_learner_roles", "actor"] == 1
+    assert found["congrasp_learner_update", "episode/success"] == 0.5
+    assert found["process_resident_memory_bytes",] > 0
+
+
+def test_a_learner_that_starts_is_not_ready():
+    def ask():
+        raise TransportError("Nobody answers.")
+
+    port = free_port()
+    with exposed(port, "127.0.0.1", LearnerMetrics(ask)):
+        assert scrape(port)["congrasp_learner_ready",] == 0
+
+
+def test_an_actor_shows_its_last_rollout():
+    metrics, port = ActorMetrics(), free_port()
+    metrics.rollout({"version": 3.0, "rollouts": 12.0, "steps_per_second": 99.0})
+    with exposed(port, "127.0.0.1", metrics):
+        found = scrape(port)
+    assert found["congrasp_actor_rollouts_total",] == 12 and found["congrasp_actor_version",] == 3
+    assert found["congrasp_actor_steps_per_second",] == 99
+
+
+def test_a_server_counts_answers_and_batches_from_many_threads():
+    metrics, port = ServerMetrics(), free_port()
+    metrics.health = lambda: {"ready": True, "version": 5, "queue": 2}
+
+    def answer():
+        for _ in range(100):
+            metrics.answer("answered", 0.004)
+            metrics.answer("overloaded", 0.0)
+            metrics.batch(3)
+
+    threads = [threading.Thread(target=answer) for _ in range(4)]
+    with exposed(port, "127.0.0.1", metrics):
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(30)
+        found = scrape(port)
+    assert found["congrasp_policy_queries_total", "answered"] == 400 == found["congrasp_policy_batch_bucket", "4.0"]
+    assert found["congrasp_policy_queries_total", "overloaded"] == 400
+    assert found["congrasp_policy_seconds_bucket", "0.003"] == 0
+    assert found["congrasp_policy_seconds_bucket", "0.005"] == found["congrasp_policy_seconds_count",] == 400
+    assert found["congrasp_policy_version",] == 5
+
+
+@contextlib.contextmanager
+def role(*arguments):
+    """A role that runs while the block does; what it has said is in the list afterwards. It must end when told to."""
+    command = [sys.executable, "-m", "services.cli.main", *arguments, "--log-format", "json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        lines: list[dict] = []
+        try:
+            yield lines
+            process.terminate()
+            rest, wrong = process.communicate(timeout=20)
+            lines += [json.loads(line) for line in rest.splitlines()]
+            assert process.returncode == 143, wrong
+        finally:
+            process.kill()
+
+
+def scraped_until(port, condition, seconds=120.0):
+    deadline = time.monotonic() + seconds
+    while True:
+        with contextlib.suppress(OSError):
+            if condition(found := scrape(port)):
+                return found
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+@pytest.mark.timeout(240)
+def test_a_learner_and_an_actor_are_scraped(tmp_path):
+    endpoint, ports = f"tcp/127.0.0.1:{free_port()}", (free_port(), free_port())
+    small = ("--network.hidden", "32", "--environments", "4", "--objects.count", "1", "--objects.families", "box")
+    learner = ("learner", "--run-dir", str(tmp_path / "run"), "--listen", endpoint, *small)
+    actor = ("actor", "--connect", endpoint, "--run", "quickstart", "--id", "worker", "--physics", "native")
+    with (
+        role(*learner, "--metrics-port", str(ports[0])),
+        role(*actor, "--metrics-port", str(ports[1])) as said,
+    ):
+        found = scraped_until(ports[0], lambda found: found.get(("congrasp_learner_roles", "actor")) == 1)
+        assert found["congrasp_learner_ready",] == 1 and found["congrasp_learner_ledger_balanced",] == 1
+        assert found["congrasp_learner_tickets_capacity",] + found["congrasp_learner_tickets_running",] == 4
+        assert ("congrasp_actor_rollouts_total",) in scrape(ports[1])
+    assert all(line.keys() == {"time", "level", "role", "id", "run", "text", "fields"} for line in said)
+    assert datetime.datetime.fromisoformat(said[0]["time"]).tzinfo is datetime.UTC
+    assert said[0]["text"] == f"Acts for {endpoint}." and (said[0]["role"], said[0]["id"]) == ("actor", "worker")
+
+
+def test_an_error_is_the_last_line_of_a_log_in_json(tmp_path):
+    command = [sys.executable, "-m", "services.cli.main", "actor", "--connect", "nonsense", "--log-format", "json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    line = json.loads(done.stdout)
+    assert done.returncode == 2 and done.stderr == "" and line["level"] == "error"
+    assert line["text"].startswith("'nonsense' is not an endpoint.")
+
+
+def test_a_full_disk_under_a_log_costs_lines_and_not_the_process(monkeypatch):
+    class Full:
+        def write(self, text):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sys, "stdout", Full())
+    with logging_as("text", role="learner", id="0", run="r"):
+        say("warning", "lost", {"figure": 1.0})
+
+
+def test_a_port_in_use_is_an_error_in_words():
+    port = free_port()
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", port))
+        busy.listen()
+        with pytest.raises(CongraspError, match=rf"127.0.0.1:{port} .*--metrics-port"), exposed(port, "127.0.0.1"):
+            pass

@@ -1,0 +1,97 @@
+"""Signals end a process within its grace, even one whose main thread cannot listen; children do not outlive parents."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import psutil
+import pytest
+
+STUCK = """
+import threading
+from services.ops.shutdown import on_signal
+with on_signal(grace=0.2):
+    print("ready", flush=True)
+    lock = threading.Lock()
+    lock.acquire()
+    lock.acquire()  # handlers run, and then it waits on for ever
+"""
+POLITE = """
+import sys, time
+from services.ops.shutdown import on_signal
+with on_signal() as stop:
+    print("ready", flush=True)
+    stop.wait(30)
+    print("drained", flush=True)
+time.sleep(0.2)
+print("said goodbye", flush=True)
+sys.exit(stop.exit_code)
+"""
+PARENT = """
+import os, subprocess, sys, time
+child = subprocess.Popen(
+    [sys.executable, "-c", "import time; from services.ops.shutdown import follow_parent; follow_parent();"
+     "print('ready', flush=True); time.sleep(60)"],
+    env={**os.environ, "CONGRASP_PARENT": str(os.getpid())}, stdout=subprocess.PIPE, start_new_session=True)
+child.stdout.readline()
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+
+
+def start(code: str) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_process_that_polls_drains_and_tells_the_shell_why(number, code):
+    with start(POLITE) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        output, _ = process.communicate(timeout=20)
+    assert output == "drained\nsaid goodbye\n"
+    assert process.returncode == code
+
+
+def test_a_process_that_is_stuck_ends_all_the_same():
+    with start(STUCK) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+    assert process.returncode == 130
+
+
+def test_a_second_signal_ends_a_process_that_drains_for_long():
+    with start(STUCK.replace("0.2", "600")) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(1)
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=20)
+    assert process.returncode == 130
+
+
+def test_a_forced_end_takes_the_children_along():
+    child = "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'], start_new_session=True)"
+    code = STUCK.replace("import threading", "import subprocess, sys, threading").replace(
+        "    print(", f"    child = {child}\n    take_along(child)\n    print(child.pid, end=' ')\n    print("
+    )
+    with start(code.replace("import on_signal", "import on_signal, take_along")) as process:
+        pid, ready = process.stdout.readline().split()
+        child = psutil.Process(int(pid))
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=20)
+    assert ready == "ready" and process.returncode == 143
+    assert not child.is_running() or child.status() == psutil.STATUS_ZOMBIE
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="uses prctl")
+def test_a_child_dies_with_a_parent_that_was_killed():
+    with start(PARENT) as parent:
+        child = psutil.Process(int(parent.stdout.readline()))
+        os.kill(parent.pid, signal.SIGKILL)
+        parent.wait(20)
+        _, alive = psutil.wait_procs([child], timeout=20)
+    assert not alive

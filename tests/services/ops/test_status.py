@@ -1,0 +1,92 @@
+"""`congrasp status` against a live learner's end."""
+
+import copy
+import json
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from common.errors import TransportError
+from common.transport.keys import Keys
+from common.transport.ports import free_port
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.messages import RolloutForm
+from learner.hub import LearnerHub
+from learner.staleness import StalenessManager
+from services.cli.status import status
+from services.ops.status import ask, warnings
+from tests.rollouts import ACTION, OBSERVATION, SCHEMA, bundle, rollout
+
+
+@pytest.fixture
+def endpoint():
+    """A run with one actor, which has sent one rollout."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ZenohTransport(listen=[endpoint]) as server:
+        hub = LearnerHub(
+            server,
+            run="r",
+            config_json="{}",
+            epoch="e",
+            schema=SCHEMA,
+            form=RolloutForm(4, 2, OBSERVATION, ACTION, half=True),
+            staleness=StalenessManager(1, 2),
+        )
+        weights = {"observation/mean": np.zeros(OBSERVATION), "observation/m2": np.zeros(OBSERVATION)}
+        weights |= dict.fromkeys(("observation/count", "value/mean", "value/m2", "value/count"), np.zeros(()))
+        message = bundle(0)
+        hub.publish_weights(type(message)({**message.arrays, **weights}, message.meta), 0)
+        with ZenohTransport(connect=[endpoint]) as actor:
+            actor.declare_alive(Keys("r").alive("actor", "worker-7", "1f"))
+            sent = rollout(actor="worker-7", incarnation="1f")
+            assert actor.query(Keys("r").rollout("worker-7"), sent, timeout=5.0).meta["outcome"] == "accepted"
+            yield endpoint
+
+
+@pytest.mark.timeout(30)
+def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
+    assert status(endpoint, "r", json=True) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["run"], found["version"], found["ledger"]["accepted"]) == ("r", 0, 1)
+    assert [(role["role"], role["id"]) for role in found["roles"]] == [("actor", "worker-7"), ("learner", "0")]
+    actor = found["roles"][0]
+    assert (actor["rollouts"], actor["version"], actor["lag"]) == (1, 0, 0)
+    assert 0 < actor["steps_per_second"] == found["rates"]["steps_per_second"] <= 8
+    assert status(endpoint, "r") == 0
+    text = capsys.readouterr().out
+    assert "worker-7" in text and "accepted" in text and "1 rollout(s) of at most 64 waiting" in text
+
+
+@pytest.mark.timeout(30)
+def test_a_ledger_that_does_not_add_up_is_said(endpoint):
+    with ZenohTransport(connect=[endpoint]) as transport:
+        found = ask(transport, "r")
+    assert found["warnings"] == []
+    lost = copy.deepcopy(found)
+    lost["ledger"]["accepted"] += 1
+    (words,) = warnings(lost)
+    assert words == "The ledger does not add up: accepted 2 is not consumed 0 + dropped 0 + queued 1."
+    lost["ledger"]["queued"] += 1
+    (words,) = warnings(lost)
+    assert words == "The ledger says that 2 rollouts wait; in the queue are 1."
+
+
+@pytest.mark.timeout(60)
+def test_watching_goes_on_until_it_is_interrupted(endpoint):
+    command = [sys.executable, "-m", "services.cli.main", "status", "--connect", endpoint, "--run", "r"]
+    with subprocess.Popen(
+        [*command, "--watch", "--every", "0.1", "--json"], stdout=subprocess.PIPE, text=True
+    ) as process:
+        versions = [json.loads(process.stdout.readline())["version"] for _ in range(3)]
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+    assert versions == [0, 0, 0] and process.returncode == 130
+
+
+@pytest.mark.timeout(30)
+def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
+    with pytest.raises(TransportError, match="other"):
+        status(endpoint, "other")

@@ -1,0 +1,263 @@
+"""Recordings survive: killed writers, full disks, cut and strange files, rotation."""
+
+import errno
+import io
+import json
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from common.errors import CongraspError
+from common.wire.codec import Message, encode
+from services.record.channels import CONVENTIONS, Entry, JsonChannels, opaque_channel
+from services.record.reader import is_complete, log_files, read_episodes, read_metrics, read_records
+from services.record.writer import LogWriter
+from tests.episodes import episode
+
+SECOND = 10**9
+
+
+def metric_entries(count: int, start: int = 0) -> list[Entry]:
+    channels = JsonChannels()
+    return [
+        channels.entry("/metrics/learner/0", i * SECOND, {"update": i, "values": {"kl": i / 10, "term": {"a": -i}}})
+        for i in range(start, start + count)
+    ]
+
+
+def updates(path: pathlib.Path) -> list[int]:
+    return [json.loads(record.data)["update"] for record in read_records(path)]
+
+
+def write(directory: pathlib.Path, entries: list[Entry], **options: float) -> list[pathlib.Path]:
+    writer = LogWriter(directory, "log", run="r", **options)  # type: ignore[arg-type]
+    for entry in entries:
+        writer.write(entry)
+    writer.close()
+    return writer.files
+
+
+def doctor(path: pathlib.Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pymcap_cli.cli", "doctor", str(path)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_finished_file_is_sound_and_says_what_its_numbers_mean(tmp_path: pathlib.Path) -> None:
+    raw = Entry(opaque_channel("/rollout/a", "congrasp.Rollout"), 5, encode(Message({"x": np.arange(3)}, {})))
+    (path,) = write(tmp_path, [*metric_entries(20), raw])
+    assert path.suffix == ".mcap" and is_complete(path)
+    checked = doctor(path)
+    assert checked.returncode == 0, checked.stdout
+    assert "passed" in checked.stdout
+    with path.open("rb") as file:
+        (metadata,) = make_reader(file).iter_metadata()
+    assert metadata.metadata == {"run": "r", **CONVENTIONS}
+
+
+def test_metrics_come_back_with_their_names(tmp_path: pathlib.Path) -> None:
+    write(tmp_path, metric_entries(4))
+    series = read_metrics(tmp_path)
+    assert set(series) == {"learner/0/kl", "learner/0/term/a"}
+    np.testing.assert_array_equal(series["learner/0/kl"][0], [0, 1, 2, 3])
+    np.testing.assert_allclose(series["learner/0/term/a"][1], [0, -1, -2, -3])
+
+
+def test_after_a_resume_the_later_value_of_an_update_counts(tmp_path: pathlib.Path) -> None:
+    channels = JsonChannels()
+    again = [channels.entry("/metrics/learner/0", 100 * SECOND, {"update": 2, "values": {"kl": 9.0}})]
+    write(tmp_path, metric_entries(4) + again)
+    steps, values = read_metrics(tmp_path)["learner/0/kl"]
+    np.testing.assert_array_equal(steps, [0, 1, 2, 3])
+    np.testing.assert_allclose(values, [0, 0.1, 9.0, 0.3])
+
+
+def test_rotation_by_age_and_by_size_keeps_everything(tmp_path: pathlib.Path) -> None:
+    by_age = write(tmp_path / "age", metric_entries(25), max_seconds=9.5)
+    assert [updates(path) for path in by_age] == [[*range(10)], [*range(10, 20)], [*range(20, 25)]]
+    assert all(is_complete(path) for path in by_age)
+    noise = np.random.default_rng(0)
+    blob = opaque_channel("/rollout/a", "congrasp.Rollout")
+    entries = [Entry(blob, i, noise.bytes(1 << 20)) for i in range(6)]
+    by_size = write(tmp_path / "size", entries, max_bytes=2 << 20)
+    assert len(by_size) >= 2
+    assert [r.data for path in log_files(tmp_path / "size") for r in read_records(path)] == [e.data for e in entries]
+
+
+def test_what_belongs_together_is_not_split_over_files(tmp_path: pathlib.Path) -> None:
+    writer = LogWriter(tmp_path, "log", max_seconds=2.5)
+    writer.write(*metric_entries(10))
+    writer.write(*metric_entries(3, start=10))
+    writer.close()
+    assert [len(updates(path)) for path in writer.files] == [10, 3]
+
+
+def test_two_writers_in_one_folder_take_different_names(tmp_path: pathlib.Path) -> None:
+    first, second = LogWriter(tmp_path, "log"), LogWriter(tmp_path, "log")
+    for writer in (first, second):
+        writer.write(*metric_entries(2))
+    first.close()
+    second.close()
+    assert len(log_files(tmp_path)) == 2 and not set(first.files) & set(second.files)
+
+
+def test_a_writer_leaves_the_finished_file_of_the_same_second_alone(tmp_path: pathlib.Path) -> None:
+    first, second = write(tmp_path, metric_entries(2)), write(tmp_path, metric_entries(1))
+    assert first != second
+    assert updates(first[0]) == [0, 1] and updates(second[0]) == [0]
+    assert sorted(tmp_path.iterdir()) == sorted([*first, *second])
+
+
+def test_episodes_come_back_as_they_were_sent(tmp_path: pathlib.Path) -> None:
+    channel = opaque_channel("/episode/a0/raw", "congrasp.Episode")
+    write(tmp_path, [*metric_entries(3), Entry(channel, SECOND, encode(episode()))])
+    (kept,) = read_episodes(tmp_path)
+    assert kept.meta == episode().meta
+    np.testing.assert_array_equal(kept.arrays["q"], episode().arrays["q"])
+
+
+KILLED = """
+import pathlib, sys, time
+from services.record.channels import JsonChannels
+from services.record.writer import LogWriter
+writer, channels = LogWriter(pathlib.Path(sys.argv[1]), "log"), JsonChannels()
+for i in range(10_000):
+    writer.write(channels.entry("/metrics/learner/0", i, {"update": i, "values": {"kl": 0.1}}))
+    if i % 100 == 99:
+        writer.flush()
+        print(i, flush=True)
+        time.sleep(0.01)
+"""
+
+
+def test_a_killed_writers_file_reads_up_to_its_last_flush(tmp_path: pathlib.Path) -> None:
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    flushed = [int(process.stdout.readline()) for _ in range(5)]
+    process.send_signal(signal.SIGKILL)
+    process.wait(10)
+    flushed += [int(line) for line in process.stdout.read().split()]
+    process.stdout.close()
+    (path,) = log_files(tmp_path)
+    assert path.name.endswith(".mcap.part") and not is_complete(path)
+    read = updates(path)
+    assert read == [*range(len(read))]
+    assert len(read) > flushed[-1]
+    assert len(read_metrics(tmp_path)["learner/0/kl"][0]) == len(read)
+
+
+@pytest.fixture(scope="module")
+def several_chunks(tmp_path_factory: pytest.TempPathFactory) -> tuple[pathlib.Path, bytes]:
+    directory = tmp_path_factory.mktemp("cut")
+    writer = LogWriter(directory, "log")
+    for entry in metric_entries(30):
+        writer.write(entry)
+        writer.flush()
+    writer.close()
+    return directory, writer.files[0].read_bytes()
+
+
+@settings(max_examples=60, deadline=None)
+@given(share=st.floats(0, 1))
+def test_a_file_cut_anywhere_gives_a_beginning(several_chunks: tuple[pathlib.Path, bytes], share: float) -> None:
+    directory, whole = several_chunks
+    cut = directory / "cut.mcap.part"
+    cut.write_bytes(whole[: round(share * len(whole))])
+    read = updates(cut)
+    assert read == [*range(len(read))]
+
+
+@settings(max_examples=60, deadline=None)
+@given(place=st.integers(8, 2000), value=st.integers(0, 255))
+def test_a_damaged_byte_invents_nothing(several_chunks: tuple[pathlib.Path, bytes], place: int, value: int) -> None:
+    directory, whole = several_chunks
+    damaged = directory / "damaged.mcap"
+    damaged.write_bytes(whole[:place] + bytes([value]) + whole[place + 1 :])
+    read = updates(damaged)
+    # A chunk may be lost, and what comes after it; what is read is what was written.
+    assert read == sorted(set(read)) and set(read) <= {*range(30)}
+
+
+class FullDisk(io.FileIO):
+    """A file on a disk that has `room` bytes."""
+
+    def __init__(self, path: pathlib.Path, room: int):
+        super().__init__(path, "xb")
+        self._room = room
+
+    def write(self, data: object) -> int:
+        size = memoryview(data).nbytes  # type: ignore[arg-type]
+        if size > self._room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self._room -= size
+        return super().write(data)  # type: ignore[arg-type]
+
+
+def test_a_full_disk_is_an_error_and_keeps_what_was_flushed(tmp_path: pathlib.Path) -> None:
+    writer = LogWriter(tmp_path, "log", open_file=lambda path: io.BufferedWriter(FullDisk(path, 20_000)))
+    flushed = 0
+    with pytest.raises(OSError, match="No space left"):
+        for entry in metric_entries(100_000):
+            writer.write(entry)
+            if entry.time // SECOND % 10 == 9:
+                writer.flush()
+                flushed = entry.time // SECOND
+    writer.abandon()
+    assert flushed > 9
+    assert updates(log_files(tmp_path)[0])[: flushed + 1] == [*range(flushed + 1)]
+
+
+@pytest.fixture
+def small_disk(tmp_path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A file system of 200 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = shutil.which("mount")
+    command = [mount or "mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", str(place)]
+    if mount is None or subprocess.run(command, capture_output=True, timeout=10, check=False).returncode:
+        pytest.skip("file systems cannot be mounted here")
+    yield place
+    subprocess.run(["umount", str(place)], timeout=10, check=True)
+
+
+def test_a_file_system_that_is_really_full(small_disk: pathlib.Path) -> None:
+    writer = LogWriter(small_disk, "log")
+    noise, blob = np.random.default_rng(0), opaque_channel("/rollout/a", "congrasp.Rollout")
+    with pytest.raises(OSError, match="No space left"):
+        for i in range(100):
+            writer.write(Entry(blob, i, noise.bytes(10_000)))
+            writer.flush()
+    writer.abandon()
+    (path,) = log_files(small_disk)
+    assert len(list(read_records(path))) >= 10
+
+
+def test_what_is_no_recording_is_said_in_words(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(CongraspError, match="no recording"):
+        log_files(tmp_path)
+    (tmp_path / "a.mcap").write_text("a text")
+    with pytest.raises(CongraspError, match=r"a\.mcap is not an MCAP file"):
+        read_metrics(tmp_path)
+    with pytest.raises(CongraspError, match="cannot be read"):
+        list(read_records(tmp_path / "absent.mcap"))
+    with pytest.raises(CongraspError, match=r"no file or folder .*absent\. Name a run"):
+        log_files(tmp_path / "absent")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CongraspError, match="cannot be made"):
+        LogWriter(tmp_path / "file" / "logs", "log")
+
+
+def test_a_file_that_is_being_written_can_be_read(tmp_path: pathlib.Path) -> None:
+    writer = LogWriter(tmp_path, "log")
+    writer.write(*metric_entries(5))
+    writer.flush()
+    assert updates(log_files(tmp_path)[0]) == [0, 1, 2, 3, 4]
+    writer.close()

@@ -1,0 +1,130 @@
+"""A viewer that connects gets channels, what came before it, and frames in their time."""
+
+import collections
+import itertools
+import json
+import pathlib
+import struct
+import time
+
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from common.errors import CongraspError
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.wire.codec import Message
+from services.record.channels import JsonChannels
+from services.record.live import LiveServer
+from services.record.recorder import Recorder
+from tests.episodes import CONTROL_DT, episode
+
+MESSAGE_DATA = 1  # operation code of a binary frame with a message
+pytestmark = pytest.mark.timeout(60)
+
+
+class Viewer:
+    """Subscribes to every channel it is told of, and keeps what comes."""
+
+    def __init__(self, socket: ClientConnection):
+        self._socket = socket
+        self._topics: dict[int, str] = {}
+        self.advertised: dict[str, dict[str, str]] = {}
+        self.frames: dict[str, list[tuple[int, bytes]]] = collections.defaultdict(list)
+
+    def listen(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (rest := end - time.monotonic()) > 0:
+            try:
+                frame = self._socket.recv(timeout=rest)
+            except TimeoutError:
+                return
+            if isinstance(frame, bytes):
+                operation, subscription, stamp = struct.unpack_from("<BIQ", frame)
+                if operation == MESSAGE_DATA:
+                    self.frames[self._topics[subscription]].append((stamp, frame[13:]))
+                continue
+            message = json.loads(frame)
+            if message["op"] == "advertise":
+                for channel in message["channels"]:
+                    self._topics[channel["id"]] = channel["topic"]
+                    self.advertised[channel["topic"]] = channel
+                self._subscribe(message["channels"])
+            elif message["op"] == "status" and "Unknown channel" in message["message"]:
+                # The server tells viewers of a new channel a moment before it takes subscriptions to it.
+                self._subscribe(list(self.advertised.values()))
+
+    def _subscribe(self, channels: list[dict[str, str]]) -> None:
+        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+    def wait_for(self, topic: str, count: int) -> None:
+        end = time.monotonic() + 20
+        while len(self.frames[topic]) < count:
+            assert time.monotonic() < end, f"{len(self.frames[topic])} frames of {topic}"
+            self.listen(0.1)
+
+
+def viewer(server: LiveServer) -> ClientConnection:
+    return connect(f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"], max_size=1 << 24)
+
+
+def test_a_recorders_channels_reach_a_viewer_while_it_records(tmp_path: pathlib.Path) -> None:
+    transport, keys = MemoryTransport(MemoryHub()), Keys("r")
+    with (
+        LiveServer(0) as server,
+        Recorder(transport, "r", tmp_path, sinks=[server]) as recorder,
+        viewer(server) as socket,
+    ):
+        seen = Viewer(socket)
+        for update in range(400):
+            message = Message({}, {"update": update, "values": {"kl": 0.5}})
+            transport.publish(keys.log("metrics", "learner", "0"), message)
+            seen.listen(0.05)
+            if len(seen.frames["/metrics/learner/0"]) >= 3:
+                break
+        transport.publish(keys.log("episode", "actor", "a0"), episode(150))
+        seen.wait_for("/episode/a0/scene", 1)
+        seen.wait_for("/episode/a0/tf", 6)
+    assert recorder.error == "" and recorder.files[0].suffix == ".mcap"
+    payload = json.loads(seen.frames["/metrics/learner/0"][-1][1])
+    assert payload["values"] == {"kl": 0.5}
+    channel = seen.advertised["/metrics/learner/0"]
+    assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
+    assert seen.advertised["/episode/a0/tf"]["schemaName"] == "foxglove.FrameTransforms"
+    stamps = [stamp for stamp, _ in seen.frames["/episode/a0/tf"]]
+    assert {round((b - a) / 1e9 / CONTROL_DT) for a, b in itertools.pairwise(stamps)} == {1}
+
+
+def test_entries_wait_for_their_time_and_newcomers_get_the_scene(tmp_path: pathlib.Path) -> None:
+    transport, keys = MemoryTransport(MemoryHub()), Keys("r")
+    with LiveServer(0) as server, Recorder(transport, "r", None, sinks=[server]):
+        channel = JsonChannels()
+        server.write(channel.entry("/late", time.time_ns() + 3600 * 10**9, {"a": 1}))
+        transport.publish(keys.log("episode", "actor", "a0"), episode(3))
+        with viewer(server) as first:
+            one = Viewer(first)
+            one.wait_for("/episode/a0/scene", 1)
+        with viewer(server) as second:
+            two = Viewer(second)
+            two.wait_for("/episode/a0/scene", 1)
+            two.wait_for("/episode/a0/surface", 1)
+    assert "/late" not in two.advertised
+
+
+def test_a_schema_that_grows_replaces_its_channel() -> None:
+    with LiveServer(0) as server, viewer(server) as socket:
+        seen, channels = Viewer(socket), JsonChannels()
+        for fields in ({"a": 1}, {"a": 1, "b": 2}):
+            for _ in range(400):
+                server.write(channels.entry("/m", time.time_ns(), fields))
+                seen.listen(0.05)
+                if seen.frames["/m"] and json.loads(seen.frames["/m"][-1][1]) == fields:
+                    break
+            assert json.loads(seen.frames["/m"][-1][1]) == fields
+        assert set(json.loads(seen.advertised["/m"]["schema"])["properties"]) == {"a", "b"}
+
+
+def test_a_busy_port_is_said_in_words() -> None:
+    with LiveServer(0) as server, pytest.raises(CongraspError, match=f"cannot listen on 127.0.0.1:{server.port}"):
+        LiveServer(server.port)

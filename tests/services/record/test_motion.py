@@ -1,0 +1,92 @@
+"""Grasp motions as NPZ files."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands import get_hand
+from services.export.motion_file import load_motion, motion_of_episode, save_motion
+from services.record.poses import link_poses
+from tests.episodes import CONTROL_DT, episode
+
+
+def test_a_motion_survives_its_file_and_the_file_says_what_every_array_means(tmp_path):
+    motion = motion_of_episode(episode(mask=(1, 0, 0, 1)))
+    assert motion.constraints == ("heading", "affordance", "trajectory") and motion.about == {
+        "version": 3,
+        "actor": "a0",
+    }
+    path = tmp_path / "deep" / "grasp.npz"
+    save_motion(path, motion)
+    again = load_motion(path)
+    for name, value in vars(motion).items():
+        np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
+    assert again.time[3] == pytest.approx(3 * CONTROL_DT)
+    with np.load(path) as file:  # which refuses pickles by default
+        meta = json.loads(str(file["meta"]))
+        assert set(meta["arrays"]) == set(file.files) - {"meta"}
+        sizes = {"T": 12, "F": 20, "L": 16, "K": 5}
+        for name, meaning in meta["arrays"].items():
+            axes = [axis.strip() for axis in meaning[1 : meaning.index(")")].split(",") if axis.strip()]
+            assert file[name].ndim == len(axes), name
+            wanted = [int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes]
+            assert all(n in (None, size) for n, size in zip(wanted, file[name].shape, strict=True)), name
+
+
+def test_the_file_alone_suffices_for_the_kinematics():
+    motion = motion_of_episode(episode())
+    q = motion.joint_position[-1]
+    turns, places = (
+        [],
+        [],
+    )  # of every link: x = turn x0 + place, for points x0 of the wrist frame with all joints at zero
+    for link, parent in enumerate(motion.link_parent):
+        turn, place = (Rotation.identity(), np.zeros(3)) if parent < 0 else (turns[parent], places[parent])
+        for j in np.flatnonzero(motion.joint_link == link):
+            own = Rotation.from_rotvec(q[j] * motion.joint_axis[j])
+            place = place + turn.apply(motion.joint_anchor[j] - own.apply(motion.joint_anchor[j]))
+            turn = turn * own
+        turns.append(turn)
+        places.append(place)
+    position, quaternion = link_poses(get_hand("human"), q)
+    for link in range(len(motion.link_names)):
+        joints = np.flatnonzero(motion.joint_link == link)
+        origin = motion.joint_anchor[joints[0]] if len(joints) else np.zeros(3)
+        np.testing.assert_allclose(turns[link].apply(origin) + places[link], position[link], atol=1e-6)
+        expected = Rotation.from_quat(quaternion[link], scalar_first=True)
+        assert (turns[link] * expected.inv()).magnitude() < 1e-5
+
+
+def test_what_is_no_motion_is_named(tmp_path):
+    path = tmp_path / "a.npz"
+    with pytest.raises(CongraspError, match="cannot be read: No such file"):
+        load_motion(path)
+    path.write_bytes(b"PK nothing")
+    with pytest.raises(CongraspError, match=r"not a grasp motion \(it is no NPZ file, or was cut\)"):
+        load_motion(path)
+    np.savez(path, a=np.zeros(3))
+    with pytest.raises(CongraspError, match="not a grasp motion"):
+        load_motion(path)
+    np.savez(path, meta=np.array({"a": 1}, object))
+    with pytest.raises(CongraspError, match="not a grasp motion"):
+        load_motion(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "complaint"),
+    [
+        ("time", lambda x: x[:3], r"table has shape \(12,\), where \(T,\) is \(3,\)"),
+        ("object_vertices", lambda x: x[:0], "object_vertices is empty"),
+        ("object_faces", lambda x: x + 1000, "names vertices that are not there"),
+        ("wrist_quaternion", lambda x: x[:, :3], r"wrist_quaternion has shape \(12, 3\), where \(T, 4\) is \(12, 4\)"),
+    ],
+)
+def test_arrays_of_the_wrong_shape_are_named(tmp_path, name, change, complaint):
+    motion = motion_of_episode(episode())
+    save_motion(path := tmp_path / "a.npz", dataclasses.replace(motion, **{name: change(getattr(motion, name))}))
+    with pytest.raises(CongraspError, match=complaint):
+        load_motion(path)

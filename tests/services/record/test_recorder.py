@@ -1,0 +1,272 @@
+"""The recorder writes what a run publishes, and nothing that happens to it reaches the run."""
+
+import errno
+import json
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from common.hands import get_hand
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.transport.ports import free_port
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message
+from services.record.channels import Entry
+from services.record.reader import is_complete, log_files, read_episodes, read_metrics, read_records, read_rollouts
+from services.record.recorder import Recorder
+from services.record.writer import LogWriter
+from tests.episodes import episode
+
+KEYS = Keys("r")
+METRICS = KEYS.log("metrics", "learner", "0")
+pytestmark = pytest.mark.timeout(90)
+
+
+def metrics(update: int) -> Message:
+    return Message({}, {"time": time.time(), "update": update, "values": {"kl": 0.1}})
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def transport() -> MemoryTransport:
+    return MemoryTransport(MemoryHub())
+
+
+def test_everything_a_run_publishes_is_in_the_file(transport: MemoryTransport, tmp_path: pathlib.Path) -> None:
+    rollout = Message({"reward": np.ones((4, 2), np.float32)}, {"actor": "a0"})
+    absent = {"pose_m": float("nan"), "return": 1.0}
+    with Recorder(transport, "r", tmp_path) as recorder:
+        for update in range(3):
+            transport.publish(METRICS, metrics(update))
+        transport.publish(
+            KEYS.log("metrics", "actor", "a0"), Message({}, {"time": 0.0, "values": {"pace": 5, **absent}})
+        )
+        transport.publish(
+            KEYS.log("event", "actor", "a0"), Message({}, {"time": 0.0, "level": "warning", "text": "hot"})
+        )
+        transport.publish(KEYS.log("version", "learner", "0"), Message({}, {"version": 7, "hash": "ab", "list": [1]}))
+        transport.publish(KEYS.log("rollout", "actor", "a0"), rollout)
+        sent = Message(episode().arrays, {**episode().meta, "metrics": absent})
+        transport.publish(KEYS.log("episode", "actor", "a0"), sent)
+        transport.publish(KEYS.rollout("a"), rollout)  # no log
+    assert (recorder.messages, recorder.damaged, recorder.dropped, recorder.error) == (8, 0, 0, "")
+    (path,) = recorder.files
+    assert is_complete(path)
+    topics: dict[str, list[bytes]] = {}
+    for record in read_records(path):
+        topics.setdefault(record.topic, []).append(record.data)
+    assert set(topics) == {
+        "/metrics/learner/0",
+        "/metrics/actor/a0",
+        "/events/actor/a0",
+        "/version/learner/0",
+        "/rollout/a0",
+        *(f"/episode/a0/{part}" for part in ("raw", "scene", "surface", "tf", "contacts", "signals")),
+        *(f"/episode/a0/hand/{link.name}" for link in get_hand("human").links),
+    }
+    assert len(topics["/metrics/learner/0"]) == 3
+    assert json.loads(topics["/version/learner/0"][0]) == {"version": 7, "hash": "ab"}
+    np.testing.assert_array_equal(read_metrics(tmp_path)["learner/0/kl"][0], [0, 1, 2])
+    (kept,) = read_episodes(tmp_path)
+    np.testing.assert_array_equal(kept.arrays["link_position"], episode().arrays["link_position"])
+    assert kept.meta["metrics"] == {"return": 1.0}
+    (read,) = read_rollouts(tmp_path)
+    assert dict(read.meta) == dict(rollout.meta) and set(read.arrays) == set(rollout.arrays)
+    for name, array in rollout.arrays.items():
+        np.testing.assert_array_equal(read.arrays[name], array)
+
+
+def test_damaged_messages_are_left_out_and_counted(transport: MemoryTransport, tmp_path: pathlib.Path) -> None:
+    said: list[str] = []
+    broken = Message({**episode().arrays, "link_position": np.zeros(3)}, episode().meta)
+    with Recorder(transport, "r", tmp_path, complain=said.append) as recorder:
+        transport.publish(METRICS, Message({}, {}))
+        transport.publish(METRICS, Message({}, {"values": {"kl": "high"}}))
+        transport.publish(KEYS.log("episode", "actor", "a0"), broken)
+        transport.publish("congrasp/r/log/gossip/actor/a0", Message({}, {}))
+        transport.publish("congrasp/r/log/metrics", Message({}, {}))
+        transport.publish(METRICS, metrics(0))
+    assert (recorder.messages, recorder.damaged) == (1, 5)
+    assert len(said) == 1 and METRICS in said[0]
+    assert [record.topic for record in read_records(recorder.files[0])] == ["/metrics/learner/0"]
+
+
+def test_what_comes_faster_than_it_is_written_is_dropped_and_counted(
+    transport: MemoryTransport, tmp_path: pathlib.Path
+) -> None:
+    recorder = Recorder(transport, "r", tmp_path, depth=10)
+    for update in range(25):
+        transport.publish(METRICS, metrics(update))
+    recorder.start().close()
+    assert (recorder.messages, recorder.dropped) == (10, 15)
+    np.testing.assert_array_equal(read_metrics(tmp_path)["learner/0/kl"][0], range(15, 25))
+
+
+def test_a_full_disk_stops_the_recording_alone(
+    transport: MemoryTransport, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    seen: list[Entry] = []
+
+    class Sink:
+        def write(self, entry: Entry) -> None:
+            seen.append(entry)
+
+    flush = LogWriter.flush
+    full = False
+
+    def flush_or_fail(self: LogWriter) -> None:
+        if full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        flush(self)
+
+    monkeypatch.setattr(LogWriter, "flush", flush_or_fail)
+    with Recorder(transport, "r", tmp_path, complain=said.append, sinks=[Sink()]) as recorder:
+        transport.publish(METRICS, metrics(0))
+        wait_for(lambda: bool(recorder.files) and len(list(read_records(recorder.files[0]))) == 1)
+        full = True
+        wait_for(lambda: bool(recorder.error))
+        transport.publish(METRICS, metrics(1))
+        wait_for(lambda: len(seen) == 2)
+    assert said == [recorder.error]
+    assert "No space left on device" in recorder.error and "\n" not in recorder.error
+    np.testing.assert_array_equal(read_metrics(tmp_path)["learner/0/kl"][0], [0])
+
+
+def test_files_rotate_while_recording(transport: MemoryTransport, tmp_path: pathlib.Path) -> None:
+    with Recorder(transport, "r", tmp_path, max_seconds=0.0) as recorder:
+        for update in range(3):
+            transport.publish(METRICS, metrics(update))
+    assert len(recorder.files) == 3 and all(is_complete(path) for path in recorder.files)
+
+
+def start_recorder(endpoint: str, out: pathlib.Path, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "services.cli.main", "record", "--connect", endpoint, "--run", "r"]
+    return subprocess.Popen(
+        [*command, "--out", str(out), *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def publish_until(transport: ZenohTransport, done: Callable[[], bool]) -> int:
+    """Publishes updates until something has happened; returns how many."""
+    update = 0
+
+    def step() -> bool:
+        nonlocal update
+        transport.publish(METRICS, metrics(update))
+        update += 1
+        return done()
+
+    wait_for(step, 60.0)
+    return update
+
+
+def recorded(out: pathlib.Path) -> int:
+    return sum(len(list(read_records(path))) for path in log_files(out)) if out.exists() and any(out.iterdir()) else 0
+
+
+def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path: pathlib.Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ZenohTransport(listen=[endpoint]) as transport:
+        process = start_recorder(endpoint, tmp_path / "out")
+        try:
+            publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
+            transport.publish(KEYS.log("episode", "actor", "a0"), episode())
+            wait_for(lambda: bool(list(read_episodes(tmp_path / "out"))))
+            process.send_signal(signal.SIGINT)
+            out, errors = process.communicate(timeout=10)
+        finally:
+            process.kill()
+            process.wait(10)
+    (path,) = log_files(tmp_path / "out")
+    assert is_complete(path) and str(path) in out
+    assert process.returncode == 130, errors
+    assert "messages recorded" in errors and "Traceback" not in errors
+
+
+def test_a_killed_recorder_leaves_a_readable_file_and_the_run_goes_on(tmp_path: pathlib.Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ZenohTransport(listen=[endpoint]) as transport:
+        process = start_recorder(endpoint, tmp_path / "out")
+        try:
+            publish_until(transport, lambda: recorded(tmp_path / "out") > 20)
+        finally:
+            process.kill()
+            process.communicate(timeout=10)
+        transport.publish(METRICS, metrics(0))
+    (path,) = log_files(tmp_path / "out")
+    assert not is_complete(path)
+    steps, _ = read_metrics(tmp_path / "out")["learner/0/kl"]
+    assert len(steps) > 20
+    np.testing.assert_array_equal(np.diff(steps), 1)
+    assert doctor(path) <= CUT
+
+
+CUT = {
+    *("BAD_TRAILING_MAGIC", "MISSING_FOOTER", "MISSING_DATA_END", "MISSING_CHUNK_INDEXES", "MISSING_METADATA_INDEXES"),
+    *("MISSING_STATISTICS", "NO_ATTACHMENTS", "TRUNCATED_RECORD", "TRUNCATED_FILE"),
+}
+"""What `pymcap-cli doctor` may say about a file whose writer was killed: its end is missing, and nothing is wrong."""
+
+
+def doctor(path: pathlib.Path) -> set[str]:
+    """The codes of what it says."""
+    command = [sys.executable, "-m", "pymcap_cli.cli", "doctor", str(path)]
+    environment = {**os.environ, "COLUMNS": "400"}
+    said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=environment).stdout
+    return set(re.findall(r"\b[A-Z]+(?:_[A-Z]+)+\b", said))
+
+
+def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:
+    """Twenty megabytes are published at it, more than it may keep; when it goes on, it says how much it missed."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    big, big_size = Message({"x": np.zeros(250_000, np.float32)}, {"actor": "a"}), 1_000_000
+    rollouts = KEYS.log("rollout", "actor", "a")
+
+    def sizes() -> list[int]:
+        records = (record for path in log_files(tmp_path / "out") for record in read_records(path))
+        return [len(record.data) for record in records if record.topic.startswith("/rollout/")]
+
+    with ZenohTransport(listen=[endpoint]) as transport:
+        process = start_recorder(endpoint, tmp_path / "out")
+        try:
+            publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
+            process.send_signal(signal.SIGSTOP)
+            for _ in range(20):
+                transport.publish(rollouts, big)
+            process.send_signal(signal.SIGCONT)
+            small = Message({"x": np.zeros(1, np.float32)}, {"actor": "a"})  # by which a gap shows
+            wait_for(lambda: transport.publish(rollouts, small) or min(sizes(), default=big_size) < big_size)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=10)
+        finally:
+            process.kill()
+            process.wait(10)
+    found = re.search(r"lost (\d+)", errors.splitlines()[-1])
+    assert found is not None
+    assert sum(size >= big_size for size in sizes()) + int(found[1]) >= 20 and int(found[1]) > 0
+
+
+def test_a_recorder_without_a_run_says_so(tmp_path: pathlib.Path) -> None:
+    process = start_recorder(f"tcp/127.0.0.1:{free_port()}", tmp_path / "out", "--duration", "1")
+    try:
+        _, errors = process.communicate(timeout=40)
+    finally:
+        process.kill()
+    assert process.returncode != 0
+    assert errors.count("congrasp: error:") == 1 and "Traceback" not in errors

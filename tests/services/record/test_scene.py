@@ -1,0 +1,191 @@
+"""What a viewer is told about an episode is where the simulation had it."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands import get_hand, kinematics
+from common.hands.spec import link_origin
+from common.wire.codec import Message, decode
+from services.record.channels import Entry
+from services.record.entries import Converter
+from services.record.poses import link_poses
+from services.record.scene import SPACING
+from tests.episodes import CONTROL_DT, FORCE, episode
+
+HAND = get_hand("human")
+START = 1_000_000_000_000
+KEY = "congrasp/run/log/episode/actor/a0"
+
+
+@pytest.fixture(scope="module")
+def entries() -> list[Entry]:
+    return Converter()(KEY, episode(), START)
+
+
+def of(entries: list[Entry], name: str) -> list[Entry]:
+    return [entry for entry in entries if entry.channel.topic == f"/episode/a0/{name}"]
+
+
+def vector(v: object) -> np.ndarray:
+    return np.array([v.x, v.y, v.z])  # type: ignore[attr-defined]
+
+
+def quaternion(q: object) -> np.ndarray:
+    return np.array([q.w, q.x, q.y, q.z])  # type: ignore[attr-defined]
+
+
+def test_poses_without_jax_agree_with_the_product_of_exponentials() -> None:
+    q = np.random.default_rng(0).uniform(HAND.lower, HAND.upper)
+    position, turn = link_poses(HAND, q)
+    expected_position, expected_turn = kinematics.link_poses(HAND, jnp.array(q))
+    np.testing.assert_allclose(position, expected_position, atol=1e-6)
+    np.testing.assert_allclose(np.abs((turn * expected_turn).sum(-1)), 1.0, atol=1e-6)
+
+
+def test_every_link_and_the_object_has_its_frame_at_every_step(entries: list[Entry]) -> None:
+    arrays = episode().arrays
+    messages = of(entries, "tf")
+    assert [e.time for e in messages] == [START + round(1e9 * CONTROL_DT) * i for i in range(12)]
+    for i, entry in enumerate(messages):
+        frames = {t.child_frame_id: t for t in FrameTransforms.FromString(entry.data).transforms}
+        assert set(frames) == {"a0", "a0/object", *(f"a0/{link.name}" for link in HAND.links)}
+        assert frames["a0"].parent_frame_id == "world"
+        for k, link in enumerate(HAND.links):
+            frame = frames[f"a0/{link.name}"]
+            assert frame.parent_frame_id == "a0"
+            np.testing.assert_allclose(vector(frame.translation), arrays["link_position"][i, k], atol=1e-7)
+            np.testing.assert_allclose(quaternion(frame.rotation), arrays["link_quaternion"][i, k], atol=1e-7)
+
+
+def test_capsules_lie_in_their_links_frames(entries: list[Entry]) -> None:
+    (entry,) = of(entries, "scene")
+    entities = {e.id: e for e in SceneUpdate.FromString(entry.data).entities}
+    for link in HAND.links:
+        entity = entities[f"hand/{link.name}"]
+        assert entity.frame_id == f"a0/{link.name}" and entity.frame_locked
+        assert len(entity.cylinders) == len(link.capsules)
+        for cylinder, capsule in zip(entity.cylinders, link.capsules, strict=True):
+            along = Rotation.from_quat(quaternion(cylinder.pose.orientation), scalar_first=True).apply([0, 0, 1])
+            ends = vector(cylinder.pose.position) + np.outer([-0.5, 0.5], along * cylinder.size.z)
+            np.testing.assert_allclose(ends, np.subtract([capsule.start, capsule.end], link_origin(link)), atol=1e-7)
+            assert cylinder.size.x == pytest.approx(2 * capsule.radius)
+
+
+def test_approach_arrow_points_at_the_heading_position(entries: list[Entry]) -> None:
+    (entry,) = of(entries, "scene")
+    entities = {e.id: e for e in SceneUpdate.FromString(entry.data).entities}
+    (arrow,) = entities["constraint/heading"].arrows
+    direction = Rotation.from_quat(quaternion(arrow.pose.orientation), scalar_first=True).apply([1, 0, 0])
+    tip = vector(arrow.pose.position) + (arrow.shaft_length + arrow.head_length) * direction
+    arrays = episode().arrays
+    np.testing.assert_allclose(tip, arrays["goal/heading_position"], atol=1e-6)
+    np.testing.assert_allclose(direction, arrays["goal/heading_direction"], atol=1e-6)
+    assert entities["constraint/heading"].frame_id == "a0/object"
+
+
+@pytest.mark.parametrize(
+    ("mask", "shown"),
+    [
+        ((0, 0, 0, 0), {"heading"}),
+        ((1, 0, 0, 1), {"heading", "trajectory"}),
+        ((0, 1, 1, 0), {"heading", "pose"}),
+        ((0, 1, 0, 1), {"heading", "pose", "trajectory"}),
+    ],
+)
+def test_only_active_constraints_are_drawn(mask: tuple[int, ...], shown: set[str]) -> None:
+    (entry,) = of(Converter()(KEY, episode(mask=mask), START), "scene")
+    ids = {e.id for e in SceneUpdate.FromString(entry.data).entities}
+    assert {name.removeprefix("constraint/") for name in ids if name.startswith("constraint/")} == shown
+
+
+def test_a_new_episode_removes_what_the_last_one_left(entries: list[Entry]) -> None:
+    (entry,) = of(entries, "scene")
+    assert [d.type for d in SceneUpdate.FromString(entry.data).deletions] == [SceneEntityDeletion.ALL]
+    assert entry.channel.latched
+
+
+def test_surface_points_are_coloured_by_region(entries: list[Entry]) -> None:
+    (entry,) = of(entries, "surface")
+    cloud = PointCloud.FromString(entry.data)
+    offsets = {field.name: field.offset for field in cloud.fields}
+    raw = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
+    arrays = episode().arrays
+    points = np.stack([raw[:, offsets[a] : offsets[a] + 4].copy().view("<f4")[:, 0] for a in "xyz"], -1)
+    np.testing.assert_array_equal(points, arrays["surface_points"])
+    red, green = raw[:, offsets["red"]].astype(int), raw[:, offsets["green"]].astype(int)
+    np.testing.assert_array_equal(red > green, arrays["surface_minus"])
+
+
+def test_points_of_every_link_lie_on_its_capsules_in_its_frame(entries: list[Entry]) -> None:
+    for link in HAND.links:
+        (entry,) = of(entries, f"hand/{link.name}")
+        cloud = PointCloud.FromString(entry.data)
+        assert cloud.frame_id == f"a0/{link.name}" and entry.channel.latched
+        raw = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
+        points = raw[:, :12].copy().view("<f4") + link_origin(link)
+        depth = []
+        for capsule in link.capsules:
+            start, along = np.array(capsule.start), np.subtract(capsule.end, capsule.start)
+            share = np.clip((points - start) @ along / (along @ along), 0, 1)
+            depth.append(np.linalg.norm(points - start - share[:, None] * along, axis=1) - capsule.radius)
+        each = np.split(np.arange(len(points)), len(link.capsules))
+        for distance, own in zip(depth, each, strict=True):
+            np.testing.assert_allclose(distance[own], 0, atol=1e-6)
+            ends = points[own].min(0), points[own].max(0)
+            assert np.linalg.norm(ends[1] - ends[0]) > 0.01
+
+
+def test_table_and_forces_are_drawn_while_they_last(entries: list[Entry]) -> None:
+    updates = [SceneUpdate.FromString(entry.data) for entry in of(entries, "contacts")]
+    has_table = [any(e.id == "table" for e in update.entities) for update in updates]
+    assert has_table == [True] * 8 + [False] * 4
+    arrows = [len(next(e for e in update.entities if e.id == "forces").arrows) for update in updates]
+    assert arrows == [0] * 6 + [5] * 6
+    for update in updates:
+        assert all(0 < e.lifetime.ToNanoseconds() <= 2 * round(1e9 * CONTROL_DT) for e in update.entities)
+
+
+def test_signals_of_a_step(entries: list[Entry]) -> None:
+    signals = [json.loads(entry.data) for entry in of(entries, "signals")]
+    last = signals[-1]
+    assert last["seconds"] == pytest.approx(11 * CONTROL_DT)
+    assert last["reward"] == pytest.approx({"contact": 0.5, "distance": -0.1, "total": 0.4}, abs=1e-6)
+    assert last["force"]["thumb_distal"] == pytest.approx(FORCE) and last["force"]["palm"] == 0
+    assert last["links_in_contact"] == 5 and last["table"] is False
+    assert list(last["q"]) == [joint.name for joint in HAND.joints]
+    index = [joint.name for joint in HAND.joints].index("index_pip")
+    assert last["q"]["index_pip"] == pytest.approx(float(episode().arrays["q"][-1, index]))
+
+
+def test_the_raw_episode_is_kept_whole(entries: list[Entry]) -> None:
+    (entry,) = of(entries, "raw")
+    kept, sent = decode(entry.data), episode()
+    assert kept.meta == sent.meta
+    assert all(np.array_equal(kept.arrays[name], sent.arrays[name]) for name in sent.arrays)
+
+
+def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side() -> None:
+    convert = Converter()
+    first, second = convert(KEY, episode(), START), convert(KEY, episode(), START + 1)
+    assert min(e.time for e in second) > max(e.time for e in first)
+    other = convert("congrasp/run/log/episode/actor/b", episode(), START)
+    transforms = [
+        FrameTransforms.FromString(next(e for e in es if e.channel.topic.endswith("/tf")).data) for es in (first, other)
+    ]
+    places = [next(t for t in tf.transforms if t.parent_frame_id == "world").translation.x for tf in transforms]
+    assert places == [0.0, pytest.approx(SPACING)]
+
+
+def test_an_unknown_hand_is_said_in_words() -> None:
+    strange = Message(episode().arrays, {**episode().meta, "hand": "tentacle"})
+    with pytest.raises(CongraspError, match="tentacle"):
+        Converter()(KEY, strange, START)

@@ -1,0 +1,157 @@
+"""The queue before the policy: every query is answered once, and too many are told so at once."""
+
+import threading
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.errors import CongraspError
+from services.serve.batching import Batcher, Late, Overloaded
+
+
+class Gate:
+    """A function of batches that waits until it is let through, and remembers what it saw."""
+
+    def __init__(self):
+        self.batches = []
+        self.entered = threading.Semaphore(0)
+        self.go = threading.Event()
+
+    def __call__(self, items, queued):
+        assert len(queued) == len(items)
+        self.entered.release()
+        assert self.go.wait(10)
+        self.batches.append(list(items))
+        return [10 * item for item in items]
+
+
+@pytest.fixture
+def gate():
+    return Gate()
+
+
+def running(batcher, gate):
+    """Submits an item, 0, that runs alone in its caller's thread and is held at the gate."""
+    answer = Future()
+    threading.Thread(target=lambda: answer.set_result(batcher.submit(0, 10.0).result(10)), daemon=True).start()
+    assert gate.entered.acquire(timeout=10)
+    return answer
+
+
+def test_what_arrives_during_a_batch_makes_the_next_one(gate):
+    batcher = Batcher(gate, size=4, window=0.0, depth=10)
+    futures = [running(batcher, gate)]
+    futures += [batcher.submit(i, 10.0) for i in range(1, 7)]
+    gate.go.set()
+    assert [future.result(10) for future in futures] == [0, 10, 20, 30, 40, 50, 60]
+    assert gate.batches == [[0], [1, 2, 3, 4], [5, 6]]
+    batcher.close()
+
+
+def test_a_batch_holds_what_weighs_no_more_than_its_size(gate):
+    batcher = Batcher(gate, size=4, window=0.0, depth=10, weigh=lambda item: item)
+    futures = [running(batcher, gate)]
+    futures += [batcher.submit(weight, 10.0) for weight in (3, 1, 2, 4, 1, 1)]
+    gate.go.set()
+    assert [future.result(10) for future in futures] == [0, 30, 10, 20, 40, 10, 10]
+    assert gate.batches == [[0], [3, 1], [2], [4], [1, 1]]
+    batcher.close()
+
+
+def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
+    batcher = Batcher(gate, size=4, window=0.0, depth=2)
+    futures = [running(batcher, gate)]
+    futures += [batcher.submit(i, 10.0) for i in (1, 2)]
+    with pytest.raises(Overloaded, match="Overloaded: 2 queries wait"):
+        batcher.submit(3, 10.0)
+    gate.go.set()
+    assert [future.result(10) for future in futures] == [0, 10, 20]
+    batcher.close()
+
+
+def test_a_query_whose_deadline_passed_is_not_computed(gate):
+    batcher = Batcher(gate, size=4, window=0.0, depth=4)
+    running(batcher, gate)
+    late, patient = batcher.submit(1, 0.001), batcher.submit(2, 10.0)
+    time.sleep(0.02)
+    gate.go.set()
+    assert patient.result(10) == 20
+    with pytest.raises(Late, match="deadline"):
+        late.result(10)
+    assert gate.batches == [[0], [2]]
+    batcher.close()
+
+
+def test_a_lone_item_runs_in_its_callers_thread_and_a_crowd_in_another():
+    threads, go = [], threading.Event()
+
+    def run(items, queued):
+        threads.append(threading.get_ident())
+        assert len(threads) == 1 or go.wait(10)
+        return items
+
+    batcher = Batcher(run, size=4, window=0.0, depth=4)
+    alone = threading.get_ident()
+    assert batcher.submit(1, 10.0).result(0) == 1
+    pool = ThreadPoolExecutor(1)
+    held = pool.submit(batcher.submit, 2, 10.0)
+    while len(threads) < 2:
+        time.sleep(0.001)
+    crowd = [batcher.submit(i, 10.0) for i in (3, 4)]
+    go.set()
+    assert [future.result(10) for future in (held.result(10), *crowd)] == [2, 3, 4]
+    assert threads[0] == alone and threads[2] not in (alone, threads[1]) and len(threads) == 3
+    batcher.close()
+    pool.shutdown()
+
+
+def test_a_failure_reaches_its_own_batch_alone():
+    def run(items, queued):
+        if "bad" in items:
+            raise ZeroDivisionError
+        return [CongraspError("refused") if item == "odd" else item for item in items]
+
+    batcher = Batcher(run, size=1, window=0.0, depth=4)
+    bad, odd, good = (batcher.submit(item, 10.0) for item in ("bad", "odd", "good"))
+    assert isinstance(bad.exception(10), ZeroDivisionError)
+    assert str(odd.exception(10)) == "refused"
+    assert good.result(10) == "good"
+    batcher.close()
+
+
+def test_closing_refuses_what_waits_and_what_comes(gate):
+    batcher = Batcher(gate, size=1, window=0.0, depth=4)
+    first = running(batcher, gate)
+    waiting = batcher.submit(1, 10.0)
+    closing = threading.Thread(target=batcher.close)
+    closing.start()
+    with pytest.raises(CongraspError, match="shutting down"):
+        while True:
+            batcher.submit(2, 10.0)
+            time.sleep(0.001)
+    gate.go.set()
+    assert first.result(10) == 0
+    with pytest.raises(CongraspError, match="shutting down"):
+        waiting.result(10)
+    closing.join(10)
+    assert not closing.is_alive()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.integers(), max_size=60), st.integers(1, 8), st.sampled_from([0.0, 0.001]))
+def test_every_item_gets_its_own_answer(items, size, window):
+    seen = []
+
+    def run(batch, queued):
+        seen.extend(batch)
+        assert 1 <= len(batch) <= size
+        return [-item for item in batch]
+
+    batcher = Batcher(run, size=size, window=window, depth=len(items) + 1)
+    futures = [batcher.submit(item, 10.0) for item in items]
+    assert [future.result(10) for future in futures] == [-item for item in items]
+    assert seen == items
+    batcher.close()

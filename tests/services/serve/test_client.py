@@ -1,0 +1,154 @@
+"""The thin client against a server of canned answers: what it sends, remembers, and survives."""
+
+import time
+
+import numpy as np
+import pytest
+
+from common.config import TaskConfig
+from common.errors import CongraspError, TransportError
+from common.hands import get_hand
+from common.transport.keys import Keys
+from common.transport.ports import free_port
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message
+from services.serve.client import PolicyClient
+from services.serve.requests import PACKED, Layout
+
+RESET = {
+    "q": np.full(20, 0.1),
+    "wrist": (np.array([0.0, 0.0, 0.3]), np.array([1.0, 0.0, 0.0, 0.0])),
+    "obj": (np.array([0.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.0, 0.0])),
+    "surface": np.zeros((4, 3)),
+    "heading_position": np.zeros(3),
+    "heading_direction": np.array([0.0, 0.0, -1.0]),
+}
+STATE = {
+    "q": np.full(20, 0.2),
+    "u": np.zeros(6),
+    "object_position": RESET["obj"][0],
+    "object_quaternion": RESET["obj"][1],
+}
+
+
+def layout(points=4):
+    return Layout(get_hand("human"), TaskConfig(surface_points=points, trajectory_points=2))
+
+
+class CannedServer:
+    """Answers the n-th query with targets of value n, and keeps the fields of the queries and how they came."""
+
+    def __init__(self, endpoint: str, points: int = 4):
+        self.layout = layout(points)
+        self.fields: list[dict[str, np.ndarray]] = []
+        self.forms: list[str] = []
+        self.transport = ZenohTransport(listen=[endpoint], flows=("policy",))
+        self.transport.serve(Keys("policy").act, self._act)
+        self.transport.serve(Keys("policy").health, lambda key, request: Message({}, {"ready": True}))
+
+    def _act(self, key: str, request: Message) -> Message:
+        query = self.layout.parse(request)
+        self.fields.append({name: value[0] for name, value in self.layout.unpack(query.vectors).items()})
+        self.forms.append("packed" if PACKED in request.arrays else "named")
+        n = np.float32(len(self.fields))
+        meta = {"version": 3, "active": [["words"]], "total_ms": 0.5}
+        targets = {"action": np.zeros(26, np.float32), "q_target": np.full(20, n), "u_target": np.full(6, -n)}
+        if self.forms[-1] == "packed":
+            return Message({PACKED: np.concatenate(list(targets.values()))[None]}, meta)
+        return Message(targets, {**meta, "layout": self.layout.digest, **self.layout.description()})
+
+    def close(self) -> None:
+        self.transport.close()
+
+
+@pytest.fixture
+def endpoint():
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+def test_the_client_remembers_the_episode_and_the_previous_targets(endpoint):
+    server = CannedServer(endpoint)
+    with PolicyClient(endpoint) as client:
+        client.reset(**RESET)
+        answer = client.act(STATE)
+        client.act({**STATE, "table": False})
+        client.reset(**RESET)
+        client.act(STATE)
+    server.close()
+    first, second, third = server.fields
+    assert server.forms == ["named", "packed", "named"]
+    assert answer.version == 3 and answer.active == ("words",) and answer.server_ms == 0.5
+    np.testing.assert_array_equal(answer.u_target, np.full(6, -1.0))
+    np.testing.assert_allclose(first["q_target"], RESET["q"], rtol=1e-6)
+    np.testing.assert_array_equal(second["q_target"], np.full(20, 1.0))
+    np.testing.assert_array_equal(second["u_target"], np.full(6, -1.0))
+    np.testing.assert_allclose(third["q_target"], RESET["q"], rtol=1e-6)
+    assert [float(arrays["time"]) for arrays in (first, second, third)] == [0.0, 1.0, 0.0]
+    assert [bool(arrays["table"]) for arrays in (first, second, third)] == [True, False, True]
+    np.testing.assert_allclose(second["q_initial"], RESET["q"], rtol=1e-6)
+
+
+def test_the_client_finds_a_server_again_that_was_started_anew(endpoint):
+    server = CannedServer(endpoint)
+    with PolicyClient(endpoint) as client:
+        client.reset(**RESET)
+        client.act(STATE)
+        server.close()
+        with pytest.raises(TransportError):
+            client.act(STATE)
+        server = CannedServer(endpoint)
+        deadline = time.monotonic() + 30
+        while True:
+            try:
+                client.act(STATE)
+                break
+            except TransportError:
+                assert time.monotonic() < deadline, "the client did not come back"
+                time.sleep(0.1)
+        # The failed query moved neither the clock nor the targets of the episode.
+        assert float(server.fields[0]["time"]) == 1.0
+        np.testing.assert_array_equal(server.fields[0]["q_target"], np.full(20, 1.0))
+    server.close()
+
+
+def test_a_server_of_another_layout_in_the_first_ones_place_is_asked_by_names(endpoint):
+    server = CannedServer(endpoint)
+    with PolicyClient(endpoint) as client:
+        client.reset(**RESET)
+        client.act(STATE)
+        assert client.act(STATE).q_target[0] == 2.0
+        server.close()
+        server = CannedServer(endpoint, points=3)
+        deadline = time.monotonic() + 30
+        while not server.fields:
+            try:
+                client.act(STATE)
+            except TransportError:
+                assert time.monotonic() < deadline, "the client did not come back"
+                time.sleep(0.1)
+        client.act(STATE)
+        assert server.forms == ["named", "packed"]
+        np.testing.assert_array_equal(server.fields[1]["surface_points"], server.fields[0]["surface_points"])
+    server.close()
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [({**STATE, "weight": np.zeros(1)}, "unknown field 'weight'"), ({**STATE, "u": np.zeros(5)}, r"shape \(5,\)")],
+)
+def test_a_bad_state_is_refused_in_the_same_words_before_and_after_packing(endpoint, state, words):
+    server = CannedServer(endpoint)
+    with PolicyClient(endpoint) as client:
+        client.reset(**RESET)
+        with pytest.raises(CongraspError, match=words):
+            client.act(state)
+        client.act(STATE)
+        with pytest.raises(CongraspError, match=words):
+            client.act(state)
+        assert client.act(STATE).version == 3
+    server.close()
+
+
+def test_nobody_there_is_said_in_one_line(endpoint):
+    with pytest.raises(TransportError, match="Nobody answers at"):
+        PolicyClient(endpoint, wait=0.5)

@@ -1,0 +1,149 @@
+"""Queries: where their fields land, what is completed, and what is refused."""
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from common.config import TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.wire.codec import Message
+from services.serve.requests import Layout
+
+HAND = get_hand("human")
+LAYOUT = Layout(HAND, TaskConfig(surface_points=8, trajectory_points=3))
+COMPLETE = jax.jit(LAYOUT.complete)
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
+coordinate = st.floats(-1.0, 1.0, width=32)
+vector = st.tuples(coordinate, coordinate, coordinate).map(lambda v: np.array(v, np.float32))
+
+
+def arrays(**changes):
+    """The arrays of a query whose values tell where they belong."""
+    rng = np.random.default_rng(0)
+    state = ("q", "u", "q_target", "u_target", "q_initial", "object_position", "object_position_initial")
+    given_arrays = {name: rng.normal(size=LAYOUT.shapes[name]).astype(np.float32) for name in (*state, "base_position")}
+    given_arrays |= dict.fromkeys(("object_quaternion", "object_quaternion_initial", "base_quaternion"), IDENTITY)
+    given_arrays |= {"time": np.float32(7), "table": np.bool_(True)}
+    given_arrays |= {"surface_points": rng.normal(size=(8, 3)), "surface_minus": np.arange(8) < 3}
+    given_arrays |= {"heading_position": rng.normal(size=3), "heading_direction": np.array([0.0, 0.0, -1.0])}
+    return {name: value for name, value in {**given_arrays, **changes}.items() if value is not None}
+
+
+def parse(constraints=("heading",), meta=None, **changes):
+    return completed(LAYOUT.parse(Message(arrays(**changes), {"constraints": list(constraints), **(meta or {})})))
+
+
+def completed(query):
+    fields, checks = COMPLETE(query.vectors)
+    if complaint := LAYOUT.complaint(query, np.asarray(checks)):
+        raise complaint
+    return query, {name: np.asarray(value[0]) for name, value in fields.items()}
+
+
+def test_fields_land_in_their_places_and_absent_sensors_read_zero():
+    sent, (query, received) = arrays(), parse()
+    assert query.vectors.shape == (1, LAYOUT.size)
+    for name, value in sent.items():
+        np.testing.assert_array_equal(received[name], np.asarray(value, np.float32), err_msg=name)
+    for name in ("q_velocity", "object_velocity", "contact_force", "contact_found"):
+        assert not received[name].any()
+    np.testing.assert_array_equal(received["asked"], [1, 0, 0, 0])
+
+
+def test_the_bits_say_what_was_asked_in_the_order_of_the_constraints():
+    pose = {"pose_q": np.zeros(20), "pose_position": np.zeros(3), "pose_quaternion": IDENTITY}
+    query, fields = parse(("pose", "affordance"), **pose)
+    assert query.asked == ("affordance", "pose")
+    np.testing.assert_array_equal(fields["asked"], [0, 1, 1, 0])
+
+
+@given(vector, vector)
+def test_the_cross_direction_is_made_unit_and_orthogonal_to_the_heading(direction, cross):
+    length = np.linalg.norm(direction)
+    assume(length > 0.1)
+    _, received = parse(heading_direction=direction / length, heading_cross=cross)
+    assert np.linalg.norm(received["heading_cross"]) == pytest.approx(1.0, abs=1e-5)
+    assert received["heading_cross"] @ received["heading_direction"] == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("count", [3, 8, 20])
+def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks_at(count):
+    points = np.arange(count)[:, None] * np.ones(3)
+    _, received = parse(surface_points=points, surface_minus=np.arange(count) >= count // 2)
+    kept = received["surface_points"][:, 0]
+    assert kept[0] == 0 and np.all(np.diff(kept) >= 0) and len(set(kept)) == min(count, 8)
+    np.testing.assert_array_equal(received["surface_minus"], kept >= count // 2)
+
+
+@pytest.mark.parametrize(
+    ("constraints", "changes", "words"),
+    [
+        (["flight"], {}, "no constraint 'flight'"),
+        (["affordance"], {}, "neither a heading"),
+        (["heading", "affordance"], {"surface_minus": np.zeros(8, bool)}, "both sides"),
+        (["heading", "affordance"], {"surface_minus": None}, "lacks the field 'surface_minus'"),
+        (["heading"], {"q": None}, "lacks the field 'q'"),
+        (["heading"], {"q": np.zeros(22)}, r"'q' has shape \(22,\); it must be \(20,\)"),
+        (["heading"], {"weight": np.zeros(1)}, "unknown field 'weight'"),
+        (["heading"], {"asked": np.ones(4)}, "unknown field 'asked'"),
+        (["heading"], {"u": np.full(6, np.inf)}, "'u' is not finite"),
+        (["heading"], {"surface_points": np.zeros((0, 3))}, "surface_points"),
+        (["heading"], {"surface_minus": np.zeros(5, bool)}, r"must be \(8,\)"),
+        (["heading"], {"base_quaternion": np.zeros(4)}, "'base_quaternion' has length 0.000, not 1"),
+        (["trajectory"], {"trajectory_position": np.zeros((3, 3))}, "lacks the field 'trajectory_quaternion'"),
+    ],
+)
+def test_bad_queries_name_the_field_and_the_rule(constraints, changes, words):
+    with pytest.raises(CongraspError, match=words):
+        parse(constraints, **changes)
+
+
+def test_another_hand_is_refused():
+    with pytest.raises(CongraspError, match="no hand 'paw'"):
+        parse(meta={"hand": "paw"})
+    with pytest.raises(CongraspError, match="list of names"):
+        parse(meta={"constraints": "heading"})
+
+
+def test_a_packed_query_is_the_vector_of_the_named_one():
+    named = LAYOUT.parse(Message(arrays(), {"constraints": ["heading"]}))
+    description = LAYOUT.description()
+    vector = np.zeros(description["size"], np.float32)
+    for name, value in arrays().items():
+        offset, *shape = description["fields"][name]
+        vector[offset : offset + int(np.prod(shape))] = np.ravel(value)
+    meta = {"constraints": ["heading"], "layout": LAYOUT.digest}
+    packed = LAYOUT.parse(Message({"packed": vector[None]}, meta))
+    np.testing.assert_array_equal(packed.vectors, named.vectors)
+    other = Layout(HAND, TaskConfig(surface_points=8, trajectory_points=4)).digest
+    for count in (0, 65):
+        with pytest.raises(CongraspError, match=f"The query has {count} states"):
+            LAYOUT.parse(Message({"packed": np.tile(vector, (count, 1))}, meta))
+    for wrong in (
+        Message({"packed": vector[None]}, {**meta, "layout": other}),
+        Message({"packed": vector}, meta),
+        Message({"packed": vector[None, :-1]}, meta),
+        Message({"packed": vector[None], "q": np.zeros(20)}, meta),
+        Message({"packed": vector[None]}, {"constraints": ["heading"]}),
+    ):
+        with pytest.raises(CongraspError, match="does not follow this server's layout"):
+            LAYOUT.parse(wrong)
+
+
+def test_a_bad_query_of_a_batch_spoils_no_other():
+    good, bad, third = (
+        LAYOUT.parse(Message(arrays(**changes), {}))
+        for changes in ({}, {"u": np.full(6, np.nan)}, {"base_quaternion": np.zeros(4)})
+    )
+    queries = good, bad, good, third
+    fields, checks = COMPLETE(np.concatenate([query.vectors for query in queries]))
+    errors = [LAYOUT.complaint(query, row[None]) for query, row in zip(queries, np.asarray(checks), strict=True)]
+    assert [error is not None for error in errors] == [False, True, False, True]
+    assert "'u' is not finite" in str(errors[1]) and "base_quaternion" in str(errors[3])
+    _, alone = parse()
+    for name, value in fields.items():
+        np.testing.assert_allclose(np.asarray(value)[[0, 2]], alone[name][None].repeat(2, 0), atol=1e-6, err_msg=name)
+        assert np.isfinite(value).all()

@@ -1,0 +1,277 @@
+"""The live policy: answers, refusals in words, and swaps of weights, over both ends of the real wire."""
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import pathlib
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from common.config import NetworkConfig
+from common.errors import CongraspError, TransportError
+from common.policy import bundle as bundles
+from common.transport.keys import Keys
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.transport.ports import free_port
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message
+from services.ops.metrics import ServerMetrics, exposed
+from services.serve.client import PolicyClient
+from services.serve.inference import PolicyFunction
+from services.serve.load import example_episode
+from services.serve.server import DEPTH, PolicyServer, follow_file, follow_run
+from services.train.command import untrained
+from services.train.presets import get_preset
+from tests.services.ops.test_metrics import scrape
+
+pytestmark = pytest.mark.timeout(300)
+CONFIG = dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
+
+
+@pytest.fixture(scope="module")
+def metrics():
+    """What the server is watched by."""
+    return ServerMetrics()
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory, metrics):
+    """A server over Zenoh that follows a policy file, and the start of an episode."""
+    path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
+    bundles.save(untrained(CONFIG), path)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ZenohTransport(listen=[endpoint], flows=("policy",)) as transport:
+        server = PolicyServer(transport, "policy", follow_file(path), on_answer=metrics.answer, on_batch=metrics.batch)
+        metrics.health = server.health
+        yield path, endpoint, example_episode(1_000_000)
+        server.close()
+
+
+def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
+    _, endpoint, episode = served
+    with PolicyClient(endpoint) as client:
+        client.reset(**episode["reset"])
+        first, second = (client.act(episode["state"]) for _ in range(2))
+        assert client.health()["ready"] and client.health()["hand"] == "human"
+    assert first.q_target.shape == (20,) and first.u_target.shape == (6,) and first.action.shape == (26,)
+    assert first.version == 0 and first.active == ("The heading guides the wrist.",)
+    # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the limits.
+    expected = first.q_target + 0.1 * second.action[:20]
+    np.testing.assert_allclose(second.q_target[3:7], expected[3:7], atol=1e-4)
+
+
+def test_answers_refusals_and_batches_are_counted(served, metrics):
+    _, endpoint, episode = served
+    port = free_port()
+    with PolicyClient(endpoint) as client, exposed(port, "127.0.0.1", metrics):
+        before = scrape(port)
+        client.reset(**episode["reset"])
+        for _ in range(3):
+            client.act(episode["state"])
+        client.reset(**{**episode["reset"], "constraints": ["levitation"]})
+        with pytest.raises(TransportError):
+            client.act(episode["state"])
+        after = scrape(port)
+    grown = {name: value - before[name] for name, value in after.items()}
+    assert grown["congrasp_policy_queries_total", "answered"] == 3 == grown["congrasp_policy_seconds_count",]
+    assert grown["congrasp_policy_queries_total", "refused"] == 1
+    assert grown["congrasp_policy_batch_count",] == 3 == grown["congrasp_policy_batch_sum",]
+    assert after["congrasp_policy_ready",] == 1 and after["congrasp_policy_version",] == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"constraints": ["levitation"]}, "no constraint 'levitation'"),
+        ({"constraints": ["affordance"]}, "neither a heading"),
+        ({"constraints": ["pose"]}, "lacks the field 'pose_q'"),
+        ({"heading_direction": np.array([0.0, 0.0, 2.0])}, "not 1"),
+        ({"heading_position": np.array([np.nan, 0.0, 0.0])}, "not finite"),
+        ({"surface": np.zeros((5, 2))}, "surface_points"),
+        ({"q": np.zeros(7)}, "shape"),
+    ],
+)
+def test_bad_queries_are_refused_in_words_and_nobody_else_suffers(served, change, words):
+    _, endpoint, episode = served
+    with PolicyClient(endpoint) as client:
+        client.reset(**{**episode["reset"], **change})
+        with pytest.raises(TransportError, match=words):
+            client.act(episode["state"])
+        client.reset(**episode["reset"])
+        assert client.act(episode["state"]).version == 0
+
+
+def test_constraints_that_contradict_each_other_are_refused_alone(served):
+    """A trajectory that ends on the part that must not be touched; one that ends on the other part is answered."""
+    _, endpoint, episode = served
+    points = np.asarray(episode["reset"]["surface"])
+    minus = points[:, 0] > np.median(points[:, 0])
+    count = CONFIG.task.trajectory_points
+    asked = {
+        **episode["reset"],
+        "constraints": ["trajectory", "affordance"],
+        "surface_minus": minus,
+        "trajectory_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+    }
+    with PolicyClient(endpoint) as client:
+        client.reset(**asked, trajectory_position=np.tile(points[points[:, 0].argmax()], (count, 1)))
+        with pytest.raises(TransportError, match=r"contradict each other: the trajectory ends nearer to O-"):
+            client.act(episode["state"])
+        client.reset(**asked, trajectory_position=np.tile(points[points[:, 0].argmin()], (count, 1)))
+        assert "The affordance keeps the fingers off O-." in client.act(episode["state"]).active
+
+
+def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(served, monkeypatch):
+    path, endpoint, episode = served
+    monkeypatch.setattr("services.serve.server._FOLLOW_SECONDS", 0.001)
+    policy = untrained(CONFIG)
+    swapped = threading.Event()
+
+    def ask(_):
+        versions = []
+        with PolicyClient(endpoint, timeout=5.0) as client:
+            client.reset(**episode["reset"])
+            while not swapped.is_set():
+                versions.append(client.act(episode["state"]).version)
+            versions.append(client.act(episode["state"]).version)
+        return versions
+
+    with concurrent.futures.ThreadPoolExecutor(4) as pool, PolicyClient(endpoint) as watcher:
+        asked = pool.map(ask, range(4))
+        try:
+            for version in range(1, 101):
+                bundles.save(dataclasses.replace(policy, version=version), path)
+                deadline = time.monotonic() + 60
+                while watcher.health()["version"] != version:
+                    assert time.monotonic() < deadline, watcher.health()
+        finally:
+            swapped.set()
+        for versions in asked:
+            assert versions == sorted(versions) and versions[-1] == 100
+            assert len(set(versions)) > 10
+
+
+def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(served):
+    _, endpoint, episode = served
+    poses = [episode["state"]["q"] + 0.01 * i for i in range(11)]
+    states = [{**episode["state"], "q": pose, "q_target": pose} for pose in poses]
+    alone = []
+    with PolicyClient(endpoint, timeout=5.0) as client:
+        for state in states:
+            client.reset(**episode["reset"])
+            alone.append(client.act(state))
+        client.reset(**episode["reset"])
+        together = client.act_each(states)
+        first = client.act(states[0])
+    for one, other in zip([*together, first], [*alone, alone[0]], strict=True):
+        assert (one.version, one.active) == (other.version, other.active)
+        for name in ("action", "q_target", "u_target"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-5, err_msg=name)
+    assert np.abs(together[0].q_target - together[10].q_target).max() > 0.01
+
+
+def test_bad_lists_of_states_are_refused_in_words(served):
+    _, endpoint, episode = served
+    good, bad = episode["state"], {**episode["state"], "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])}
+    with PolicyClient(endpoint) as client:
+        client.reset(**episode["reset"])
+        with pytest.raises(TransportError, match=r"'object_quaternion' of state 2 has length 2\.000, not 1"):
+            client.act_each([good, good, bad])
+        with pytest.raises(CongraspError, match="65 states"):
+            client.act_each([good] * 65)
+        with pytest.raises(CongraspError, match="no state"):
+            client.act_each([])
+        assert len(client.act_each([good] * 64)) == 64
+
+
+def test_a_client_of_another_hand_is_refused(served):
+    _, endpoint, episode = served
+    with PolicyClient(endpoint, hand="paw") as client:
+        client.reset(**episode["reset"])
+        with pytest.raises(TransportError, match="no hand 'paw'"):
+            client.act(episode["state"])
+
+
+def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, metrics, monkeypatch):
+    _, endpoint, episode = served
+    entered, go = threading.Semaphore(0), threading.Event()
+    infer = PolicyFunction.__call__
+
+    def hold(self, weights, queries):
+        entered.release()
+        assert go.wait(60)
+        return infer(self, weights, queries)
+
+    monkeypatch.setattr(PolicyFunction, "__call__", hold)
+
+    def ask(client: PolicyClient) -> int:
+        client.reset(**episode["reset"])
+        return client.act(episode["state"]).version
+
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(PolicyClient(endpoint, timeout=50.0)) for _ in range(DEPTH + 2)]
+        pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(len(clients)))
+        stack.callback(go.set)
+        asked = [pool.submit(ask, clients[0])]
+        assert entered.acquire(timeout=60)
+        asked += [pool.submit(ask, client) for client in clients[1:-1]]
+        deadline = time.monotonic() + 60
+        while clients[-1].health()["queue"] < DEPTH:
+            assert time.monotonic() < deadline, "the queue never filled"
+            time.sleep(0.01)
+        with pytest.raises(TransportError, match="Overloaded"):
+            ask(clients[-1])
+        assert metrics.outcomes["overloaded"] == 1
+        assert not any(future.done() for future in asked)
+        go.set()
+        assert len({future.result(60) for future in asked}) == 1
+
+
+def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(served):
+    path, endpoint, _ = served
+    with PolicyClient(endpoint) as client:
+        version = client.health()["version"]
+        for other, words in (
+            (dataclasses.replace(CONFIG.task, dynamic_center=False), "another task"),
+            (dataclasses.replace(CONFIG.task, trajectory_points=3), "is needed"),
+        ):
+            policy = untrained(dataclasses.replace(CONFIG, task=other))
+            bundles.save(dataclasses.replace(policy, version=99), path)
+            deadline = time.monotonic() + 60
+            while words not in client.health()["trouble"]:
+                assert time.monotonic() < deadline, client.health()
+                time.sleep(0.05)
+            assert client.health()["version"] == version
+
+
+def test_following_a_run_pulls_only_what_is_newer():
+    keys, policy = Keys("r"), untrained(CONFIG)
+    with MemoryTransport(MemoryHub()) as transport:
+        pull = follow_run(transport, "r")
+        with pytest.raises(TransportError):
+            pull(-1)
+
+        def weights(key: str, request: Message) -> Message:
+            current = request.meta["newer_than"] == policy.version
+            return Message({}, {"version": policy.version}) if current else policy.to_message()
+
+        transport.serve(keys.weights, weights)
+        assert pull(-1).version == policy.version
+        assert pull(policy.version) is None
+
+
+def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: pathlib.Path):
+    with MemoryTransport(MemoryHub()) as transport:
+        with pytest.raises(CongraspError, match="cannot be read"):
+            PolicyServer(transport, "p", follow_file(tmp_path / "none.safetensors"))
+        broken = tmp_path / "broken.safetensors"
+        broken.write_bytes(b"PK\x03\x04 not a policy")
+        with pytest.raises(CongraspError, match="damaged"):
+            PolicyServer(transport, "p", follow_file(broken))
+        with pytest.raises(CongraspError, match="no policy to serve"):
+            PolicyServer(transport, "p", lambda version: None)
+        with pytest.raises(TransportError):
+            transport.query(Keys("p").health, Message({}, {}), timeout=0.5)

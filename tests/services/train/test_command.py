@@ -1,0 +1,160 @@
+"""What `congrasp train` says around training."""
+
+import dataclasses
+import io
+import types
+
+import pytest
+from rich.console import Console
+
+from common.config import NetworkConfig, ObjectsConfig, RunConfig, TaskConfig
+from common.errors import CongraspError
+from services.train import command as quickstart
+from services.train.command import EPISODE, SHIPPED, _compare, _minutes, _next_steps, _Progress
+from services.train.presets import get_preset
+
+CONFIG = RunConfig(updates=10, environments=4, rollout_steps=5)  # 40 steps an update
+
+
+@pytest.fixture
+def said(monkeypatch):
+    """What was printed so far, as lines."""
+    output = io.StringIO()
+    monkeypatch.setattr(quickstart, "console", Console(file=output, width=200))
+    return lambda: output.getvalue().splitlines()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that only the test moves."""
+    now = types.SimpleNamespace(seconds=100.0)
+    monkeypatch.setattr(quickstart.time, "monotonic", lambda: now.seconds)
+    return now
+
+
+def status(update, **values):
+    figures = {"transitions": 40.0 * update, "steps_per_second": 1234.4, "staleness_mean": 0.5, **values}
+    return {"values": figures, "version": update, "actors": 2}
+
+
+def test_progress_counts_the_time_left_from_the_first_update(said, clock):
+    with _Progress(CONFIG) as progress:
+        clock.seconds += 30  # compiling
+        progress.show({"actors": 2})
+        clock.seconds += 30
+        progress.show(status(1))
+        clock.seconds += 20
+        progress.show(status(3, **{"episode/success": 0.256, "episode/links_at_removal": 2.5, "episode/return": -7.25}))
+    first, early, late = (line.strip() for line in said())
+    assert first == "compiling, and filling the first batch: 30 s, 2 actor(s)"
+    assert early.startswith("update    1/10") and early.endswith("left ?")
+    # Two updates took 20 s, so that the seven others take 70.
+    for words in (
+        "update    3/10",
+        "1234 steps/s",
+        "version 3",
+        "lag 0.5",
+        "success  25.6 %",
+        "links  2.5",
+        "left 1:10",
+    ):
+        assert words in late
+
+
+def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(said, clock):
+    with _Progress(CONFIG) as progress:
+        for _ in range(22):
+            clock.seconds += 1.0
+            progress.show({"actors": 1})
+    assert [line.split()[-4] for line in said()] == ["1", "11", "21", "22"]  # the last one at the end
+
+
+def test_times_that_are_not_known_are_a_question_mark():
+    assert [_minutes(float("nan")), _minutes(float("inf")), _minutes(59.9), _minutes(600.0)] == [
+        "?",
+        "?",
+        "0:59",
+        "10:00",
+    ]
+
+
+def rows(*returns):
+    fields = ({"episode_return": value, "links_at_removal": 1.0, "success": value / 100} for value in returns)
+    return [types.SimpleNamespace(**row) for row in fields]
+
+
+@pytest.mark.parametrize(
+    ("after", "verdict"),
+    [
+        ((5.0, 6.0, 7.0), "better than the noise"),  # 6 ± 1 after 2 ± 1
+        ((2.0, 3.0, 4.0), "within the noise, or worse"),  # 3 ± 1
+        ((-9.0, -8.0, -7.0), "within the noise, or worse"),
+    ],
+)
+def test_the_comparison_claims_no_more_than_the_noise_allows(said, after, verdict):
+    _compare(rows(1.0, 2.0, 3.0), rows(*after))
+    header, reward, links, success = said()
+    assert "3 draws" in header
+    assert "2.00 ±  1.00" in reward and f"{sum(after) / 3:.2f} ±  1.00" in reward and reward.endswith(verdict)
+    assert links.endswith("within the noise, or worse")
+    assert "success, %" in success and "2.00 ±  1.00" in success and success.endswith(verdict)
+
+
+def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, tmp_path):
+    from services.cli.main import COMMANDS
+
+    (tmp_path / EPISODE).touch()
+    _next_steps(tmp_path)
+    assert any(line.strip() == str(tmp_path / EPISODE) for line in said())
+    assert not any(SHIPPED in line for line in said())
+    commands = [line.split("congrasp ", 1)[1].split()[0] for line in said() if "congrasp " in line]
+    assert commands and set(commands) <= set(COMMANDS)
+    (tmp_path / SHIPPED).touch()
+    _next_steps(tmp_path)
+    assert any(line.strip() == str(tmp_path / SHIPPED) for line in said())
+
+
+@pytest.mark.parametrize(("free", "words"), [(1000, "disk of .* is full.*--resume"), (10**9, "it said nothing")])
+def test_a_run_that_dies_of_a_full_disk_says_so(said, monkeypatch, tmp_path, free, words):
+    def die(*args, **options):
+        raise CongraspError("The learner failed: it said nothing")  # its log is on the same disk
+
+    monkeypatch.setattr(quickstart, "train", die)
+    monkeypatch.setattr(quickstart.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
+    with pytest.raises(CongraspError, match=words):
+        quickstart.run_training(CONFIG, tmp_path, actors=1, resume=False, evaluation=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"task": TaskConfig(hand="paw")}, "no hand 'paw'"),
+        ({"objects": ObjectsConfig(families=("unicorn",))}, "unicorn"),
+        ({"objects": ObjectsConfig(count=0)}, "pool of 0 objects"),
+        ({"environments": 0}, "empty"),
+    ],
+)
+def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, change, words):
+    with pytest.raises(CongraspError, match=words):
+        quickstart.run_training(
+            dataclasses.replace(CONFIG, **change),
+            tmp_path / "run",
+            actors=1,
+            resume=False,
+            evaluation=0,
+        )
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_path):
+    def stop(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(quickstart, "train", stop)
+    config = RunConfig(objects=ObjectsConfig(count=8), network=NetworkConfig(hidden=(32,)), physics="native")
+    with pytest.raises(KeyboardInterrupt):
+        quickstart.run_training(config, tmp_path, actors=1, resume=False, evaluation=0)
+    full = get_preset("human").objects.count
+    assert (
+        f"Easier than the full task: an actor has 8 objects, not {full}; networks have layers of 32 units" in said()[1]
+    )

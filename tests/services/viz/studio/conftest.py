@@ -1,0 +1,62 @@
+"""A headless browser for the tests of the page; what it saw is kept in test-results/ where a test fails."""
+
+import os
+import pathlib
+import re
+import shutil
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[4]
+RESULTS = ROOT / "test-results"
+SIZE = {"width": 1280, "height": 760}
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium, drawing without a graphics card."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
+    with playwright.sync_playwright() as running:
+        own = pathlib.Path(running.chromium.executable_path)
+        found = next(filter(None, map(shutil.which, BROWSERS)), None) or (str(own) if own.exists() else None)
+        if found is None:
+            pytest.skip("there is no browser here (tests/install_browser.sh installs one)")
+        started = running.chromium.launch(executable_path=found, args=ARGUMENTS)
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def page(browser: Any, request: pytest.FixtureRequest, tmp_path: pathlib.Path) -> Iterator[Any]:
+    """A page that must not complain: errors on its console fail the test."""
+    context = browser.new_context(viewport=SIZE, accept_downloads=True)
+    context.set_default_timeout(60_000)
+    context.tracing.start(screenshots=True, snapshots=True)
+    opened = context.new_page()
+    complaints: list[str] = []
+    opened.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+    opened.on("pageerror", lambda error: complaints.append(str(error)))
+    opened.complaints = complaints
+    yield opened
+    # Chromium itself warns when a picture is read back from a processor that draws.
+    complaints[:] = [text for text in complaints if "GL Driver Message" not in text]
+    if complaints or getattr(request.node, "failed", True) or os.environ.get("KEEP_TRACES"):
+        name = re.sub(r"\W+", "-", request.node.name)
+        RESULTS.mkdir(exist_ok=True)
+        opened.screenshot(path=RESULTS / f"{name}.png")
+        context.tracing.stop(path=RESULTS / f"{name}.zip")
+    context.close()
+    assert complaints == getattr(opened, "expected", [])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Any:
+    """Tells the fixture whether its test failed."""
+    report = yield
+    if report.when == "call":
+        item.failed = report.failed  # type: ignore[attr-defined]
+    return report

@@ -1,0 +1,99 @@
+"""The policy behind the studio: newest weights, and which of the grasps near what was drawn is shown."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from actors.trials import Outcome
+from common.errors import CongraspError, TransportError
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle
+from common.policy.pretrained import policy_file
+from services.viz.studio import grasping
+from services.viz.studio.grasping import TRIES, PolicyGrasping
+from services.viz.studio.state import Studio
+from tests.studio import objects
+
+SHIPPED = bundles.load(policy_file(None))
+
+
+class Source:
+    """Gives what it is told to."""
+
+    def __init__(self) -> None:
+        self.next: Callable[[], PolicyBundle | None] = lambda: SHIPPED
+
+    def __call__(self, version: int) -> PolicyBundle | None:
+        return self.next()
+
+
+def outcome(held: list[int], error: list[float]) -> Outcome:
+    names = ("success", "held", "heading_rad", "heading_m", "moved_at_removal", "force_link_max")
+    metrics = {name: np.zeros(TRIES) for name in names}
+    metrics["success"][held] = metrics["held"][held] = 1.0
+    metrics["heading_rad"][: len(error)] = error
+
+    class Trace:
+        object_position = np.zeros((3, TRIES, 3))
+        table = np.array([[1] * TRIES, [1] * TRIES, [0] * TRIES])
+
+    none = np.zeros(TRIES, bool)
+    return Outcome(None, none, ~none, metrics, Trace())  # type: ignore[arg-type]
+
+
+def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused_in_words() -> None:
+    source = Source()
+    policy = PolicyGrasping(source, "the run 'r'")
+    newer = dataclasses.replace(SHIPPED, version=SHIPPED.version + 5)
+    source.next = lambda: newer
+    policy.refresh()
+    assert policy.newest() == {"source": "the run 'r'", "version": SHIPPED.version + 5, "trouble": ""}
+    other = dataclasses.replace(newer, spec=dataclasses.replace(newer.spec, hand="allegro"))
+    source.next = lambda: other
+    policy.refresh()
+    assert policy.newest()["version"] == newer.version and "allegro" in policy.newest()["trouble"]
+
+    def away() -> PolicyBundle | None:
+        raise TransportError("nobody is there")
+
+    source.next = away
+    policy.refresh()
+    assert "away" in policy.newest()["trouble"]
+    source.next = lambda: None
+    policy.refresh()
+    assert policy.newest()["trouble"] == ""
+    with pytest.raises(CongraspError, match="no policy of the run 'r' yet"):
+        PolicyGrasping(source, "the run 'r'")
+
+
+def test_what_was_drawn_is_tried_first_and_the_others_are_near_it() -> None:
+    policy = PolicyGrasping(Source(), "file")
+    studio = Studio(policy.hand, policy.task, objects().get("mug"))
+    beginnings, aside = grasping._beginnings(studio.request, policy.task.surface_points)
+    goal = beginnings.request.goal
+    np.testing.assert_allclose(goal.heading_position[0], studio.arrow.position, atol=1e-6)
+    np.testing.assert_allclose(goal.heading_direction[0], studio.arrow.direction, atol=1e-6)
+    assert aside[0] == 0 and (aside[1:] > 0).all() and aside.max() < 0.04
+    cosine = goal.heading_direction @ studio.arrow.direction
+    assert (cosine > np.cos(0.5)).all() and cosine[1:].max() < 1 - 1e-6
+    np.testing.assert_allclose((goal.heading_direction * goal.heading_cross).sum(-1), 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("held", "error", "index", "says"),
+    [
+        ([0, 1, 2], [0.1, 0.0, 0.0], 0, ""),
+        ([0, 1, 2], [1.5, 1.5, 0.0], 2, "this one did better"),
+        ([3], [0.0], 3, "this one held, which what was drawn did not"),
+        ([], [0.0], 0, "Try another arrow"),
+    ],
+)
+def test_what_was_drawn_is_shown_unless_another_is_clearly_better(
+    held: list[int], error: list[float], index: int, says: str
+) -> None:
+    found = outcome(held, error)
+    assert grasping._best(found, ()) == index
+    assert says in grasping._note(found, index, np.full(TRIES, 0.004))
+    assert bool(says) == bool(grasping._note(found, index, np.full(TRIES, 0.004)))

@@ -1,0 +1,164 @@
+"""The page's server answers its own page alone, and whatever is asked, in words."""
+
+import http.client
+import json
+import pathlib
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from common.errors import CongraspError
+from common.wire.codec import decode
+from services.cli.main import main
+from services.export.motion_file import load_motion
+from services.record.reader import read_episodes
+from services.viz.studio.server import PageServer
+from services.viz.studio.session import Session
+from tests import studio as made_up
+
+
+class Page:
+    """Asks as a browser does."""
+
+    def __init__(self, port: int):
+        self.port = port
+
+    def ask(self, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        kind = {"Content-Type": "application/json"} if method == "POST" else {}
+        connection.request(method, path, body or None, {**kind, **{k.replace("_", "-"): v for k, v in headers.items()}})
+        answer = connection.getresponse()
+        found = answer.status, answer.read()
+        connection.close()
+        return found
+
+    def do(self, action: str, **values: Any) -> dict[str, Any]:
+        code, found = self.ask("POST", "/api/do", json.dumps({"action": action, **values}).encode())
+        assert code == 200
+        return json.loads(found)
+
+    def wait(self) -> dict[str, Any]:
+        deadline = time.monotonic() + 30
+        while (job := json.loads(self.ask("GET", "/api/job")[1]))["running"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        return job
+
+
+@pytest.fixture(scope="module")
+def grasping() -> made_up.MadeUpGrasping:
+    return made_up.MadeUpGrasping()
+
+
+@pytest.fixture(scope="module")
+def page(grasping: made_up.MadeUpGrasping) -> Iterator[Page]:
+    session: Session = made_up.session(grasping, window=made_up.window(5))
+    server = PageServer(session.gets, session.posts, "127.0.0.1", 0)
+    yield Page(server.port)
+    server.close()
+    session.close()
+
+
+def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: Page) -> None:
+    assert b"<title>congrasp" in page.ask("GET", "/")[1]
+    assert page.ask("GET", "/static/gl.js")[0] == 200
+    for path in ("/static/../server.py", "/static/%2e%2e/server.py", "/etc/passwd", "/static/", "/api/none"):
+        assert page.ask("GET", path)[0] == 404, path
+
+
+def test_other_sites_are_turned_away(page: Page) -> None:
+    assert page.ask("GET", "/api/state", Host="evil.example:80")[0] == 403
+    assert page.ask("GET", "/api/state", Origin="http://evil.example")[0] == 403
+    body = json.dumps({"action": "fill", "minus": True}).encode()
+    assert page.ask("POST", "/api/do", body, Content_Type="text/plain")[0] == 403
+    assert page.ask("POST", "/api/do", body, Origin="http://evil.example")[0] == 403
+    assert (
+        page.ask("GET", "/api/state", Host=f"localhost:{page.port}", Origin=f"http://localhost:{page.port}")[0] == 200
+    )
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        (b"", "JSON"),
+        (b"[1]", "JSON"),
+        (b'{"action": "explode"}', "cannot do 'explode'"),
+        (b'{"action": "view"}', "cannot do 'view'"),
+        (b'{"action": "roll", "turns": 2}', "other values"),
+        (b'{"action": "object", "name": "moon"}', "no object 'moon'"),
+        (b'{"action": "ask", "constraint": "x", "on": true}', "no constraint 'x'"),
+    ],
+)
+def test_wrong_requests_are_answered_in_words(page: Page, body: bytes, says: str) -> None:
+    code, found = page.ask("POST", "/api/do", body)
+    assert code == 200 and says in json.loads(found)["error"]
+
+
+def test_too_much_is_refused_before_it_is_read(page: Page) -> None:
+    assert page.ask("POST", "/api/upload?name=a.stl", b"", Content_Length=str(1 << 40))[0] == 413
+
+
+def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasping, tmp_path: pathlib.Path) -> None:
+    page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, minus=True)
+    page.do("grasp")
+    assert page.wait()["error"] == ""
+    assert grasping.asked[-1].constraints == ("affordance",)
+    motions = json.loads(page.ask("GET", "/api/state")[1])["motions"]
+    assert motions[0]["held"] and motions[0]["steps"] == made_up.STEPS
+    played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])
+    assert played.arrays["lane/affordance/met"].shape == (made_up.STEPS,)
+    for kind in ("npz", "mcap"):
+        (tmp_path / f"m.{kind}").write_bytes(page.ask("GET", f"/api/export?id={motions[0]['id']}&kind={kind}")[1])
+    motion = load_motion(tmp_path / "m.npz")
+    np.testing.assert_array_equal(motion.link_position, played.arrays["link_position"])
+    (episode,) = read_episodes(tmp_path / "m.mcap")
+    np.testing.assert_array_equal(episode.arrays["link_position"], played.arrays["link_position"])
+    assert b"Choose from: npz, mcap, glb" in page.ask("GET", "/api/export?id=1&kind=docx")[1]
+
+
+def test_a_fault_inside_is_told_and_the_studio_goes_on(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+    grasping.fails = "the hand fell off"
+    page.do("grasp")
+    job = page.wait()
+    grasping.fails = ""
+    assert "the hand fell off" in job["error"] and "fault of congrasp" in job["error"]
+    page.do("grasp")
+    assert page.wait()["error"] == ""
+
+
+def test_a_mesh_becomes_an_object_and_an_empty_file_a_sentence(page: Page) -> None:
+    code, found = page.ask("POST", "/api/upload?name=nothing.stl", b"", Content_Type="application/octet-stream")
+    assert code == 200 and "nothing.stl is empty" in json.loads(found)["error"]
+    code, _ = page.ask("POST", "/api/upload?name=..%2Fx.stl", b"solid", Content_Type="application/octet-stream")
+    assert code == 200 and page.wait()["error"] == ""
+    state = json.loads(page.ask("GET", "/api/state")[1])
+    assert state["studio"]["object"]["name"] == state["chosen"] == "bottle_5"
+
+
+def test_a_run_is_shown_beside_the_studio(page: Page) -> None:
+    view = json.loads(page.ask("GET", "/api/training?names=episode/return")[1])
+    assert list(view["curves"]) == ["episode/return"] and len(view["actors"]) == 5
+    played = decode(page.ask("GET", "/api/motion?id=actor:a003")[1])
+    assert played.meta["object"] == "thing-3"
+    assert "recordings" in json.loads(page.ask("GET", "/api/moment?time=1&seconds=1")[1])["error"]
+
+
+def test_a_busy_port_and_an_open_interface_are_refused_in_one_line(
+    page: Page, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(CongraspError, match="--port"):
+        PageServer({}, {}, "127.0.0.1", page.port)
+    for arguments, says in (
+        (["--host", "0.0.0.0"], "could be reached from other machines"),
+        (["--policy", "a.safetensors", "--connect", "tcp/127.0.0.1:1"], "Give one of --policy and --connect"),
+        (["--policy", "nowhere.safetensors"], "nowhere.safetensors"),
+        (["--objects", "/nowhere"], "/nowhere"),
+        (["--recordings", "/nowhere"], "/nowhere"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(["view", "--port", "0", *arguments])
+        error = capsys.readouterr().err
+        assert end.value.code == 2 and says in error and error.count("\n") == 1, error

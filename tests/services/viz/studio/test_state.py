@@ -1,0 +1,159 @@
+"""What a user does in the studio, and what the priority rules make of it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from common.config import TaskConfig
+from common.constraints.headings import BACK_OFF, INWARD
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.hands.kinematics import grasp_frame
+from common.objects import procedural
+from common.objects.shapes import matrix
+from services.viz.studio.state import Studio
+
+MUG = procedural.generate(1, "mug")
+
+
+@pytest.fixture
+def studio() -> Studio:
+    return Studio(get_hand("human"), TaskConfig(), MUG)
+
+
+def masks(studio: Studio) -> dict[str, bool]:
+    return studio.view()["active"]["masks"]
+
+
+def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
+    assert studio.trouble == ""
+    request = studio.request
+    assert request.constraints == ()
+    down = matrix(MUG.rest_poses[0][3:]) @ studio.arrow.direction
+    np.testing.assert_allclose(down, [0, 0, -1], atol=1e-6)
+    assert studio.words == ["The heading guides the wrist."]
+    assert masks(studio) == dict.fromkeys(("affordance", "pose_finger", "pose_wrist", "trajectory"), False)
+
+
+def test_the_hand_begins_before_the_arrow_and_aligned_with_it(studio: Studio) -> None:
+    hand, rest = studio.hand, MUG.rest_poses[0]
+    start = studio.view()["start"]
+    wrist, turn = np.array(start["position"][0]), matrix(np.array(start["quaternion"][0]))
+    center = wrist + turn @ grasp_frame(hand).center
+    target = rest[:3] + matrix(rest[3:]) @ studio.arrow.position
+    np.testing.assert_allclose(center, target + np.array([0, 0, BACK_OFF]), atol=1e-4)
+    np.testing.assert_allclose(turn @ grasp_frame(hand).heading, [0, 0, -1], atol=1e-4)
+
+
+def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: Studio) -> None:
+    center = MUG.points[0]
+    studio.paint([center], 0.02, minus=True)
+    far = np.linalg.norm(MUG.points - center, axis=-1)
+    np.testing.assert_array_equal(studio.canvas.minus, far <= 0.02)
+    shown = np.linalg.norm(studio.canvas.vertices - center, axis=-1)
+    np.testing.assert_array_equal(studio.canvas.shown, shown <= 0.02)
+    assert studio.asked == {"affordance"} and masks(studio)["affordance"]
+    np.testing.assert_array_equal(studio.request.obj.non_graspable_points, studio.canvas.minus)
+    studio.paint([center], 0.03, minus=False)
+    assert not studio.canvas.minus.any() and studio.asked == set()
+
+
+def test_without_paint_the_affordance_takes_the_parts_that_the_object_came_with(studio: Studio) -> None:
+    studio.ask("affordance", True)
+    np.testing.assert_array_equal(studio.canvas.minus, MUG.non_graspable_points)
+    assert 0 < studio.canvas.shown.mean() < 1
+
+
+def test_the_rules_are_told_in_words_and_masks(studio: Studio) -> None:
+    studio.ask("affordance", True)
+    studio.ask("pose", True)
+    assert masks(studio) == {"affordance": False, "pose_finger": True, "pose_wrist": True, "trajectory": False}
+    assert any("affordance is overridden" in line for line in studio.words)
+    studio.ask("trajectory", True)
+    assert masks(studio) == {"affordance": False, "pose_finger": True, "pose_wrist": False, "trajectory": True}
+    assert "guides the wrist" in studio.words[0] and "trajectory" in studio.words[0]
+    studio.ask("pose", False)
+    studio.ask("affordance", False)
+    assert studio.request.constraints == ("trajectory",)
+
+
+def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studio) -> None:
+    studio.paint([studio.arrow.position - INWARD * studio.arrow.direction], 0.03, minus=True)
+    view = studio.view()
+    assert view["active"]["overruled"] and any("turned towards O+" in line for line in view["words"])
+    assert np.linalg.norm(np.subtract(view["active"]["direction"], studio.arrow.direction)) > 0.02
+
+
+def test_the_arrow_is_aimed_as_deep_as_in_training_and_rolls_around_itself(studio: Studio) -> None:
+    studio.aim([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
+    np.testing.assert_allclose(studio.arrow.position, [0.01, -INWARD, 0.02])
+    before = studio.arrow.cross
+    studio.roll(np.pi / 2)
+    assert studio.arrow.cross @ before == pytest.approx(0.0, abs=1e-6)
+    assert studio.arrow.cross @ studio.arrow.direction == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_drawn_path_keeps_its_begin_and_ends_at_the_wrist_of_the_grasp(studio: Studio) -> None:
+    up = matrix(MUG.rest_poses[0][3:])[2]
+    drawn = [studio.arrow.position + up * h for h in (0.35, 0.25, 0.2)]
+    studio.draw(drawn)
+    studio.ask("trajectory", True)
+    assert studio.path is not None and studio.pose is not None
+    assert studio.path.position.shape == (TaskConfig().trajectory_points, 3)
+    np.testing.assert_allclose(studio.path.position[0], drawn[0], atol=1e-6)
+    np.testing.assert_allclose(studio.path.position[-1], studio.pose.position, atol=1e-6)
+    assert studio.trouble == "" and studio.words[0].startswith("The wrist trajectory")
+
+
+def test_what_training_would_draw_can_be_suggested(studio: Studio) -> None:
+    first = studio.arrow
+    studio.suggest("heading")
+    assert np.linalg.norm(studio.arrow.position - first.position) > 1e-3
+    assert studio.trouble == ""
+    studio.suggest("trajectory")
+    studio.ask("trajectory", True)
+    assert studio.trouble == "" and studio.request.constraints == ("trajectory",)
+
+
+def test_suggestions_are_for_the_object_as_it_is_shown(studio: Studio) -> None:
+    larger = Studio(studio.hand, dataclasses.replace(studio.task, object_scale=1.4), MUG)
+    for one in (studio, larger):
+        one.suggest("heading")
+    np.testing.assert_array_equal(larger.arrow.position, studio.arrow.position)
+
+
+@pytest.mark.parametrize(
+    ("do", "says"),
+    [
+        (lambda s: s.point([0, 0, np.nan], [0, 0, 1]), "three numbers"),
+        (lambda s: s.point([0, 0, 0], [0, 0, 0]), "no direction"),
+        (lambda s: s.point("up", [0, 0, 1]), "three numbers"),
+        (lambda s: s.paint([[0, 0]], 0.01, True), "brush stroke"),
+        (lambda s: s.paint([[0, 0, 0]], 9.0, True), "radius"),
+        (lambda s: s.draw([[0, 0, 0.1], [0, 0, 0.101]]), "0.1 cm long"),
+        (lambda s: s.ask("touch", True), "no constraint 'touch'"),
+        (lambda s: s.lay(99), "no resting pose"),
+        (lambda s: s.suggest("affordance"), "Nothing can be suggested"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(studio: Studio, do, says) -> None:
+    with pytest.raises(CongraspError, match=says):
+        do(studio)
+
+
+def test_an_impossible_request_says_why_before_it_is_asked(studio: Studio) -> None:
+    up = matrix(MUG.rest_poses[0][3:]).T @ np.array([0.0, 0.0, 1.0])
+    studio.aim(studio.arrow.position, up)
+    assert "under the table" in studio.trouble
+    with pytest.raises(CongraspError, match="under the table"):
+        _ = studio.request
+    studio.suggest("heading")
+    studio.fill(minus=True)
+    assert studio.trouble.startswith("Everything is painted")
+
+
+def test_another_object_forgets_what_was_asked_of_the_one_before(studio: Studio) -> None:
+    studio.ask("pose", True)
+    studio.take(dataclasses.replace(MUG, name="other"))
+    assert studio.asked == set() and studio.pose is None and studio.view()["object"]["name"] == "other"

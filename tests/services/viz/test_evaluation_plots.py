@@ -1,0 +1,64 @@
+"""An evaluation's figures say what its JSON says."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from actors.environment import METRICS
+from common.errors import CongraspError
+from common.task.types import MASKS
+from services.cli.plot import plot
+from services.evaluate.plots import cells, plot_evaluation
+from services.evaluate.scores import Sample, active_mask, summarise, write_json
+
+
+def evaluation(path: pathlib.Path) -> list[dict]:
+    """Two rows of 40 episodes, of which 30 succeeded with errors that rise evenly from 0.1 to 0.4."""
+    rows = []
+    for constraint in ("heading", "trajectory+affordance"):
+        values = {name: np.zeros(40) for name in METRICS}
+        values["success"][:30] = 1
+        for name in METRICS:
+            if name.endswith(("_rad", "_m", "_ratio")):
+                values[name] = np.concatenate([np.linspace(0.1, 0.4, 30), np.full(10, 9.0)])
+        for name, bit in zip(MASKS, active_mask(constraint), strict=True):
+            values[f"mask_{name}"][:] = bit
+        sample = Sample(values, np.zeros((0, 1, 1)), np.zeros((0, 1, 1)))
+        rows.append(summarise(constraint, "human", sample, held_2s=True))
+    write_json(rows, path, {})
+    return json.loads(path.read_text())["rows"]
+
+
+def test_quantiles_are_of_the_successful_episodes(tmp_path: pathlib.Path) -> None:
+    heading, composed = evaluation(tmp_path / "e.json")
+    np.testing.assert_allclose(heading["quantiles"]["heading_rad"], np.linspace(0.1, 0.4, 101), atol=1e-6)
+    assert set(heading["quantiles"]) == {"heading_rad", "heading_m"}
+    assert set(composed["quantiles"]) == {"traj_rad", "traj_m", "affordance_ratio"}
+
+
+def test_the_table_has_every_row_beside_the_papers(tmp_path: pathlib.Path) -> None:
+    head, heading, composed = cells(evaluation(tmp_path / "e.json"))
+    assert heading[:5] == ["heading", "40", "75.0 (59.8-85.8)", "96.9", "0.0"]
+    at = head.index("Heading, direction, rad")
+    assert heading[at : at + 2] == ["0.250", "0.137"] and composed[at : at + 2] == ["", ""]
+    at = head.index("Affordance, wrong contacts, share")
+    assert composed[at : at + 2] == ["0.250", "0.045"]
+
+
+def test_an_evaluation_becomes_png_and_pdf(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    evaluation(tmp_path / "e.json")
+    assert plot(tmp_path / "e.json") == 0
+    files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
+    assert [f.name for f in files] == [f"{n}.{k}" for n in ("table", "success", "errors") for k in ("png", "pdf")]
+    starts = {".png": b"\x89PNG", ".pdf": b"%PDF-"}
+    assert all(file.read_bytes().startswith(starts[file.suffix]) for file in files)
+
+
+def test_other_files_are_refused_in_words(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "a.json").write_text("[1]")
+    with pytest.raises(CongraspError, match=r"a\.json is not the result of an evaluation .*evaluate --json"):
+        plot_evaluation(tmp_path / "a.json", tmp_path, ("png",))
+    with pytest.raises(CongraspError, match="cannot be read"):
+        plot_evaluation(tmp_path / "b.json", tmp_path, ("png",))

@@ -1,0 +1,94 @@
+"""Figures hold every metric once, and their curves are the metrics."""
+
+import pathlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from common.errors import CongraspError
+from services.cli.plot import plot
+from services.record.channels import JsonChannels, nest
+from services.record.writer import LogWriter
+from services.viz.plots import LEARNING, Panel, draw, figures, plot_run, smooth
+
+METRICS = {
+    "episode/return": 3.0,
+    "episode/success": 0.5,
+    "episode/heading_rad": 0.3,
+    "term/contact": 1.0,
+    "term/force_excess": -0.1,
+    "kl": 0.01,
+    "steps_per_second": 900.0,
+    "staleness_mean": 0.5,
+    "staleness_max": 1.0,
+    "queue_length": 2.0,
+}
+
+
+def record(directory: pathlib.Path, updates: int = 30) -> None:
+    writer, channels = LogWriter(directory, "log"), JsonChannels()
+    for i in range(updates):
+        values = nest({name: value * (1 + i / updates) for name, value in METRICS.items()})
+        writer.write(channels.entry("/metrics/learner/0", i, {"update": i, "values": values}))
+        writer.write(channels.entry("/metrics/actor/a0", i, {"version": i, "values": {"steps_per_second": 400.0}}))
+    writer.close()
+
+
+def test_every_metric_is_in_exactly_one_panel() -> None:
+    series = {f"learner/0/{name}": (np.arange(3), np.arange(3.0)) for name in METRICS}
+    groups = figures(series)
+    shown = [metric for _, panels in groups.values() for panel in panels for metric in panel.metrics]
+    assert sorted(shown) == sorted(METRICS)
+    assert [panel.metrics for panel in groups["reward_terms"][1]] == [("term/contact",), ("term/force_excess",)]
+    assert groups["episodes"][1] == [Panel("Heading rad", "rad", ("episode/heading_rad",))]
+    assert groups["details"][1] == [Panel("Queue length", "", ("queue_length",))]
+    assert {panel.title for panel in groups["learning"][1]} == {
+        panel.title for panel in LEARNING if set(panel.metrics) & set(METRICS)
+    }
+
+
+def test_a_run_becomes_png_files(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(tmp_path / "run" / "logs")
+    assert plot(tmp_path / "run") == 0
+    files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
+    figures = ("learning", "reward_terms", "episodes", "details")
+    assert [file.name for file in files] == [f"{name}.{kind}" for name in figures for kind in ("png", "pdf")]
+    assert all(file.read_bytes().startswith(b"%PDF-") for file in files if file.suffix == ".pdf")
+    assert all(file.parent == tmp_path / "run" / "plots" for file in files)
+    learning = np.asarray(Image.open(files[0]).convert("RGB")).astype(int)
+    assert learning.shape[1] > 1200
+    # The learner's and the actor's lines in their colours.
+    for colour in ((0x2F, 0x6F, 0xDB), (0xE0, 0x8A, 0x2C)):
+        assert (np.abs(learning - colour).sum(-1) < 10).sum() > 200
+
+
+def test_the_curve_is_the_metric() -> None:
+    steps, values = np.arange(10) * 3, np.arange(10.0) ** 2
+    figure = draw("Title", [Panel("Kl", "nats", ("kl",))], {"learner/0/kl": (steps, values)})
+    (line,) = [line for axes in figure.axes for line in axes.get_lines()]
+    np.testing.assert_array_equal(line.get_xydata(), np.stack([steps, values], -1))
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40), st.integers(1, 12))
+def test_smoothing_is_the_mean_of_the_last_values(values: list[float], window: int) -> None:
+    expected = [np.mean(values[max(0, i - window + 1) : i + 1]) for i in range(len(values))]
+    np.testing.assert_allclose(smooth(np.array(values), window), expected, atol=1e-9)
+
+
+def test_smoothing_skips_what_is_absent_and_keeps_constants() -> None:
+    np.testing.assert_allclose(smooth(np.array([np.nan, 1.0, np.nan, 3.0]), 3), [np.nan, 1.0, 1.0, 2.0])
+    assert (smooth(np.full(500, 5e-4), 12) == 5e-4).all()
+
+
+def test_nothing_to_draw_is_said_in_words(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(CongraspError, match="no recording"):
+        plot_run(tmp_path, tmp_path)
+    LogWriter(tmp_path / "logs", "log").close()
+    writer = LogWriter(tmp_path / "logs", "log")
+    writer.write(JsonChannels().entry("/version/learner/0", 0, {"version": 1}))
+    writer.close()
+    with pytest.raises(CongraspError, match="no metrics"):
+        plot_run(tmp_path, tmp_path)

@@ -1,0 +1,253 @@
+"""Pictures show what is there, where it is, and in the right colours."""
+
+import pathlib
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.wire.codec import encode
+from services.cli import render as command
+from services.record.channels import Entry, opaque_channel
+from services.record.writer import LogWriter
+from services.viz.raycast import Camera, Scene, Shape, between
+from services.viz.render import (
+    OBJECT,
+    OBJECT_MINUS,
+    TOUCHING,
+    arrow,
+    beads,
+    best_camera,
+    episode_shapes,
+    episode_sheet,
+    episode_title,
+    fit,
+    hand_sheet,
+    key_steps,
+    pick_episode,
+    render_episode_frames,
+)
+from services.viz.shade import render_scene, visible
+from services.viz.sheets import contact_sheet, save_png, save_video
+from services.viz.smooth import SmoothNormals
+from tests.episodes import CONTROL_DT, episode
+
+WHITE, RED, BLUE = (0.9, 0.9, 0.9), (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
+FRONT = Camera(np.array([1.0, 0.0, 0.0]), np.zeros(3), 30.0)
+
+
+def ball(radius: float = 0.1, colour: tuple[float, float, float] = RED, at: tuple[float, ...] = (0, 0, 0)) -> Shape:
+    return Shape("sphere", (radius, 0, 0), colour, np.array(at, float))
+
+
+def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """(N, 2) picture coordinates from -1 to 1 of a square picture."""
+    x, y, z = camera.axes() @ (points - camera.position).T
+    return np.stack([x, y], -1) / z[:, None] / np.tan(np.radians(camera.field_of_view) / 2)
+
+
+def test_a_ball_covers_its_projection() -> None:
+    seen = visible(Scene([ball()]), FRONT, (200, 200)) == 0
+    # A sphere of radius r at distance d is seen under the half angle asin(r / d).
+    radius = np.tan(np.arcsin(0.1)) / np.tan(np.radians(15)) * 100
+    assert seen.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
+    rows, columns = np.nonzero(seen)
+    assert rows.mean() == pytest.approx(99.5, abs=0.1) and columns.mean() == pytest.approx(99.5, abs=0.1)
+
+
+def test_right_is_right_and_up_is_up() -> None:
+    # Seen from +x, +y lies to the right.
+    seen = visible(Scene([ball(0.03, at=(0, 0.15, 0.15))]), FRONT, (100, 100)) == 0
+    rows, columns = np.nonzero(seen)
+    assert rows.mean() < 40 and columns.mean() > 60
+
+
+def test_the_nearer_shape_hides_the_other() -> None:
+    seen = visible(Scene([ball(0.1), ball(0.02, BLUE, (0.3, 0, 0))]), FRONT, (101, 101))
+    assert seen[50, 50] == 1 and seen[35, 50] == 0 and seen[0, 0] == -1
+
+
+def test_colours_and_background() -> None:
+    image = render_scene([ball()], FRONT, (60, 60))
+    assert image.shape == (60, 60, 3) and image.dtype == np.uint8
+    red, green, blue = image[25, 30].astype(int)
+    assert red > 2 * green and red > 2 * blue
+    assert image[0].min() > 180
+
+
+def test_what_is_seen_through_takes_its_share_of_the_colour() -> None:
+    pane = Shape("box", (0.01, 0.2, 0.2), BLUE, np.array([0.3, 0, 0]), alpha=0.5)
+    plain, through = render_scene([ball()], FRONT, (61, 61)), render_scene([ball(), pane], FRONT, (61, 61))
+    center_plain, center = plain[30, 30].astype(int), through[30, 30].astype(int)
+    assert center[0] < center_plain[0] and center[2] > center_plain[2]
+    assert center[0] > 40  # the red ball is still seen
+    hidden = Shape("box", (0.01, 0.02, 0.02), BLUE, np.array([-0.3, 0, 0]), alpha=0.5)
+    np.testing.assert_array_equal(render_scene([ball(), hidden], FRONT, (61, 61))[30, 30], plain[30, 30])
+
+
+def test_a_ball_darkens_the_ground_beneath_it() -> None:
+    ground = Shape("box", (1, 1, 0.01), WHITE, np.array([0, 0, -0.01]), shine=0.0)
+    above = Camera(np.array([0.5, 0.0, 0.5]), np.zeros(3), 40.0)
+    bare = render_scene([ground], above, (80, 80)).astype(int).sum(-1)
+    shaded = render_scene([ground, ball(0.05, at=(0, 0, 0.05))], above, (80, 80)).astype(int).sum(-1)
+    floor = visible(Scene([ground, ball(0.05, at=(0, 0, 0.05))]), above, (80, 80)) == 0
+    assert (bare - shaded)[floor].max() > 100
+    corner = np.zeros_like(floor)
+    corner[:10, :10] = True
+    assert np.abs(bare - shaded)[floor & corner].max() < 30
+
+
+def test_painted_regions_meet_where_their_points_do() -> None:
+    mesh = trimesh.creation.box((0.2, 0.2, 0.2))
+    points = np.array([[0.1, y, z] for y in np.linspace(-0.1, 0.1, 11) for z in np.linspace(-0.1, 0.1, 11)])
+    colours = np.where(points[:, 2:] > 0, RED, BLUE)
+    painted = Shape(
+        "mesh", (0, 0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint_points=points, paint_colours=colours
+    )
+    image = render_scene([painted], FRONT, (60, 60)).astype(int)
+    assert image[20, 30, 0] > 2 * image[20, 30, 2] and image[40, 30, 2] > 2 * image[40, 30, 0]
+
+
+def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
+    sphere = trimesh.creation.icosphere(2, 0.1)
+    points, faces = trimesh.sample.sample_surface(sphere, 500, seed=0)
+    flat = sphere.face_normals[faces]
+    exact = points / np.linalg.norm(points, axis=1, keepdims=True)
+    smooth = SmoothNormals(sphere.vertices, sphere.faces)(points, flat)
+    assert np.degrees(np.arccos((flat * exact).sum(1))).max() > 5
+    assert np.degrees(np.arccos(np.clip((smooth * exact).sum(1), -1, 1))).max() < 2
+    box = trimesh.creation.box((1, 1, 1))
+    points, faces = trimesh.sample.sample_surface(box, 200, seed=0)
+    np.testing.assert_allclose(
+        SmoothNormals(box.vertices, box.faces)(points, box.face_normals[faces]), box.face_normals[faces], atol=1e-6
+    )
+
+
+def test_between_and_arrow_lie_where_they_are_asked_to() -> None:
+    start, end = np.array([0.1, -0.2, 0.3]), np.array([-0.2, 0.1, 0.1])
+    capsule = between(start, end, 0.01, RED)
+    axis = Rotation.from_quat(capsule.quaternion, scalar_first=True).apply([0, 0, capsule.size[1]])
+    np.testing.assert_allclose([capsule.position - axis, capsule.position + axis], [start, end], atol=1e-12)
+    shaft, cone = arrow(start, end, 0.01, RED)
+    turn = Rotation.from_quat(cone.quaternion, scalar_first=True)
+    corners = turn.apply(cone.vertices) + cone.position
+    along = (end - start) / np.linalg.norm(end - start)
+    np.testing.assert_allclose(corners[np.argmax(corners @ along)], end, atol=1e-12)
+    assert shaft.kind == "capsule"
+    assert between(start, start, 0.01, RED).kind == "sphere"
+
+
+def test_beads_are_one_shape_at_the_points() -> None:
+    points = np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.1], [0, 0.1, 0.1]])
+    mesh = beads(points, 0.01, RED)
+    assert mesh.vertices is not None
+    np.testing.assert_allclose(mesh.vertices.min(0), [-0.01, -0.01, -0.01], atol=1e-3)
+    np.testing.assert_allclose(mesh.vertices.max(0), [0.01, 0.11, 0.11], atol=1e-3)
+
+
+def test_the_camera_just_holds_all_points() -> None:
+    points = np.random.default_rng(0).normal(size=(50, 3)) * [0.1, 0.2, 0.3] + [1, 2, 3]
+    camera = fit(points, np.array([1.0, 0.5, 0.4]), 1.0)
+    places = projected(camera, points)
+    assert 0.9 < np.abs(places).max() <= 1.0
+    span = np.abs(places.max(0) + places.min(0))
+    assert span.max() < 0.02  # in the middle
+
+
+def test_steps_of_a_sheet_include_the_ends_and_the_removal() -> None:
+    table = np.arange(75) < 50
+    steps = key_steps(table, 8)
+    assert steps[0] == 0 and steps[-1] == 74 and 50 in steps and len(steps) == 8
+    assert key_steps(np.ones(3, bool), 8) == [0, 1, 2]
+
+
+def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
+    shapes = episode_shapes(episode(), 11)
+    hand = get_hand("human")
+    capsules = [link.name for link in hand.links for _ in link.capsules]
+    touching = {name for name, shape in zip(capsules, shapes, strict=False) if shape.colour != shapes[0].colour}
+    assert touching == {hand.links[i].name for i in hand.tip_links}
+    tip = shapes[capsules.index("thumb_distal")].colour
+    assert np.linalg.norm(np.subtract(tip, TOUCHING)) < 0.2
+    body = shapes[len(capsules)]
+    assert body.paint_colours is not None
+    minus = episode().arrays["surface_minus"]
+    np.testing.assert_allclose(body.paint_colours, np.where(minus[:, None], OBJECT_MINUS, OBJECT))
+    assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[len(capsules)].paint_points is None
+
+
+def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_through() -> None:
+    def flat(step: int) -> bool:
+        return any(shape.kind == "cylinder" for shape in episode_shapes(episode(), step))
+
+    assert flat(7) and not flat(8)
+    ghosts = [shape for shape in episode_shapes(episode(mask=(0, 1, 1, 0)), 11) if shape.alpha < 1]
+    solid = [shape for shape in episode_shapes(episode(), 11) if shape.alpha == 1][: len(ghosts)]
+    # The last step has reached the pose: ghost and hand coincide.
+    for ghost, link in zip(ghosts, solid, strict=True):
+        np.testing.assert_allclose(ghost.position, link.position, atol=1e-5)
+
+
+def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
+    camera = best_camera(episode(), [0, 6, 11], 1.0)
+    for step in (0, 11):
+        assert np.abs(projected(camera, episode().arrays["link_position"][step].astype(float))).max() < 1
+    frames = list(render_episode_frames(episode(), [0, 11], (64, 48)))
+    fallen = episode()
+    fallen.arrays["object_position"][-1, 2] -= 5.0
+    np.testing.assert_allclose(
+        best_camera(fallen, [0, 11]).target[2], best_camera(episode(), [0, 11]).target[2], atol=0.1
+    )
+    assert [frame.shape for frame in frames] == [(48, 64, 3)] * 2
+    assert np.abs(frames[0].astype(int) - frames[1]).max() > 50
+
+
+def test_sheets(tmp_path: pathlib.Path) -> None:
+    sheet = episode_sheet(episode(), moments=3, size=(48, 36))
+    assert sheet.shape[1] == 3 * (48 + 10) + 10
+    hand = hand_sheet(get_hand("human"), size=(40, 40))
+    assert hand.shape[1] == 3 * (40 + 10) + 10
+    save_png(tmp_path / "new" / "sheet.png", sheet)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "new" / "sheet.png")), sheet)
+
+
+def test_a_sheet_keeps_its_pictures_and_shrinks_long_titles() -> None:
+    images = [np.full((20, 30, 3), shade, np.uint8) for shade in (0, 80, 160)]
+    sheet = contact_sheet(images, ["a", "b", "c"], 2, "a title that is much too long for so narrow a sheet")
+    assert sheet.shape == (44 + 2 * (20 + 24) + 10, 2 * 40 + 10, 3)
+    assert (
+        (sheet[44:64, 10:40] == 0).all() and (sheet[44:64, 50:80] == 80).all() and (sheet[88:108, 10:40] == 160).all()
+    )
+    with pytest.raises(CongraspError, match="3 pictures and 1 labels"):
+        contact_sheet(images, ["a"], 2)
+
+
+def test_the_title_says_what_was_asked_and_how_it_went() -> None:
+    title = episode_title(episode(mask=(1, 0, 0, 1), success=False))
+    for words in ("human hand", "cylinder-0", "heading + affordance + trajectory", "no success", "return 12.5", "3"):
+        assert words in title
+
+
+def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    writer = LogWriter(tmp_path / "run", "log")
+    channel = opaque_channel("/episode/a0/raw", "congrasp.Episode")
+    for steps, success in ((4, True), (5, False), (6, False)):
+        writer.write(Entry(channel, steps, encode(episode(steps, removal=3, success=success))))
+    writer.close()
+    lengths = [len(pick_episode(tmp_path / "run", i).arrays["table"]) for i in (0, 1, 2, -1, -2, -3)]
+    assert lengths == [4, 5, 6, 6, 5, 4]
+    assert len(pick_episode(tmp_path / "run", -1, success=True).arrays["table"]) == 4
+    for index, success in ((3, False), (-4, False), (1, True)):
+        with pytest.raises(CongraspError, match="holds"):
+            pick_episode(tmp_path / "run", index, success=success)
+    out = tmp_path / "out.png"
+    assert command.episode(tmp_path / "run", out, index=0, moments=1) == 0
+    assert Image.open(out).size[0] > 400
+    frames = render_episode_frames(pick_episode(tmp_path / "run", 0), range(4), (64, 48))
+    save_video(tmp_path / "film.mp4", frames, (64, 48), 0.5 / CONTROL_DT)
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 4

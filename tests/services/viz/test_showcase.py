@@ -1,0 +1,36 @@
+"""The picture of one grasp under each constraint."""
+
+import numpy as np
+from PIL import Image
+
+from services.evaluate import showcase as module
+from services.evaluate.showcase import CONSTRAINTS, showcase
+from tests.episodes import episode
+
+
+def test_the_picture_has_a_row_for_each_constraint_and_counts_the_successes(monkeypatch, tmp_path):
+    asked = []
+
+    class Played:
+        def __init__(self, policy, objects, **options):
+            assert objects == ["an object"]
+
+        def episode(self, constraint, tries):
+            asked.append(constraint)
+            return episode(success=constraint != "pose")
+
+    monkeypatch.setattr(module, "Evaluator", Played)
+    monkeypatch.setattr(module, "load_pool", lambda config: ["an object"])
+    monkeypatch.setattr(module, "_SIZE", (40, 30))
+    told = []
+    assert showcase(_policy(), tmp_path / "grasps.png", told.append) == 3
+    assert tuple(asked) == CONSTRAINTS == ("heading", "pose", "trajectory", "affordance")
+    assert len(told) == 4
+    image = np.asarray(Image.open(tmp_path / "grasps.png"))
+    assert image.shape[0] > 4 * 30 and image.shape[1] > 4 * 40
+
+
+def _policy():
+    import types
+
+    return types.SimpleNamespace(version=3, spec=types.SimpleNamespace(hand_name="human"))
