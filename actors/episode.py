@@ -13,7 +13,8 @@ from common.config import TaskConfig
 from common.hands.kinematics import link_poses
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
-from common.task.reward import TERMS
+from common.task import metrics
+from common.task.reward import terms
 from common.task.types import Array, Goal, Surface
 from common.wire.codec import Message
 
@@ -57,8 +58,10 @@ def episode_message(
         "u_target": cut.u_target,
         "action": cut.action,
         "table": cut.table,
-        **{f"reward/{name}": cut.terms[:, i] for i, name in enumerate(TERMS)},
-        **{f"goal/{name}": value for name, value in goal._asdict().items()},
+        **{f"reward/{name}": cut.terms[:, i] for i, name in enumerate(terms(task))},
+        **{f"error/{spec.name}": cut.errors[:, i] for i, spec in enumerate(metrics.specs(task))},
+        **{f"goal/{name}": value for name, value in goal.flat().items()},
+        **{f"active/{name}": value for name, value in goal.active.items()},
         "surface_points": surface.points,
         "surface_minus": surface.minus,
         **_geometry(obj),

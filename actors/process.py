@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from actors.environment import EnvironmentState
+from actors.bank import build_bank
+from actors.env import EnvState, episode_fields
 from actors.episode import episode_message
 from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from actors.physics import make_physics
-from actors.rollout import Rollout, RolloutWorker, finished_episodes, goal_of_world
-from actors.taskset import build_taskset
+from actors.rollout import Rollout, RolloutWorker, finished_episodes
 from common.config import PhysicsName, RunConfig, run_config_from_json
 from common.hands import get_hand
 from common.journal import Journal
@@ -99,14 +99,14 @@ class _Actor:
         self._hand = get_hand(config.task.hand)
         number = zlib.crc32(link.actor.encode())
         self._objects = sized(self._hand, config.task, load_pool(config.objects, number))
-        taskset = build_taskset(self._hand, config.task, self._objects, config.seed + number)
+        bank = build_bank(self._hand, config.task, self._objects, config.seed + number)
         self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
         self._spec = policy_spec(config.task, config.network)
         self._worker = RolloutWorker(
             self._hand,
             config.task,
             self._physics,
-            taskset,
+            bank,
             functools.partial(sample_action, self._spec.layout),
             batch=config.environments,
             # Another incarnation must not repeat the episodes of the one that it replaces.
@@ -166,14 +166,14 @@ class _Actor:
         return self._bundle is not None
 
     def _rollout(self, bundle: PolicyBundle, ticket: Ticket, since: "_Since") -> None:
-        config, env = self._config, self._worker.env
+        config, before = self._config, self._worker.state
         began = time.monotonic()
         self._configure(bundle.version)
-        started_fresh = bool(np.asarray(env.time)[0] == 0)
+        started_fresh = before is not None and bool(np.asarray(before.time)[0] == 0)
         rollout = self._worker.collect(bundle.acting, config.rollout_steps)
         steps = config.rollout_steps * config.environments
         taken = {name: getattr(rollout, name) for name in ROLLOUT_ARRAYS}
-        episodes, left_out = countable(finished_episodes(rollout))
+        episodes, left_out = countable(finished_episodes(rollout, config.task))
         arrays = taken | episodes
         if config.task.own_references:
             self._worker.renew_references()
@@ -192,7 +192,8 @@ class _Actor:
         self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
         self._on_rollout({"version": float(bundle.version), **values})
         if self._rollouts % config.episode_every == 0 and started_fresh:
-            self._publish_episode(bundle, rollout, env)
+            assert before is not None
+            self._publish_episode(bundle, rollout, before)
         if config.log_rollout_every and self._rollouts % config.log_rollout_every == 0:
             self._publish("rollout", self._sampled(bundle, taken))
         self._rollouts += 1
@@ -211,13 +212,13 @@ class _Actor:
         }
         return Message(first_worlds(arrays, self._config.log_rollout_worlds or self._config.environments), meta)
 
-    def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, env: EnvironmentState) -> None:
+    def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, begun: EnvState) -> None:
         """World 0's episode, from the rollout that it began in."""
-        episodes = dict(zip(finished_episodes(rollout), np.asarray(rollout.episodes)[0], strict=True))
+        episodes = dict(zip(episode_fields(self._config.task), np.asarray(rollout.episodes)[0], strict=True))
         metrics = {name.removeprefix("episode/"): float(v) for name, v in episodes.items() if "episode/" in name}
-        surface = Surface(*(np.asarray(field)[0] for field in env.surface))
-        obj = self._objects[int(np.asarray(env.world.object_index)[0])]
-        goal = goal_of_world(env.goal)
+        surface = Surface(*(np.asarray(field)[0] for field in begun.surface))
+        obj = self._objects[int(np.asarray(begun.world.object_index)[0])]
+        goal = begun.goal.row(0)
         meta = {
             "time": time.time(),
             "version": bundle.version,

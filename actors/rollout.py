@@ -1,10 +1,9 @@
-"""Rollouts: policy, decode, physics, reward and reset for T control steps of a batch of worlds.
+"""Rollouts: the one driver of control steps, for training, evaluation, attempts and benchmarks alike.
 
-With a compiled engine the whole rollout is one program (`jax.lax.scan`); with `native` the same functions are
-compiled piecewise around the C step.
+With a compiled engine the whole rollout is one program (`jax.lax.scan`); with one that JAX cannot trace, the same
+functions are compiled piecewise around its step.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -12,26 +11,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors import environment, references
-from actors.environment import EPISODE_FIELDS, EnvironmentState
-from actors.physics.engine import Physics, Readout, where_worlds
-from actors.taskset import TaskSet
+from actors import harvest, initial
+from actors.env import EnvState, GraspEnv, Settings, Transition, episode_fields
+from actors.initial import InitialConditions
+from actors.physics.engine import Physics, Readout
 from common.config import RewardWeights, TaskConfig
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
-from common.task.control import decode
-from common.task.features import Features
+from common.task import metrics
+from common.task.bank import ConstraintBank
+from common.task.constraints.base import Scene
 from common.task.observation import observe
-from common.task.types import Action, Array, Goal, SceneState
+from common.task.types import Action, Array
 
 Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
 """(parameters, observation (B, D) float32, random key) -> action (B, A), log-probability (B,)."""
-Probe = Callable[[SceneState, Features], Any]
-"""The moment after a control step -> a pytree of arrays that someone wants of every world and step."""
+Probe = Callable[[Scene], Any]
+"""The scene after a control step -> a pytree of arrays that someone wants of every environment and step."""
 
 
 class Trace(NamedTuple):
-    """What is kept of world 0, or of several, at every step, for logs and pictures (T leads)."""
+    """What is kept of one environment, or of several, at every step, for logs and pictures (T leads)."""
 
     q: Array
     u: Array
@@ -46,12 +46,14 @@ class Trace(NamedTuple):
     action: Array
     terms: Array
     """(T, terms) weighted reward terms."""
+    errors: Array
+    """(T, errors) of the constraints, in the order of `common.task.metrics.specs`."""
     table: Array
     terminal: Array
 
 
 class Rollout(NamedTuple):
-    """T control steps of B worlds."""
+    """T control steps of B environments."""
 
     observation: Array
     """(T, B, D)."""
@@ -68,7 +70,7 @@ class Rollout(NamedTuple):
     last_observation: Array
     """(B, D)."""
     episodes: Array
-    """(B, fields) metrics of the last episode that ended in each world, in the order of `EPISODE_FIELDS`."""
+    """(B, fields) metrics of the last episode that ended in each environment, in the order of `episode_fields`."""
     has_episode: Array
     """(B,) bool."""
     trace: Trace
@@ -76,239 +78,276 @@ class Rollout(NamedTuple):
     """What the probe returned, with leading axis T; None without a probe."""
 
 
+class _Decision(NamedTuple):
+    """What the policy wants of the coming control step."""
+
+    observation: Array
+    action: Array
+    log_probability: Array
+    target: Action
+    joints: Array
+    table: Array
+
+
 class RolloutWorker:
-    """Worlds that go on from one rollout to the next."""
+    """Environments that go on from one rollout to the next."""
 
     def __init__(
         self,
         hand: Hand,
         task: TaskConfig,
         physics: Physics,
-        taskset: TaskSet,
+        bank: ConstraintBank | None,
         policy: Policy,
         *,
         batch: int,
         seed: int,
         half: bool,
-        probe: Probe = lambda scene, seen: None,
+        probe: Probe = lambda scene: None,
         traced: int | slice = 0,
     ):
-        """Starts fresh episodes.
+        """Starts fresh episodes, if there is a bank.
 
         Args:
           hand: the hand.
           task: the task.
-          physics: the engine; its objects are those of `taskset`.
-          taskset: what episodes are drawn from.
+          physics: the engine; its objects are those of the bank.
+          bank: what episodes are drawn from; without one they are given to `begin`, and stay in place at their end.
           policy: a pure function; parameters are given at each rollout.
-          batch: B, number of worlds.
+          batch: B, number of environments.
           seed: seed of episodes and actions.
-          half: observations are rounded to float16, for the policy as well as for the learner.
+          half: observations are rounded to half precision, for the policy as well as for the learner.
           probe: what else to keep of every step.
-          traced: of which worlds a trace is kept.
+          traced: of which environments a trace is kept.
         """
-        self.physics = physics
-        self._hand, self._task, self._taskset, self._policy = hand, task, taskset, policy
-        self._probe, self._traced = probe, traced
+        self.physics, self.env = physics, GraspEnv(hand, task, physics)
+        self._hand, self._task, self._bank, self._policy = hand, task, bank, policy
+        self._probe, self._traced, self.batch = probe, traced, batch
         self._dtype = jnp.float16 if half else jnp.float32
-        self._weights, self._control, self._stationary = task.reward, task.control, np.array(False)
-        episode_key, self._key = jax.random.split(jax.random.key(seed))
-        self.env: EnvironmentState = jax.jit(functools.partial(environment.start, hand, task, batch=batch))(
-            taskset, episode_key, stationary=self._stationary
-        )
-        self.state = physics.start(self.env.world)
-        self._act_jit = jax.jit(self._act)
+        self._settings, self._stationary = self.env.settings, np.array(False)
+        self._episode_key, self._key = jax.random.split(jax.random.key(seed))
+        self._sample_jit = jax.jit(self._sample)
+        self._begin_jit = jax.jit(self.env.state_of)
+        self._decide_jit = jax.jit(self._decide)
         self._advance_jit = jax.jit(self._advance)
-        self._restart_jit = jax.jit(functools.partial(environment.restart, hand, task))
-        self._moment_jit = jax.jit(functools.partial(environment.moment, hand, task))
+        self._merge_jit = jax.jit(
+            lambda state, mask, fresh: self.env.merge(state, mask, self.env.state_of(fresh, None))
+        )
+        self._seen_jit = jax.jit(self.env.seen)
         self._scan_jit = jax.jit(self._scan, static_argnames="steps")
-        self._moment: tuple[SceneState, Features] = self._moment_jit(self.env, physics.read(self.state))
+        self.state: EnvState | None = None
+        if bank is not None:
+            self.restart()
 
     def configure(self, weights: RewardWeights, *, stationary: bool) -> None:
         """Sets the reward's weights, and whether the objects of episodes that start from now on are held in place."""
-        self._weights, self._stationary = weights, np.array(stationary)
+        self._settings, self._stationary = self._settings._replace(weights=weights), np.array(stationary)
 
-    def replace_objects(self, objects: Sequence[GraspObject], taskset: TaskSet) -> None:
-        """Episodes that start from now on are drawn from these objects, as many as before, and their task set."""
-        self.state = self.physics.replace_objects(self.state, objects)
-        self._taskset = taskset
-        found = self.env.grasps.found
-        self.env = self.env._replace(grasps=self.env.grasps._replace(found=jnp.zeros_like(found)))
+    def replace_objects(self, objects: Sequence[GraspObject], bank: ConstraintBank | None) -> None:
+        """Episodes that start from now on are drawn from these objects, as many as before, and their bank."""
+        physics = self.physics.replace_objects(self.state.physics if self.state else None, objects)
+        self._bank = bank
+        if self.state is not None:
+            self.state = self.state._replace(physics=physics if self.physics.compiled else None)
+            self._forget_grasps()
 
     def restart(self) -> None:
-        """Fresh episodes in every world."""
-        everywhere = jnp.ones_like(self.env.bad)
-        self.begin(self._restart_jit(self._taskset, self.env, everywhere, self._stationary))
+        """Fresh episodes in every environment."""
+        self._episode_key, key = jax.random.split(self._episode_key)
+        self.begin(self._sample_jit(self._bank, key, self._stationary))
 
-    def begin(self, env: EnvironmentState) -> None:
-        """Goes on with these episodes, which have just begun, one for each world."""
-        self.env = env
-        self.state = self.physics.reset(self.state, jnp.ones_like(env.bad), env.world)
-        self._moment = self._moment_jit(self.env, self.physics.read(self.state))
+    def begin(self, conditions: InitialConditions) -> None:
+        """Goes on with these episodes, which are about to begin, one for each environment."""
+        if self.state is None:
+            physics = self.physics.start(conditions.world)
+        else:
+            everywhere = np.ones(self.batch, bool)
+            physics = self.physics.reset(self.state.physics, everywhere, conditions.world)
+        kept = self.state
+        self.state = self._begin_jit(conditions, physics if self.physics.compiled else None)
+        if not self.physics.compiled:
+            self.state = self._seen_jit(self.state._replace(scene=()), self.physics.read(None))
+        if kept is not None:
+            self.state = self.state._replace(grasps=kept.grasps)
 
     @property
-    def taskset(self) -> TaskSet:
+    def bank(self) -> ConstraintBank:
         """What episodes are drawn from at present."""
-        return self._taskset
+        assert self._bank is not None, "these episodes are given"
+        return self._bank
 
     def forget_references(self) -> None:
         """Episodes that start from now on have no reference pose or trajectory, until there are renewed ones."""
-        none = jnp.zeros_like(self._taskset.pose_valid)
-        self._taskset = self._taskset._replace(pose_valid=none)
+        self._bank = self.bank._replace(pose_valid=jnp.zeros_like(self.bank.pose_valid))
 
     def renew_references(self) -> None:
-        """Puts the grasps that succeeded since the last call into the task set as reference poses."""
+        """Puts the grasps that succeeded since the last call into the bank as reference poses."""
+        assert self.state is not None
         self._key, key = jax.random.split(self._key)
-        grasps = self.env.grasps
-        self._taskset = references.renew(self._hand, self._task, self._taskset, grasps, key)
-        self.env = self.env._replace(grasps=grasps._replace(found=jnp.zeros_like(grasps.found)))
+        self._bank = harvest.renew(self._hand, self._task, self.bank, self.state.grasps, key)
+        self._forget_grasps()
 
-    def collect(self, parameters: Any, steps: int) -> Rollout:
-        """The next `steps` control steps under these policy parameters."""
+    def _forget_grasps(self) -> None:
+        assert self.state is not None
+        grasps = self.state.grasps
+        self.state = self.state._replace(grasps=grasps._replace(found=jnp.zeros_like(grasps.found)))
+
+    def collect(self, parameters: Any, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
+        """The next `steps` control steps under these policy parameters.
+
+        Args:
+          parameters: of the policy.
+          steps: T.
+          progress: told how many steps are done, by engines that are not compiled.
+        """
+        assert self.state is not None, "no episode was begun"
         self._key, key = jax.random.split(self._key)
-        self.env = self.env._replace(has_finished=jnp.zeros_like(self.env.has_finished))
-        run = self._collect_compiled if self.physics.compiled else self._collect_stepwise
-        return run(parameters, key, steps)
+        self.state = self.state._replace(has_finished=jnp.zeros_like(self.state.has_finished))
+        if self.physics.compiled:
+            return self._collect_compiled(parameters, key, steps)
+        return self._collect_stepwise(parameters, key, steps, progress)
 
-    def _act(
-        self, parameters: Any, control: Any, env: EnvironmentState, scene: SceneState, seen: Features, key: Array
-    ) -> tuple[Array, Array, Array, Action, Array, Array]:
-        observation = observe(self._task, scene, seen, env.goal).astype(self._dtype)
+    def _sample(self, bank: ConstraintBank, key: Array, stationary: Array) -> InitialConditions:
+        return initial.sample(self._hand, self._task, bank, key, self.batch, stationary)
+
+    def _merge(self, state: EnvState, mask: Array, fresh: InitialConditions) -> EnvState:
+        return self.env.merge(state, mask, self.env.state_of(fresh, None))
+
+    def _observe(self, state: EnvState) -> Array:
+        return observe(self.env.scene_of(state)).astype(self._dtype)
+
+    def _decide(self, parameters: Any, settings: Settings, state: EnvState, key: Array) -> _Decision:
+        observation = self._observe(state)
         action, log_probability = self._policy(parameters, observation.astype(jnp.float32), key)
-        target = decode(self._hand, control, scene, seen, env.goal, action)
-        joints = jnp.concatenate([target.u_target, target.q_target], -1)
-        return observation, action, log_probability, target, joints, environment.table_present(env, self._task)
+        return _Decision(observation, action, log_probability, *self.env.targets(state, action, settings))
 
-    def _score(
-        self, weights: Any, env: EnvironmentState, readout: Readout, target: Action, action: Array
-    ) -> tuple[EnvironmentState, environment.Score, SceneState, Features, tuple[Trace, Any]]:
-        env, score, scene, seen = environment.score(self._hand, self._task, weights, env, readout, target)
-        return env, score, scene, seen, (traced(scene, seen, action, score, self._traced), self._probe(scene, seen))
+    def _kept(self, state: EnvState, action: Array, transition: Transition) -> tuple[Trace, Any]:
+        return _traced(state, action, transition, self._task, self._traced), self._probe(self.env.scene_of(state))
 
     def _advance(
         self,
         parameters: Any,
-        weights: Any,
-        control: Any,
-        env: EnvironmentState,
+        settings: Settings,
+        state: EnvState,
         readout: Readout,
-        decision: Any,
+        decision: _Decision,
         keys: Array,
         step: Array,
-    ) -> tuple[dict[str, Any], environment.Score, tuple[Trace, Any], Any]:
-        """Scores a control step and decides on the next one: one call between two physics steps.
+    ) -> tuple[dict[str, Any], Transition, tuple[Trace, Any], _Decision]:
+        """Ends a control step and decides on the next one: one call between two of the engine's.
 
-        Of the environment only what changed is returned, because every array that passes through a call has its price.
+        Of the state only what changed is returned, because every array that passes through a call has its price.
         """
-        _, action, _, target, _, _ = decision
-        after, score, scene, seen, kept = self._score(weights, env, readout, target, action)
-        changed = {name: new for name, new in after._asdict().items() if new is not getattr(env, name)}
-        key = jax.random.wrap_key_data(keys[step])
-        return changed, score, kept, self._act(parameters, control, after, scene, seen, key)
+        after, transition = self.env.advance(state, decision.target, readout, settings)
+        kept = self._kept(after, decision.action, transition)
+        following = self._decide(parameters, settings, after, jax.random.wrap_key_data(keys[step]))
+        changed = {name: new for name, new in after._asdict().items() if new is not getattr(state, name)}
+        changed.pop("scene")
+        return changed, transition, kept, following
 
-    def _collect_stepwise(self, parameters: Any, key: Array, steps: int) -> Rollout:
+    def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
         # One key more than there are steps: what is decided after the last one only yields `last_observation`.
         keys = jax.random.split(key, steps + 1)
         key_data = jax.random.key_data(keys)
-        weights, control = jax.device_put((self._weights, self._control))
-        decision = self._act_jit(parameters, control, self.env, *self._moment, keys[0])
+        settings = jax.device_put(self._settings)
+        assert self.state is not None
+        decision = self._decide_jit(parameters, settings, self.state, keys[0])
+        state = self.state._replace(scene=())
         rows, extras = [], []
         for step in range(1, steps + 1):
-            observation, action, log_probability, _, joints, table = decision
-            self.state, readout = self.physics.step(self.state, np.asarray(joints), np.asarray(table))
-            changed, score, kept, decision = self._advance_jit(
-                parameters, weights, control, self.env, readout, decision, key_data, step
+            _, readout = self.physics.step(None, np.asarray(decision.joints), np.asarray(decision.table))
+            row = decision[:3]
+            changed, transition, kept, decision = self._advance_jit(
+                parameters, settings, state, readout, decision, key_data, step
             )
-            self.env = self.env._replace(**changed)
-            rows.append((observation, action, log_probability, score.reward, score.terminal, readout.usage))
+            state = state._replace(**changed)
+            rows.append((*row, transition.reward, transition.terminal, transition.usage))
             extras.append(kept)
-            if np.asarray(score.terminal).any():
-                self.env = self._restart_jit(self._taskset, self.env, score.terminal, self._stationary)
-                self.state = self.physics.reset(self.state, score.terminal, self.env.world)
-                readout = self.physics.read(self.state)
-                moment = self._moment_jit(self.env, readout)
-                decision = self._act_jit(parameters, control, self.env, *moment, keys[step])
-        self._moment = self._moment_jit(self.env, readout)
+            if self._bank is not None and np.asarray(transition.terminal).any():
+                self._episode_key, episode_key = jax.random.split(self._episode_key)
+                fresh = self._sample_jit(self._bank, episode_key, self._stationary)
+                self.physics.reset(None, transition.terminal, fresh.world)
+                state = self._merge_jit(state, transition.terminal, fresh)
+                readout = self.physics.read(None)
+                decision = self._decide_jit(parameters, settings, self._seen_jit(state, readout), keys[step])
+            progress(step)
+        self.state = self._seen_jit(state, readout)
         columns = [np.stack(column) for column in zip(*rows, strict=True)]
         trace, probed = jax.tree.map(lambda *x: np.stack(x), *extras)
-        last, *_ = decision
-        return Rollout(*(*columns, last, self.env.finished, self.env.has_finished, trace, probed))
+        finished = self.state.finished, self.state.has_finished
+        return Rollout(*(*columns, decision.observation, *finished, trace, probed))
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         # Committed to the device, whether they were there already or not: anything else would compile once more.
-        parameters, taskset, carry = jax.device_put(
-            (parameters, self._taskset, (self.env, self.state, self._moment)), jax.local_devices()[0]
+        parameters, bank, carry = jax.device_put(
+            (parameters, self._bank, (self.state, self._episode_key)), jax.local_devices()[0]
         )
-        carry, rollout = self._scan_jit(
-            parameters, self._weights, self._control, self._stationary, taskset, carry, key, steps=steps
+        (self.state, self._episode_key), rollout = self._scan_jit(
+            parameters, self._settings, self._stationary, bank, carry, key, steps=steps
         )
-        self.env, self.state, self._moment = carry
         return rollout
 
     def _scan(
         self,
         parameters: Any,
-        weights: Any,
-        control: Any,
+        settings: Settings,
         stationary: Array,
-        taskset: TaskSet,
-        carry: Any,
+        bank: ConstraintBank | None,
+        carry: tuple[EnvState, Array],
         key: Array,
         steps: int,
-    ) -> tuple[Any, Rollout]:
-        physics = self.physics
+    ) -> tuple[tuple[EnvState, Array], Rollout]:
+        def renew(operand: Any) -> Any:
+            state, episode_key, terminal = operand
+            episode_key, own = jax.random.split(episode_key)
+            assert bank is not None
+            return self.env.restart(state, terminal, self._sample(bank, own, stationary)), episode_key
 
         def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
-            env, state, (scene, seen) = carry
-            observation, action, log_probability, target, joints, table = self._act(
-                parameters, control, env, scene, seen, step_key
-            )
-            state, readout = physics.step(state, joints, table)
-            env, score, scene, seen, kept = self._score(weights, env, readout, target, action)
-
-            def renew(operand: Any) -> Any:
-                env, state, ended = operand
-                env = environment.restart(self._hand, self._task, taskset, env, score.terminal, stationary)
-                state = physics.reset(state, score.terminal, env.world)
-                # The worlds that go on keep their contacts, which `read` does not know.
-                fresh = environment.moment(self._hand, self._task, env, physics.read(state))
-                return env, state, where_worlds(score.terminal, fresh, ended)
-
-            carry = jax.lax.cond(jnp.any(score.terminal), renew, lambda x: x, (env, state, (scene, seen)))
-            return carry, (observation, action, log_probability, score.reward, score.terminal, readout.usage, kept)
+            state, episode_key = carry
+            observation = self._observe(state)
+            action, log_probability = self._policy(parameters, observation.astype(jnp.float32), step_key)
+            state, transition = self.env.step(state, action, settings)
+            kept = self._kept(state, action, transition)
+            carry = state, episode_key
+            if bank is not None:
+                ended = jnp.any(transition.terminal)
+                carry = jax.lax.cond(ended, renew, lambda x: x[:2], (*carry, transition.terminal))
+            row = (observation, action, log_probability, transition.reward, transition.terminal, transition.usage)
+            return carry, (*row, kept)
 
         carry, (*columns, (trace, probed)) = jax.lax.scan(body, carry, jax.random.split(key, steps))
-        env, _, (scene, seen) = carry
-        last = observe(self._task, scene, seen, env.goal).astype(self._dtype)
-        return carry, Rollout(*(*columns, last, env.finished, env.has_finished, trace, probed))
+        state, _ = carry
+        finished = state.finished, state.has_finished
+        return carry, Rollout(*(*columns, self._observe(state), *finished, trace, probed))
 
 
-def traced(scene: SceneState, seen: Features, action: Array, score: environment.Score, worlds: int | slice) -> Trace:
-    """What is kept of a step of one world, or of several."""
-    force = jnp.sum(jnp.where(scene.contact_found[worlds][..., None], scene.contact_force[worlds], 0.0), -2)
+def _traced(state: EnvState, action: Array, transition: Transition, task: TaskConfig, where: int | slice) -> Trace:
+    """What is kept of a step of one environment, or of several."""
+    scene, features = state.scene
+    force = jnp.sum(jnp.where(scene.contact_found[where][..., None], scene.contact_force[where], 0.0), -2)
+    errors = [
+        a[where] / jnp.maximum(b[where], 1.0) for a, b in (transition.errors[s.name] for s in metrics.specs(task))
+    ]
     return Trace(
-        q=scene.q[worlds],
-        u=scene.u[worlds],
-        q_target=scene.q_target[worlds],
-        u_target=scene.u_target[worlds],
-        wrist_position=seen.wrist_position[worlds],
-        wrist_quaternion=seen.wrist_quaternion[worlds],
-        object_position=scene.object_position[worlds],
-        object_quaternion=scene.object_quaternion[worlds],
+        q=scene.q[where],
+        u=scene.u[where],
+        q_target=scene.q_target[where],
+        u_target=scene.u_target[where],
+        wrist_position=features.wrist_position[where],
+        wrist_quaternion=features.wrist_quaternion[where],
+        object_position=scene.object_position[where],
+        object_quaternion=scene.object_quaternion[where],
         contact_force=force,
-        action=action[worlds],
-        terms=score.terms[worlds],
-        table=scene.table[worlds],
-        terminal=score.terminal[worlds],
+        action=action[where],
+        terms=transition.terms[where],
+        errors=jnp.stack(errors, -1),
+        table=scene.table[where],
+        terminal=transition.terminal[where],
     )
 
 
-def goal_of_world(goal: Goal, index: int = 0) -> Goal:
-    """The goal of one world, without the batch axis, as NumPy."""
-    return Goal(*(np.asarray(field)[index] for field in goal))
-
-
-def finished_episodes(rollout: Rollout) -> dict[str, np.ndarray]:
-    """Metrics (E,) of the E episodes that ended, by the names in `EPISODE_FIELDS`."""
+def finished_episodes(rollout: Rollout, task: TaskConfig) -> dict[str, np.ndarray]:
+    """Metrics (E,) of the E episodes that ended, by the names in `actors.env.episode_fields`."""
     rows = np.asarray(rollout.episodes)[np.asarray(rollout.has_episode)]
-    return dict(zip(EPISODE_FIELDS, rows.T, strict=True))
+    return dict(zip(episode_fields(task), rows.T, strict=True))

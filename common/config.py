@@ -7,11 +7,14 @@ every actor that connects, so that an actor needs no other argument than an addr
 import dataclasses
 import hashlib
 import json
-from typing import Any, Literal
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal
 
 import dacite
+from typing_extensions import Doc
 
 from common.errors import CongraspError
+from common.task.constraints import CONSTRAINTS, PAPER
 
 PhysicsName = Literal["auto", "warp", "jax", "native"]
 Board = Literal["tensorboard", "wandb", "wandb-offline"]
@@ -19,8 +22,8 @@ Board = Literal["tensorboard", "wandb", "wandb-offline"]
 
 
 @dataclasses.dataclass(frozen=True)
-class RewardWeights:
-    """Weights of the reward's terms, all in units of reward per control step (paper, section Reward Function)."""
+class GraspWeights:
+    """Weights of the grasp reward's terms, all in units of reward per control step (paper, section Reward Function)."""
 
     distance: float = 0.3
     """w_dis: per metre of the weighted distance from the hand's keypoints to the object's surface (0.3 m at most)."""
@@ -42,26 +45,28 @@ class RewardWeights:
     """w_q of the regulariser: per squared radian from the initial finger pose."""
     drop: float = 1.0
     """w_drop: per step with the object fallen."""
-    heading_direction: float = 0.3
-    """w_dir: for the heading axis along the target direction (cosine)."""
-    heading_position: float = 3.0
-    """w_pos: per metre between hand centre and heading position."""
-    pose_finger: float = 0.1
-    """w_q of the pose term: per squared radian of the finger joints, gated by the hand's distance."""
-    pose_link: float = 5.0
-    """w_x: per square metre of the finger links' positions, gated by the hand's distance."""
-    pose_wrist_position: float = 20.0
-    """w_p: per square metre of the wrist's position."""
-    pose_wrist_rotation: float = 0.5
-    """w_R of the pose term: per square radian of the wrist's rotation."""
-    trajectory_position: float = 20.0
-    """w_traj-p: per square metre between the wrist and the active waypoint."""
-    trajectory_rotation: float = 0.5
-    """w_traj-q: per square radian between the wrist and the active waypoint."""
-    affordance_distance: float = 0.05
-    """w_d: for each unit of softplus((m - d)/tau) near the non-grasping region."""
-    affordance_force: float = 0.1
-    """w_f of the affordance term: per newton on the non-grasping region (clipped at 10 N per link)."""
+
+
+def _declared(base: type, fields: Iterable[tuple[str, float, str]]) -> Any:
+    """A frozen dataclass with numbers that constraints declare, documented as other fields are."""
+    made = [(field, Annotated[float, Doc(said)], dataclasses.field(default=value)) for field, value, said in fields]
+    return dataclasses.make_dataclass("Declared", made, bases=(base,), frozen=True)
+
+
+_Weights: Any = _declared(GraspWeights, (weight for constraint in CONSTRAINTS for weight in constraint.weights))
+_Shares: Any = _declared(
+    object,
+    (
+        (f"p_{c.name}", 0.5, f"Probability that an episode has the constraint '{c.name}', where the object allows it.")
+        for c in CONSTRAINTS
+        if c.optional
+    ),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardWeights(_Weights):
+    """Weights of all terms of the reward: the grasp's, and those that each constraint declares."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +90,7 @@ class ControlConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class TaskConfig:
+class TaskConfig(_Shares):
     """The task: hand, timing, observation, control, reward and constraint sampling."""
 
     hand: str = "human"
@@ -116,12 +121,8 @@ class TaskConfig:
     """Surface points of an object that the policy senses (at most 512)."""
     trajectory_points: int = 15
     """K, waypoints of a wrist trajectory."""
-    p_affordance: float = 0.5
-    """Probability that an episode has an affordance constraint (objects with parts only)."""
-    p_pose: float = 0.5
-    """Probability that an episode has a reference pose."""
-    p_trajectory: float = 0.5
-    """Probability that an episode has a wrist trajectory."""
+    constraints: tuple[str, ...] = PAPER
+    """Constraints that the policy knows: what it observes, and can be asked for."""
     headings: Literal["all", "above"] = "all"
     """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier)."""
     own_references: bool = True

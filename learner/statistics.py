@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from common.task.constraints import CONSTRAINTS
 from common.wire.codec import Message
 
 _EPISODE = ("episode/", "term/")
-_CONSTRAINTS = {"affordance": "affordance", "pose": "pose_wrist", "trajectory": "trajectory"}
-"""Mask bit that says whether an episode had the constraint; without any of them it had the heading alone."""
+_BLOCKS = {constraint.name: constraint.blocks for constraint in CONSTRAINTS if constraint.optional}
+"""Bits of the mask, any of which says that an episode had the constraint; without any it had the heading alone."""
 
 
 def summary(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str, Any]:
@@ -58,7 +59,11 @@ def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], 
                 columns[name].append(np.asarray(values, np.float64).ravel())
     joined = {name: np.concatenate(parts) for name, parts in columns.items()}
     count = max((len(values) for values in joined.values()), default=0)
-    active = {name: joined.get(f"episode/mask_{bit}", np.zeros(count)) > 0 for name, bit in _CONSTRAINTS.items()}
+    none = np.zeros(count)
+    active = {
+        name: np.any([joined.get(f"episode/mask_{block}", none) > 0 for block in blocks], 0)
+        for name, blocks in _BLOCKS.items()
+    }
     active["heading"] = ~np.any(list(active.values()), 0)
     success = joined.get("episode/success", np.full(count, np.nan))
     joined |= {f"success/{name}": np.where(rows, success, np.nan) for name, rows in active.items()}

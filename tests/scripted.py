@@ -7,7 +7,7 @@ import numpy as np
 
 from actors.physics.native import NativePhysics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes
-from actors.taskset import build_taskset
+from actors.bank import build_bank
 from common.config import TaskConfig
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
@@ -48,7 +48,7 @@ def grasps(
         hand,
         task,
         physics,
-        build_taskset(hand, task, objects, seed),
+        build_bank(hand, task, objects, seed),
         close(hand, task, firmness),
         batch=batch,
         seed=seed,

@@ -132,6 +132,23 @@ class Hand:
         return tuple(sorted(tips, key=lambda i: self.links[i].name != self.thumb))
 
     @functools.cached_property
+    def finger_roots(self) -> tuple[str, ...]:
+        """First link of each finger with a tip, thumb first."""
+        return tuple(chain_of(self, self.links[i].name)[0] for i in self.tip_links)
+
+    @functools.cached_property
+    def fingers(self) -> tuple[str, ...]:
+        """Names of the G fingers, thumb first: `index` of `index_proximal` where that tells them apart."""
+        short = tuple(root.rpartition("_")[0] or root for root in self.finger_roots)
+        return short if len(set(short)) == len(short) else self.finger_roots
+
+    @functools.cached_property
+    def link_fingers(self) -> np.ndarray:
+        """(L,) index of the finger that each link belongs to, -1 for the palm and what has no tip."""
+        roots = [next(iter(chain_of(self, link.name)), "") for link in self.links]
+        return np.array([self.finger_roots.index(root) if root in self.finger_roots else -1 for root in roots])
+
+    @functools.cached_property
     def contact_weights(self) -> np.ndarray:
         """(L,) shares of the links in the contact reward; they sum to one."""
         weights = np.array([link.contact_weight for link in self.links], np.float32)

@@ -23,7 +23,7 @@ import numpy as np
 
 from common.config import NetworkConfig
 from common.errors import CongraspError
-from common.task.types import MASKS, Array
+from common.task.types import Array
 
 Layout = tuple[tuple[str, int], ...]
 """Names and sizes of an observation's blocks, in order (`common.task.observation.layout`)."""
@@ -31,16 +31,21 @@ Params = dict[str, Any]
 """Flax parameters: nested dicts of arrays."""
 
 TRUNK = ("state", "heading", "mask")
-"""Blocks that go into the trunk as they are, in this order; the codes of `MASKS` follow."""
+"""Blocks that go into the trunk as they are, in this order; the codes of the gated blocks follow."""
 _HIDDEN_GAIN = math.sqrt(2.0)
 _ACTION_GAIN = 0.01  # first actions are noise around zero, whatever the observation
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
+def gated(layout: Layout) -> tuple[str, ...]:
+    """Names of the optional blocks, each of which a bit of the mask gates, in the order of the bits."""
+    return tuple(name for name, _ in layout if name not in TRUNK)
+
+
 def check_layout(layout: Layout) -> None:
     """Raises `CongraspError` unless the layout has exactly the blocks that the networks are made for."""
     names = [name for name, _ in layout]
-    if sorted(names) != sorted((*TRUNK, *MASKS)) or dict(layout)["mask"] != len(MASKS):
+    if len(set(names)) < len(names) or not {*TRUNK} <= {*names} or dict(layout)["mask"] != len(gated(layout)):
         raise CongraspError(f"The observation layout {names} does not fit the network.", "Use this version's layout.")
 
 
@@ -72,7 +77,7 @@ class GatedNetwork(nn.Module):
         """Maps normalised observations (..., D) to (..., outputs)."""
         blocks = split(self.layout, observation)
         inputs = [blocks[name] for name in TRUNK]
-        for bit, name in enumerate(MASKS):
+        for bit, name in enumerate(gated(self.layout)):
             code = nn.elu(self._dense(self.encoder, name)(blocks[name]))
             inputs.append(code * blocks["mask"][..., bit : bit + 1])
         x = jnp.concatenate(inputs, -1)
@@ -96,7 +101,8 @@ def _sizes(tree: Params) -> tuple[tuple[int, ...], int, int]:
     """Hidden, encoder and output units of a network, read off its kernels' shapes."""
     depth = sum(name.startswith("trunk_") for name in tree)
     hidden = tuple(tree[f"trunk_{i}"]["kernel"].shape[-1] for i in range(depth))
-    return hidden, tree[MASKS[0]]["kernel"].shape[-1], tree["output"]["kernel"].shape[-1]
+    encoders = [layer["kernel"].shape[-1] for name, layer in tree.items() if not name.startswith(("trunk_", "output"))]
+    return hidden, encoders[0] if encoders else 0, tree["output"]["kernel"].shape[-1]
 
 
 def shapes(layout: Layout, action_size: int, config: NetworkConfig) -> Params:

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.policy.network import Layout
-from common.task.types import MASKS, Array
+from common.policy.network import TRUNK, Layout
+from common.task.types import Array
 
 LIMIT = 10.0
 """Normalised observations are clipped to plus and minus this."""
@@ -97,7 +97,7 @@ def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
         if statistics.count == 0 or name == "mask":
             continue
         part = Statistics(statistics.count, statistics.mean[block], statistics.m2[block])
-        if name in MASKS:
+        if name not in TRUNK:
             mean_square = part.mean**2 + part.m2 / part.count
             scale[block] = 1.0 / np.maximum(np.sqrt(mean_square), _SMALLEST_STD)
         else:

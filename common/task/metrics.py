@@ -1,62 +1,61 @@
-"""Errors of one moment, with the paper's definitions (section Metrics); episodes average them over their window."""
+"""Errors of one control step, with the paper's definitions (section Metrics), and their means over an episode."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 
-from common import rotations
 from common.config import TaskConfig
-from common.hands.kinematics import grasp_frame
-from common.hands.spec import Hand
-from common.task.control import in_world, tracked_waypoint, wrist_to_joints
-from common.task.features import Features
-from common.task.types import Array, Goal, SceneState
+from common.task.constraints import error_specs, known
+from common.task.constraints.base import ErrorSpec, Scene
+from common.task.types import Array
 
 
-class Errors(NamedTuple):
-    """Errors (B,) of one control step, whether or not their constraint is active."""
-
-    heading_rad: Array
-    """Geodesic distance between v and v-bar; averaged after the table's removal."""
-    heading_m: Array
-    """Length of p - p-bar projected on the plane perpendicular to v-bar; after removal."""
-    pose_rad: Array
-    """Mean absolute error of the finger joints and the three wrist hinges; after removal."""
-    pose_m: Array
-    """Distance of the wrist from its reference position; after removal."""
-    trajectory_rad: Array
-    """Geodesic distance between the wrist and the tracked waypoint; before removal."""
-    trajectory_m: Array
-    """Distance between the wrist and the tracked waypoint; before removal."""
-    minus_links: Array
-    """Number of links that touch O-; the affordance ratio divides sums over the steps after removal."""
-    any_links: Array
-    """Number of touches of links on O+ or O- (a link on both counts once)."""
+def specs(task: TaskConfig) -> tuple[ErrorSpec, ...]:
+    """The errors of the constraints that a task knows."""
+    return error_specs(known(task))
 
 
-def errors(hand: Hand, task: TaskConfig, state: SceneState, features: Features, goal: Goal) -> Errors:
-    """The errors of a batch at one moment."""
-    heading = jnp.array(grasp_frame(hand).heading)
-    target = features.heading_direction
-    cosine = jnp.sum(heading * target, -1)
-    sine = jnp.linalg.norm(jnp.cross(jnp.broadcast_to(heading, target.shape), target), axis=-1)
-    off = features.center - features.heading_position
-    lateral = off - jnp.sum(off * target, -1, keepdims=True) * target
+def errors(scene: Scene) -> dict[str, tuple[Array, Array]]:
+    """Numerator and denominator (B,) of every error in one step, whether or not its constraint is active."""
+    found = {name: value for constraint in known(scene.task) for name, value in constraint.measure(scene).items()}
+    one = jnp.ones_like(scene.state.time)
+    return {name: value if isinstance(value, tuple) else (value, one) for name, value in found.items()}
 
-    position, quaternion = in_world(
-        state.object_position, state.object_quaternion, goal.pose_position, goal.pose_quaternion
-    )
-    hinges = wrist_to_joints(state, position, quaternion)[..., 3:] - state.u[..., 3:]
-    hinges = jnp.mod(hinges + jnp.pi, 2 * jnp.pi) - jnp.pi
-    angles = jnp.concatenate([state.q - goal.pose_q, hinges], -1)
-    waypoint = tracked_waypoint(state, features, goal, task.control.lookahead, current=True)
-    return Errors(
-        heading_rad=jnp.arctan2(sine, cosine),
-        heading_m=jnp.linalg.norm(lateral, axis=-1),
-        pose_rad=jnp.mean(jnp.abs(angles), -1),
-        pose_m=jnp.linalg.norm(features.wrist_position - position, axis=-1),
-        trajectory_rad=rotations.angle(features.wrist_quaternion, waypoint[1]),
-        trajectory_m=jnp.linalg.norm(features.wrist_position - waypoint[0], axis=-1),
-        minus_links=jnp.sum(features.touching_minus, -1).astype(jnp.float32),
-        any_links=jnp.sum(features.touching, -1).astype(jnp.float32),
-    )
+
+def accumulate(
+    task: TaskConfig, sums: Mapping[str, Array], step: Mapping[str, tuple[Array, Array]], approach: Array, hold: Array
+) -> dict[str, Array]:
+    """Sums over an episode with one step more.
+
+    Args:
+      task: names the errors.
+      sums: (B,) so far; a ratio has another sum, of its denominators.
+      step: `errors` of the step.
+      approach: (B,) bool, the step belongs to the approach.
+      hold: (B,) bool, it belongs to the paper's hold.
+    """
+    total = {}
+    for spec in specs(task):
+        counts = (approach if spec.window == "approach" else hold).astype(jnp.float32)
+        numerator, denominator = step[spec.name]
+        total[spec.name] = sums[spec.name] + numerator * counts
+        if spec.ratio:
+            total[f"{spec.name}/of"] = sums[f"{spec.name}/of"] + denominator * counts
+    return total
+
+
+def empty_sums(task: TaskConfig, batch: int) -> dict[str, Array]:
+    """Sums before the first step."""
+    zero = jnp.zeros(batch)
+    return {
+        name: zero for spec in specs(task) for name in ((spec.name, f"{spec.name}/of") if spec.ratio else (spec.name,))
+    }
+
+
+def episode_errors(task: TaskConfig, sums: Mapping[str, Array]) -> dict[str, Array]:
+    """(B,) error of an episode by name: the mean over the steps of its window, or the ratio of its sums."""
+    windows = {"approach": task.approach_steps, "hold": max(task.hold_steps, 1)}
+    return {
+        spec.name: sums[spec.name] / (jnp.maximum(sums[f"{spec.name}/of"], 1.0) if spec.ratio else windows[spec.window])
+        for spec in specs(task)
+    }

@@ -5,14 +5,15 @@ top is at z = 0. Quaternions are (w, x, y, z) and rotate from the named body's f
 F finger joints, L links, P keypoints, C contacts kept per link, N surface points, K waypoints.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 Array = Any  # a jax.Array inside compiled functions, a numpy.ndarray outside
 
-MASKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
-"""Order of the bits of `Goal.mask`."""
 CONTACTS_PER_LINK = 3
 """C, strongest contacts kept for each link."""
 
@@ -71,27 +72,45 @@ class Surface(NamedTuple):
     """(B, N) bool, true in the non-grasping region O-."""
 
 
-class Goal(NamedTuple):
-    """Active constraints after the priority rules, all in the object frame; what a zero bit gates is ignored."""
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Goal:
+    """What an episode asks for, by the names of its constraints (`common.task.constraints`); object frame."""
 
-    heading_position: Array
-    """(B, 3) p-bar."""
-    heading_direction: Array
-    """(B, 3) v-bar, unit."""
-    heading_cross: Array
-    """(B, 3) direction for the cross-finger axis w, unit, orthogonal to v-bar; it fixes the guidance's roll only."""
-    pose_q: Array
-    """(B, F) reference finger angles q-bar."""
-    pose_position: Array
-    """(B, 3) reference wrist position."""
-    pose_quaternion: Array
-    """(B, 4) reference wrist orientation (wrist frame to object frame)."""
-    trajectory_position: Array
-    """(B, K, 3) wrist waypoints."""
-    trajectory_quaternion: Array
-    """(B, K, 4)."""
-    mask: Array
-    """(B, 4) float 0/1 in the order of `MASKS`."""
+    values: dict[str, Any]
+    """Of each constraint its goal arrays (B, ...), as the NamedTuple that the constraint names `goal`."""
+    active: dict[str, Array]
+    """(B,) bool for each optional block of the observation: whether its constraint is active after the priority rules.
+    What an inactive block gates is ignored."""
+
+    def __getitem__(self, constraint: str) -> Any:
+        """The goal arrays of a constraint."""
+        return self.values[constraint]
+
+    def replace(self, constraint: str, **arrays: Array) -> "Goal":
+        """The goal with other arrays of one constraint."""
+        return dataclasses.replace(self, values={**self.values, constraint: self.values[constraint]._replace(**arrays)})
+
+    def where(self, mask: Array, constraint: str, **arrays: Array) -> "Goal":
+        """The goal with other arrays of one constraint in the masked environments (B,)."""
+        own = self.values[constraint]
+        chosen = {
+            name: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, getattr(own, name))
+            for name, new in arrays.items()
+        }
+        return self.replace(constraint, **chosen)
+
+    def flat(self) -> dict[str, Array]:
+        """All goal arrays by the names that messages give them: `heading_direction`, `pose_q` and so on."""
+        return {
+            f"{constraint}_{name}": array
+            for constraint, arrays in self.values.items()
+            for name, array in arrays._asdict().items()
+        }
+
+    def row(self, index: int) -> "Goal":
+        """The goal of one environment, without the batch axis, as NumPy."""
+        return jax.tree.map(lambda array: np.asarray(array)[index], self)
 
 
 class Action(NamedTuple):
@@ -101,8 +120,3 @@ class Action(NamedTuple):
     """(B, F)."""
     u_target: Array
     """(B, 6)."""
-
-
-def first(tree: Any) -> Any:
-    """Element 0 of every array of a (possibly nested) NamedTuple, as NumPy."""
-    return type(tree)(*(np.asarray(leaf)[0] for leaf in tree))

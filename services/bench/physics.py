@@ -14,11 +14,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from actors.bank import build_bank
 from actors.physics import make_physics
 from actors.physics.engine import Physics, Readout
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker
-from actors.taskset import build_taskset
 from common.config import PhysicsName
 from common.hands import get_hand
 from common.objects.pool import load_pool, sized
@@ -79,7 +79,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
     config = get_preset("quickstart")
     hand = get_hand(config.task.hand)
     objects = sized(hand, config.task, load_pool(config.objects))
-    taskset = build_taskset(hand, config.task, objects, 0)
+    bank = build_bank(hand, config.task, objects, 0)
     policy = untrained(config)
     table = Table(title=f"{environments} environments, {threads} thread(s), {_STEPS} control steps, {repeats} repeats")
     for column in ("engine", "actor, control steps/s", "engine alone, control steps/s", "ratio of medians", "of bests"):
@@ -93,7 +93,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
             hand,
             config.task,
             physics,
-            taskset,
+            bank,
             functools.partial(sample_action, policy.spec.layout),
             batch=environments,
             seed=0,
@@ -105,7 +105,8 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
         actor_seconds, bare_seconds = [], []
         for _ in range(repeats):
             if isinstance(physics, Recorder) and twin is not None:
-                twin.start(worker.env.world)
+                assert worker.state is not None
+                twin.start(worker.state.world)
                 physics.commands.clear()
                 bare = functools.partial(replay, twin, physics.commands, config.task.substeps)
             else:
@@ -147,11 +148,13 @@ def _compiled_loop(worker: RolloutWorker) -> Callable[[], object]:
         return jax.lax.scan(body, state, None, length=_STEPS)[0]
 
     compiled = jax.jit(loop)
-    target = jax.numpy.concatenate([worker.env.u_target, worker.env.q_target], -1)
+    state = worker.state
+    assert state is not None
+    target = jax.numpy.concatenate([state.u_target, state.q_target], -1)
     table = jax.numpy.ones(len(target), bool)
 
     def run() -> object:
-        return jax.block_until_ready(compiled(worker.state, target, table))
+        return jax.block_until_ready(compiled(state.physics, target, table))
 
     run()
     return run

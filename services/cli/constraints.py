@@ -62,10 +62,10 @@ class ConstraintsGenerate:
             objects = [obj for text in self.objects for obj in _find(text, self.folder)]
             objects += generate_many(self.count, self.first_seed, self.families)
             status.update("Making constraints")
-            task, taskset = TaskConfig(hand=hand.name), None
+            task, bank = TaskConfig(hand=hand.name), None
             if self.references == "policy":
-                taskset = self._grasped(hand.name, objects, lambda text: status.update(f"Grasping: {text}"))
-            for constraints in make_sets(hand, task, objects, self.seed, taskset):
+                bank = self._grasped(hand.name, objects, lambda text: status.update(f"Grasping: {text}"))
+            for constraints in make_sets(hand, task, objects, self.seed, bank):
                 save(constraints, self.out)
         what = "The constraint set of 1 object is" if len(objects) == 1 else f"The sets of {len(objects)} objects are"
         _console.print(f"{what} in {escape(str(self.out))}.", soft_wrap=True)
@@ -93,9 +93,9 @@ class ConstraintsGenerate:
             said = f"{filled} of {places} places for reference poses are filled"
             progress(said)
 
-        taskset = evaluator.references(tell)
+        bank = evaluator.references(tell)
         _console.print(f"{said}.")
-        return taskset
+        return bank
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,8 +9,8 @@ from common.config import PhysicsName
 from common.errors import CongraspError
 
 if TYPE_CHECKING:
-    from actors.taskset import TaskSet
     from common.objects.spec import GraspObject
+    from common.task.bank import ConstraintBank
     from services.cli.progress import Track
 
 Split = Literal["all", "training", "held-out"]
@@ -90,20 +90,21 @@ def evaluate(
     with tracked() as track:
         given = objects_of(objects, track) if objects else None
         settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
-        taskset = None
+        bank = None
         if constraints is not None:
-            given, taskset = _captured(constraints, split, given, objects)
+            given, bank = _captured(constraints, split, given, objects)
         names = [name for key in TABLES if key in table or "all" in table for name in TABLES[key]]
+        names = [name for name in names if set(name.split("+")) <= set(loaded.task.constraints)]
         evaluator: Any = None
         noisy: list[Any] = []
         left_out: list[CongraspError] = []
         if names:
-            evaluator = _evaluator(loaded, given, taskset, pool or _POOL, settings, track)
+            evaluator = _evaluator(loaded, given, bank, pool or _POOL, settings, track)
             names, left_out = evaluator.allowed(names)
             advance = track("Episodes", len(names) * episodes)
             rows += evaluator.rows(names, episodes, advance, keep=pictures is not None)
         if "noise" in table or "all" in table:
-            evaluator = evaluator or _evaluator(loaded, given, taskset, pool or _POOL, settings, track)
+            evaluator = evaluator or _evaluator(loaded, given, bank, pool or _POOL, settings, track)
             noisy = evaluator.rows_under_noise(track("Episodes under noise", len(LEVELS) * episodes), episodes)
             rows += noisy
         if "objects" in table or "all" in table:
@@ -144,22 +145,22 @@ def evaluate(
 
 def _captured(
     folder: pathlib.Path, split: Split, given: "list[GraspObject] | None", objects: pathlib.Path | None
-) -> "tuple[list[GraspObject], TaskSet]":
+) -> "tuple[list[GraspObject], ConstraintBank]":
     """The objects that have a constraint set in a folder, and the task set of their sets."""
-    from services.grasp.constraint_sets import load_for, taskset_of
+    from services.grasp.constraint_sets import bank_of, load_for
 
     if given is None:
         raise CongraspError("--constraints needs the sets' objects.", "Name their folder with --objects.")
     chosen, sets = load_for(folder, given)
     if not sets:
         raise CongraspError(f"{folder} holds no constraint set of an object in {objects}.", "Name matching folders.")
-    return chosen, taskset_of(sets, split)
+    return chosen, bank_of(sets, split)
 
 
 def _evaluator(
     bundle: Any,
     given: "list[GraspObject] | None",
-    taskset: "TaskSet | None",
+    bank: "ConstraintBank | None",
     pool: int,
     settings: dict[str, Any],
     track: "Track",
@@ -177,7 +178,7 @@ def _evaluator(
         given or load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED)),
         threads=os.cpu_count() or 1,
         hold_steps=two_seconds(bundle.task),
-        taskset=taskset,
+        bank=bank,
         **settings,
     )
 

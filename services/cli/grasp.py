@@ -1,26 +1,37 @@
 """`congrasp grasp`: motions for the user's own objects."""
 
+import dataclasses
 import pathlib
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
+from typing_extensions import Doc
 
 from common.errors import CongraspError
+from common.task.constraints import CONSTRAINTS
 from services.assets.objects.meshes import ImportOptions
 
 NOT_HELD, BAD_INPUT = 1, 2
+
+Constraints: Any = dataclasses.make_dataclass(
+    "Constraints",
+    [
+        (option.name, Annotated[tuple[str, ...], Doc(option.help)], ())
+        if option.many
+        else (option.name, Annotated[str, Doc(option.help)], "")
+        for constraint in CONSTRAINTS
+        for option in constraint.options
+    ],
+    frozen=True,
+)
+"""The options of all constraints."""
 
 
 def grasp(
     objects: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
     out: pathlib.Path = pathlib.Path("grasps"),
-    heading: str = "",
-    at: str = "",
-    affordance: str = "",
-    avoid: str = "",
-    pose: str = "",
-    trajectory: str = "",
+    constraints: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = Constraints(),  # noqa: B008
     video: bool = False,
     pictures: bool = True,
     policy: pathlib.Path | None = None,
@@ -40,13 +51,7 @@ def grasp(
     Args:
       objects: Meshes (STL, OBJ, PLY, GLB), object files, or folders of them.
       out: Folder for the results.
-      heading: The way the hand comes, three numbers in the axes of the object's file ("0 0 -1"), or 'above'. Free by
-        default.
-      at: Where the middle of the grasping hand should be, three numbers in metres, in the coordinates of the file.
-      affordance: What to grasp: a mesh of that part in the coordinates of the object's file, or names of its parts.
-      avoid: What not to touch, likewise.
-      pose: Reference pose: a grasp.npz, a constraint set (FILE:NUMBER), or JSON with joints, position, quaternion.
-      trajectory: Wrist path: a grasp.npz, a constraint set, JSON with position and quaternion, or CSV (x y z w x y z).
+      constraints: What the grasp must keep to.
       video: Also write grasp.mp4, at half speed, with the constraints drawn.
       pictures: Write pictures.
       policy: A policy file; by default the one that comes with the package.
@@ -75,16 +80,8 @@ def grasp(
     file = policy_file(policy, hand)
     loaded = bundles.load(file)
     jobs, results = find_jobs(objects)
-    constraints = {
-        "heading": heading,
-        "at": at,
-        "affordance": affordance,
-        "avoid": avoid,
-        "pose": pose,
-        "trajectory": trajectory,
-    }
     identity = (bundles.content_hash(file.read_bytes()), tries, seed)
-    settings = Settings(out, options, constraints, identity, video, pictures, again)
+    settings = Settings(out, options, dataclasses.asdict(constraints), identity, video, pictures, again)
     grasper = Grasper(loaded, tries=tries, seed=seed)
 
     def say(result: Result) -> None:

@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from common.constraints.headings import above, clear_table, feasible, sample_headings
 from common.errors import CongraspError
 from common.objects import store
 from common.objects.procedural import FAMILIES, family_turns, generate
 from common.objects.spec import GraspObject
 from common.objects.store import Catalogue
+from common.task.sampling.headings import above, clear_table, feasible, sample_headings
 from services.assets.objects.meshes import ImportOptions, import_source
 from services.assets.objects.sources import SUFFIXES, find_sources
 from services.cli.objects_affordance import ObjectsAffordance

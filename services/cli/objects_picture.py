@@ -4,10 +4,10 @@ import pathlib
 
 import numpy as np
 
-from common.constraints.headings import Headings, clear_table, feasible
 from common.errors import CongraspError
 from common.objects import shapes
 from common.objects.spec import GraspObject
+from common.task.sampling.headings import Headings, clear_table, feasible
 
 _PLUS, _MINUS, _ARROW, _GREY = "#2a9d3a", "#d1495b", "#2b6cb0", "#b0b4b8"
 _ARROWS = 24

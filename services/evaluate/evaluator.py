@@ -10,16 +10,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from actors.environment import METRICS, EnvironmentState
+from actors.bank import build_bank
+from actors.env import EnvState, metric_names
 from actors.episode import episode_message
-from actors.rollout import Rollout, RolloutWorker, Trace, finished_episodes, goal_of_world
-from actors.taskset import TaskSet, build_taskset
+from actors.rollout import RolloutWorker, Trace, finished_episodes
 from common.config import PhysicsName, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects.pool import sized
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle
+from common.task.bank import ConstraintBank, Draw
+from common.task.constraints import get_constraint, optional, require_known
 from common.task.types import Surface
 from common.wire.codec import Message
 from services.evaluate.noise import LEVELS, Noise, disturbed
@@ -50,7 +52,7 @@ class Evaluator:
         task: TaskConfig | None = None,
         friction: float = NOMINAL_FRICTION,
         hold_steps: int | None = None,
-        taskset: TaskSet | None = None,
+        bank: ConstraintBank | None = None,
     ):
         """Builds the constraint sets.
 
@@ -64,8 +66,8 @@ class Evaluator:
           task: where it is not to be the bundle's; see `protocol` for what stays of it.
           friction: sliding friction between hand and object.
           hold_steps: control steps without the table; the task's, which count for success, if not given.
-          taskset: constraints to draw from, of these objects in this order
-            (`services.grasp.constraint_sets.taskset_of`); made from the seed if not given.
+          bank: constraints to draw from, of these objects in this order
+            (`services.grasp.constraint_sets.bank_of`); made from the seed if not given.
         """
         base = task or bundle.task
         hold = hold_steps or base.hold_steps
@@ -76,8 +78,8 @@ class Evaluator:
         self.objects = sized(self._hand, self.task, objects)
         self._physics, self._threads, self._seed = physics, threads, seed
         self._batch = batch or _BATCH[physics]
-        self._taskset = taskset or build_taskset(self._hand, self.task, self.objects, seed)
-        self._referred = taskset is not None
+        self._bank = bank or build_bank(self._hand, self.task, self.objects, seed)
+        self._referred = bank is not None
         self._kept: dict[str, dict[bool, list[Message]]] = {}
 
     def samples(
@@ -124,9 +126,9 @@ class Evaluator:
             yield self._gather(worker, [constraint], episodes, progress)[constraint]
             for number, objects in enumerate(pools, 1):
                 self.objects = sized(self._hand, self.task, objects)
-                self._taskset = build_taskset(self._hand, self.task, self.objects, self._seed + number)
+                self._bank = build_bank(self._hand, self.task, self.objects, self._seed + number)
                 self._referred = False
-                worker.replace_objects(self.objects, self._taskset)
+                worker.replace_objects(self.objects, self._bank)
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
 
@@ -136,12 +138,15 @@ class Evaluator:
         Raises:
           CongraspError: none does.
         """
-        affordance, *pose, trajectory = active_mask(constraint)
-        allowed = np.ones(self._taskset.has_affordance.shape, bool)
-        if affordance:
-            allowed &= np.asarray(self._taskset.has_affordance)
-        if trajectory or any(pose):
-            allowed &= np.asarray(self._taskset.pose_valid)[:, int(affordance)].any(-1)
+        require_known(constraint.split("+"), self.task)
+        bank, found = self._bank, active_mask(constraint, self.task)
+        objects, rests = (axis.ravel() for axis in np.indices(bank.has_affordance.shape))
+        draw = Draw(bank, objects, rests, np.zeros_like(objects), np.zeros_like(objects))
+        allowed = np.ones(objects.shape, bool)
+        for part in optional(self.task):
+            if any(found[block] for block in part.blocks):
+                allowed &= np.asarray(part.available(draw))
+                draw = draw._replace(region=np.maximum(draw.region, part.region))
         if not allowed.any():
             raise CongraspError(
                 f"None of the {len(self.objects)} objects allows the constraint '{constraint}'.",
@@ -165,7 +170,7 @@ class Evaluator:
             raise errors[0]
         return allowed, errors
 
-    def references(self, progress: Callable[[int, int], None] = lambda filled, places: None) -> TaskSet:
+    def references(self, progress: Callable[[int, int], None] = lambda filled, places: None) -> ConstraintBank:
         """The task set with reference poses and trajectories from the policy's own grasps under headings.
 
         It grasps until every place is filled, or until `_TRIES` episodes a region of an object filled no further one.
@@ -175,18 +180,18 @@ class Evaluator:
             object, and on O+ where that can be approached.
         """
         with self._worker(mixture(self.task, ["heading", "affordance"]), self._batch) as worker:
-            regions = np.stack([np.ones(len(self.objects), bool), np.asarray(self._taskset.has_affordance).any(-1)], -1)
-            places = int(regions.sum()) * self._taskset.pose_q.shape[2]
+            regions = np.stack([np.ones(len(self.objects), bool), np.asarray(self._bank.has_affordance).any(-1)], -1)
+            places = int(regions.sum()) * self._bank.pose_q.shape[2]
             worker.forget_references()
             filled = idle = 0
             while filled < places and idle < _TRIES * regions.sum():
                 worker.restart()
                 worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
                 worker.renew_references()
-                before, filled = filled, int(np.any(worker.taskset.pose_valid, axis=2)[regions].sum())
+                before, filled = filled, int(np.any(worker.bank.pose_valid, axis=2)[regions].sum())
                 idle = 0 if filled > before else idle + self._batch
                 progress(filled, places)
-            return TaskSet(*(np.asarray(field) for field in worker.taskset))
+            return ConstraintBank(*(np.asarray(field) for field in worker.bank))
 
     def rows_under_noise(self, progress: Callable[[int], None], episodes: int) -> list[Row]:
         """A row for each of `services.evaluate.noise.LEVELS`; see there. The same references are disturbed in all.
@@ -200,7 +205,7 @@ class Evaluator:
             with self._worker(mixture(self.task, [constraint]), episodes) as worker:
                 self._refer(worker, [constraint])
                 for noise in group:
-                    worker.replace_objects(self.objects, disturbed(self._hand, self._taskset, noise, self._seed))
+                    worker.replace_objects(self.objects, disturbed(self._hand, self._bank, noise, self._seed))
                     worker.restart()
                     advance = functools.partial(lambda done, n: progress(done + n), len(rows) * episodes)
                     sample = self._gather(worker, [constraint], episodes, advance)
@@ -209,16 +214,16 @@ class Evaluator:
 
     def noisy_example(self, noise: Noise) -> Message | None:
         """An episode under a noisy reference in which the object is held to the end, if there is one."""
-        kept = self._taskset, self._kept
+        kept = self._bank, self._kept
         try:
-            self._taskset, self._kept = disturbed(self._hand, self._taskset, noise, self._seed), {}
+            self._bank, self._kept = disturbed(self._hand, self._bank, noise, self._seed), {}
             return next(iter(self.examples(noise.constraint, 1, 0, self._batch)), None)
         finally:
-            self._taskset, self._kept = kept
+            self._bank, self._kept = kept
 
     def _refer(self, worker: RolloutWorker, constraints: Sequence[str]) -> None:
         """References from the policy's own grasps under headings, as the paper makes them for its hands; once."""
-        asked = any(any(active_mask(name)[1:]) for name in constraints)
+        asked = any(get_constraint(part).from_reference for name in constraints for part in name.split("+"))
         if not self.task.own_references or self._referred or not asked:
             return
         self._referred = True
@@ -228,11 +233,11 @@ class Evaluator:
             worker.restart()
             worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
             worker.renew_references()
-        made = int(np.asarray(worker.taskset.pose_valid).any(2).sum())
+        made = int(np.asarray(worker.bank.pose_valid).any(2).sum())
         if made < wanted // 4:  # a policy that hardly grasps: those that closing the hand gave are all there is
-            worker.replace_objects(self.objects, self._taskset)
+            worker.replace_objects(self.objects, self._bank)
         else:
-            self._taskset = worker.taskset
+            self._bank = worker.bank
         worker.restart()
 
     def _gather(
@@ -258,7 +263,7 @@ class Evaluator:
             batch, message = self._batch_of_episodes(worker)
             seen += len(batch.values["success"])
             for name in constraints:
-                fits = matching(batch.values, name)
+                fits = matching(batch.values, name, self.task)
                 sample = batch.where(fits).first(episodes - counts[name])
                 for row in np.flatnonzero(fits)[: episodes - counts[name]] if keep else ():
                     kept = self._kept[name][bool(batch.values["held"][row] > 0)]
@@ -315,20 +320,20 @@ class Evaluator:
         with self._worker(mixture(self.task, [constraint]), 1, traced=True) as worker:
             for _ in range(_PATIENCE * tries):
                 sample, message = self._batch_of_episodes(worker)
-                if not matching(sample.values, constraint)[0]:
+                if not matching(sample.values, constraint, self.task)[0]:
                     continue
                 tries -= 1
                 if sample.values["success"][0] > 0 or not tries:
                     return message(0)
         raise CongraspError(f"No episode had the constraints '{constraint}'.", "Choose other objects.")
 
-    def _message(self, begun: EnvironmentState, trace: Trace, metrics: dict[str, float], world: int) -> Message:
+    def _message(self, begun: EnvState, trace: Trace, metrics: dict[str, float], world: int) -> Message:
         """The episode of one of the worlds, from how all of them began and what was recorded of it."""
         return episode_message(
             self._hand,
             self.task,
             trace,
-            goal_of_world(begun.goal, world),
+            begun.goal.row(world),
             Surface(*(np.asarray(field)[world] for field in begun.surface)),
             self.objects[int(np.asarray(begun.world.object_index)[world])],
             {
@@ -343,12 +348,12 @@ class Evaluator:
         self, task: TaskConfig, episodes: int, traced: bool = False
     ) -> contextlib.AbstractContextManager[RolloutWorker]:
         """Acting worlds, not many more than `episodes` of each row need."""
-        rows = 2 ** sum(p not in (0.0, 1.0) for p in (task.p_affordance, task.p_pose, task.p_trajectory))
+        rows = 2 ** sum(getattr(task, f"p_{constraint.name}") not in (0.0, 1.0) for constraint in optional(task))
         return acting(
             self.bundle,
             task,
             self.objects,
-            self._taskset,
+            self._bank,
             physics=self._physics,
             threads=self._threads,
             batch=min(self._batch, 1 << (episodes * rows - 1).bit_length()),
@@ -356,10 +361,11 @@ class Evaluator:
             traced=slice(None) if traced else slice(0),
         )
 
-    def _begin(self, worker: RolloutWorker) -> EnvironmentState:
+    def _begin(self, worker: RolloutWorker) -> EnvState:
         """Gives the episodes that begin now the full hold, whatever was drawn for them."""
-        worker.env = worker.env._replace(hold=jnp.full_like(worker.env.hold, self._hold))
-        return worker.env
+        assert worker.state is not None
+        worker.state = worker.state._replace(hold=jnp.full_like(worker.state.hold, self._hold))
+        return worker.state
 
     def _batch_of_episodes(self, worker: RolloutWorker) -> tuple[Sample, Callable[[int], Message]]:
         """One episode of every world, and what gives the recording of one; all of them begin and end together.
@@ -380,7 +386,8 @@ class Evaluator:
                 rows = slice(max(0, start - step), start + window - step)
                 probed.append([np.asarray(values)[rows].swapaxes(0, 1) for values in rollout.probed])
         force, torque = (np.concatenate(parts, 1) for parts in zip(*probed, strict=True))
-        values = _metrics(rollout)
+        finished = finished_episodes(rollout, self.task)
+        values = {name: finished[f"episode/{name}"] for name in metric_names(self.task)}
 
         def message(world: int) -> Message:
             trace = Trace(
@@ -389,9 +396,3 @@ class Evaluator:
             return self._message(begun, trace, {name: float(column[world]) for name, column in values.items()}, world)
 
         return Sample(values, force, torque), message
-
-
-def _metrics(rollout: Rollout) -> dict[str, np.ndarray]:
-    """Metrics (E,) of the episodes that ended, by the names in `METRICS`."""
-    episodes = finished_episodes(rollout)
-    return {name: episodes[f"episode/{name}"] for name in METRICS}

@@ -9,9 +9,9 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from actors.taskset import TaskSet
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
+from common.task.bank import ConstraintBank
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +42,7 @@ LEVELS = (
 """Rows of the table."""
 
 
-def disturbed(hand: Hand, taskset: TaskSet, noise: Noise, seed: int) -> TaskSet:
+def disturbed(hand: Hand, bank: ConstraintBank, noise: Noise, seed: int) -> ConstraintBank:
     """The task set with noisy references.
 
     * joints: an independent normal error of standard deviation `level` on every finger joint, kept within its limits.
@@ -51,17 +51,17 @@ def disturbed(hand: Hand, taskset: TaskSet, noise: Noise, seed: int) -> TaskSet:
     """
     rng = np.random.default_rng(seed)
     if noise.kind == "joints":
-        q = np.asarray(taskset.pose_q)
+        q = np.asarray(bank.pose_q)
         noisy = np.clip(q + rng.normal(0.0, noise.level, q.shape), hand.lower, hand.upper)
-        return taskset._replace(pose_q=noisy.astype(np.float32))
+        return bank._replace(pose_q=noisy.astype(np.float32))
     if noise.kind == "depth":
-        position, quaternion = np.asarray(taskset.pose_position), np.asarray(taskset.pose_quaternion)
+        position, quaternion = np.asarray(bank.pose_position), np.asarray(bank.pose_quaternion)
         turn = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
         inward = turn.apply(grasp_frame(hand).heading).reshape(position.shape)
         depth = rng.uniform(0.0, noise.level, (*position.shape[:-1], 1))
-        return taskset._replace(pose_position=(position + depth * inward).astype(np.float32))
+        return bank._replace(pose_position=(position + depth * inward).astype(np.float32))
     if noise.kind == "jitter":
-        path = np.asarray(taskset.trajectory_position)
+        path = np.asarray(bank.trajectory_position)
         noisy = path + rng.normal(0.0, noise.level, path.shape)
-        return taskset._replace(trajectory_position=noisy.astype(np.float32))
-    return taskset
+        return bank._replace(trajectory_position=noisy.astype(np.float32))
+    return bank

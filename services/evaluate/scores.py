@@ -9,22 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from common.config import TaskConfig
 from common.files import write_atomically
-from common.task.types import MASKS
+from common.task.constraints import CONSTRAINTS, optional
+from common.task.constraints.priority import active_blocks
 
 TABLES = {
-    "single": ("heading", "pose", "trajectory", "affordance"),
+    "single": tuple(constraint.name for constraint in CONSTRAINTS),
     "composed": ("pose+trajectory", "trajectory+affordance"),
 }
 """Rows of the paper's tables, by the constraints that are active."""
-ERRORS = {
-    "heading": {"heading_rad": "heading_rad", "heading_m": "heading_m"},
-    "pose": {"pose_rad": "pose_rad", "pose_m": "pose_m"},
-    "trajectory": {"trajectory_rad": "traj_rad", "trajectory_m": "traj_m"},
-    "affordance": {"affordance_ratio": "affordance_ratio"},
-}
-"""Of each constraint: names of its errors in `actors.environment.METRICS` and in the rows."""
-_UNITS = {"rad": "rad", "m": "m", "ratio": ""}
+ERRORS = {c.name: {spec.name: spec.column or spec.name for spec in c.errors} for c in CONSTRAINTS}
+"""Of each constraint: names of its errors among the metrics of episodes and in the rows."""
+_UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
 PROBED_EPISODES = 2000
 """Forces are read from this many episodes of a row at most."""
 _HUNDREDTHS = np.linspace(0, 1, 101)
@@ -76,7 +73,7 @@ class Sample:
     """Episodes that count for one row."""
 
     values: dict[str, np.ndarray]
-    """Metrics (E,), by the names in `actors.environment.METRICS`."""
+    """Metrics (E,), by the names in `actors.env.metric_names`."""
     link_force: np.ndarray
     """(E', W, L) net contact force of each link in the paper's window, N; of the first E' of the episodes."""
     torque: np.ndarray
@@ -155,23 +152,17 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     return max(low, 0.0), min(high, 1.0)
 
 
-def active_mask(constraint: str) -> tuple[bool, ...]:
-    """Bits of the goal's mask, in the order of `MASKS`, in an episode that belongs to a row."""
+def active_mask(constraint: str, task: TaskConfig) -> dict[str, bool]:
+    """Which blocks of the observation are active in an episode that belongs to a row."""
     parts = constraint.split("+")
-    pose, trajectory = "pose" in parts, "trajectory" in parts
-    bits = {
-        "affordance": "affordance" in parts and not pose,
-        "pose_finger": pose,
-        "pose_wrist": pose and not trajectory,
-        "trajectory": trajectory,
-    }
-    return tuple(bits[name] for name in MASKS)
+    found = active_blocks({c.name: np.bool_(c.name in parts) for c in optional(task)})
+    return {block: bool(active) for block, active in found.items()}
 
 
-def matching(values: dict[str, np.ndarray], constraint: str) -> np.ndarray:
+def matching(values: dict[str, np.ndarray], constraint: str, task: TaskConfig) -> np.ndarray:
     """(E,) bool: episodes in which exactly the row's constraints were active."""
-    masks = np.stack([values[f"mask_{name}"] > 0 for name in MASKS], -1)
-    return np.all(masks == np.array(active_mask(constraint)), -1)
+    wanted = active_mask(constraint, task)
+    return np.all([(values[f"mask_{block}"] > 0) == active for block, active in wanted.items()], 0)
 
 
 def summarise(constraint: str, hand: str, sample: Sample, *, held_2s: bool, group: str = "") -> Row:
@@ -341,7 +332,7 @@ def _errors(errors: dict[str, float | None] | dict[str, float]) -> str:
     """Such as "0.137 rad 0.020 m", constraint by constraint."""
     words = []
     for names in ERRORS.values():
-        found = [(errors.get(name), _UNITS[name.rsplit("_", 1)[1]]) for name in names.values()]
+        found = [(errors.get(name), _UNITS[name]) for name in names.values()]
         part = " ".join(f"{value:.3f} {unit}".strip() for value, unit in found if value is not None)
         words += [part] if part else []
     return ", ".join(words)

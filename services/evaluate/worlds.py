@@ -11,16 +11,16 @@ import numpy as np
 
 from actors.physics import make_physics
 from actors.rollout import RolloutWorker
-from actors.taskset import TaskSet
 from common.config import PhysicsName, TaskConfig
 from common.hands import get_hand
-from common.hands.spec import Hand
 from common.objects.mjcf import CONTACT
 from common.objects.pool import object_scale
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, mean_action
-from common.task.features import Features
-from common.task.types import Array, SceneState
+from common.task.bank import ConstraintBank
+from common.task.constraints import optional
+from common.task.constraints.base import Scene
+from common.task.types import Array
 
 HOLD_SECONDS = 2.0
 """How long a grasp should last without the table, beyond the paper's quarter of a second."""
@@ -56,12 +56,8 @@ def mixture(task: TaskConfig, constraints: Sequence[str]) -> TaskConfig:
         share = sum(part in parts for parts in asked) / len(asked)
         return share if share in (0.0, 1.0) else 0.5
 
-    return dataclasses.replace(
-        task,
-        p_affordance=probability("affordance"),
-        p_pose=probability("pose"),
-        p_trajectory=probability("trajectory"),
-    )
+    shares: dict[str, Any] = {f"p_{constraint.name}": probability(constraint.name) for constraint in optional(task)}
+    return dataclasses.replace(task, **shares)
 
 
 def objects_in_words(bundle: PolicyBundle, folder: pathlib.Path | None) -> str:
@@ -76,7 +72,7 @@ def acting(
     bundle: PolicyBundle,
     task: TaskConfig,
     objects: Sequence[GraspObject],
-    taskset: TaskSet,
+    bank: ConstraintBank,
     *,
     physics: PhysicsName,
     threads: int,
@@ -92,7 +88,7 @@ def acting(
       bundle: the policy.
       task: the task.
       objects: what is grasped.
-      taskset: constraints on them.
+      bank: constraints on them.
       physics: engine; not `auto`.
       threads: threads of the `native` engine.
       batch: B, number of worlds.
@@ -104,21 +100,21 @@ def acting(
     def policy(acting: Any, observation: Array, key: Array) -> tuple[Array, Array]:
         return mean_action(layout, acting, observation), observation[..., 0] * 0.0
 
-    def probe(scene: SceneState, seen: Features) -> tuple[Array, Array]:
-        force = jnp.linalg.norm(seen.force, axis=-1)
-        return force.astype(jnp.float16), torque_share(hand, scene).astype(jnp.float16)
+    def probe(scene: Scene) -> tuple[Array, Array]:
+        force = jnp.linalg.norm(scene.features.force, axis=-1)
+        return force.astype(jnp.float16), torque_share(scene).astype(jnp.float16)
 
     engine = make_physics(physics, hand, task, objects, threads=threads)
     try:
         yield RolloutWorker(
-            hand, task, engine, taskset, policy, batch=batch, seed=seed, half=False, probe=probe, traced=traced
+            hand, task, engine, bank, policy, batch=batch, seed=seed, half=False, probe=probe, traced=traced
         )
     finally:
         engine.close()
 
 
-def torque_share(hand: Hand, scene: SceneState) -> Array:
+def torque_share(scene: Scene) -> Array:
     """(B, F) |clip(kp (q_target - q) - kv q_velocity, limit)| / limit: finger torques by the hand's position servos."""
-    gains = np.array([(joint.kp, joint.kv, joint.torque_limit) for joint in hand.joints], np.float32)
-    torque = gains[:, 0] * (scene.q_target - scene.q) - gains[:, 1] * scene.q_velocity
+    gains = np.array([(joint.kp, joint.kv, joint.torque_limit) for joint in scene.hand.joints], np.float32)
+    torque = gains[:, 0] * (scene.state.q_target - scene.state.q) - gains[:, 1] * scene.state.q_velocity
     return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)

@@ -17,11 +17,14 @@ from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands import get_hand
 from common.hands.spec import Hand, link_origin
-from common.task.types import MASKS
+from common.task.constraints import CONSTRAINTS
 from common.wire.codec import Message
+from services.record.goals import active_constraints
 
-FORMAT = 1
+FORMAT = 2
 _META = "meta"
+_OLDER = {"pose_joints": "pose_q"}
+"""Names of goal arrays in files of format 1."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -40,9 +43,9 @@ class GraspMotion:
     control_dt: float
     """Seconds between two moments."""
     constraints: tuple[str, ...]
-    """Active constraints: heading, affordance, pose, trajectory."""
+    """Names of the active constraints, weakest first."""
     metrics: dict[str, float]
-    """Errors, forces and reward of the episode, by the names in `actors.environment.METRICS`."""
+    """Errors, forces and reward of the episode, by the names in `actors.env.metric_names`."""
     about: dict[str, Any]
     """Where it comes from: version of the policy, file of the object, command."""
     time: Annotated[np.ndarray, "(T,) s"]
@@ -72,33 +75,32 @@ class GraspMotion:
     capsule_radius: Annotated[np.ndarray, "(C,) m"]
     surface_points: Annotated[np.ndarray, "(N, 3) m, object frame, points of the surface"]
     surface_minus: Annotated[np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"]
-    heading_position: Annotated[np.ndarray, "(3,) m, object frame, where the middle of the grasping hand should be"]
-    heading_direction: Annotated[np.ndarray, "(3,) unit, object frame, the way the hand comes"]
-    pose_joints: Annotated[np.ndarray, "(F,) rad, reference pose (where pose is among the constraints)"]
-    pose_position: Annotated[np.ndarray, "(3,) m, object frame, wrist of the reference pose"]
-    pose_quaternion: Annotated[np.ndarray, "(4,) w x y z, wrist frame to object frame"]
-    trajectory_position: Annotated[np.ndarray, "(K, 3) m, object frame, wrist (where trajectory is a constraint)"]
-    trajectory_quaternion: Annotated[np.ndarray, "(K, 4) w x y z, wrist frame to object frame"]
+    goal: dict[str, np.ndarray]
+    """Goal arrays of the constraints that the policy knows, by constraint and field: `heading_direction`, `pose_q`."""
 
 
+_GOALS = {
+    f"{constraint.name}_{name}": f"({', '.join(map(str, array.shape))}{',' * (len(array.shape) == 1)}) {array.meaning}"
+    for constraint in CONSTRAINTS
+    for name, array in constraint.arrays.items()
+}
+"""Meaning of the goal arrays; it begins with the shape, as that of the others does."""
 _HINTS = get_type_hints(GraspMotion, include_extras=True)
 _ARRAYS = {name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")}
-_FACTS = tuple(name for name in _HINTS if name not in _ARRAYS)
+_FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name != "goal")
 
 
 def motion_of_episode(episode: Message) -> GraspMotion:
     """The motion of an episode, whether just made or read from MCAP (`services.record.reader.read_episodes`)."""
     arrays, meta = {name: np.asarray(value) for name, value in episode.arrays.items()}, dict(episode.meta)
     hand = get_hand(meta.pop("hand"))
-    bits = dict(zip(MASKS, arrays["goal/mask"] > 0, strict=True))
-    active = {"affordance": bits["affordance"], "pose": bits["pose_finger"], "trajectory": bits["trajectory"]}
     dt = float(meta.pop("control_dt"))
     return GraspMotion(
         hand=hand.name,
         object=meta.pop("object"),
         success=bool(meta.pop("success")),
         control_dt=dt,
-        constraints=("heading", *(name for name, bit in active.items() if bit)),
+        constraints=active_constraints(arrays),
         metrics={name: float(value) for name, value in meta.pop("metrics", {}).items()},
         about=meta,
         time=dt * np.arange(len(arrays["table"])),
@@ -119,13 +121,9 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         **hand_arrays(hand),
         surface_points=arrays["surface_points"],
         surface_minus=arrays["surface_minus"].astype(bool),
-        heading_position=arrays["goal/heading_position"],
-        heading_direction=arrays["goal/heading_direction"],
-        pose_joints=arrays["goal/pose_q"],
-        pose_position=arrays["goal/pose_position"],
-        pose_quaternion=arrays["goal/pose_quaternion"],
-        trajectory_position=arrays["goal/trajectory_position"],
-        trajectory_quaternion=arrays["goal/trajectory_quaternion"],
+        goal={
+            name.removeprefix("goal/"): value for name, value in arrays.items() if name.removeprefix("goal/") in _GOALS
+        },
     )
 
 
@@ -160,10 +158,10 @@ def save_motion(path: pathlib.Path, motion: GraspMotion) -> None:
         "units": "m, rad, s, N",
         "quaternions": "(w, x, y, z)",
         "world": "z up, table's top at z = 0",
-        "arrays": _ARRAYS,
+        "arrays": {**_ARRAYS, **{name: _GOALS[name] for name in motion.goal}},
     }
     buffer = io.BytesIO()
-    arrays: dict[str, Any] = {name: getattr(motion, name) for name in _ARRAYS}
+    arrays: dict[str, Any] = {**{name: getattr(motion, name) for name in _ARRAYS}, **motion.goal}
     arrays[_META] = np.array(json.dumps(meta))
     np.savez_compressed(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
@@ -180,12 +178,13 @@ def load_motion(path: pathlib.Path) -> GraspMotion:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         meta = json.loads(str(arrays.pop(_META)))
-        if meta["format"] != FORMAT:
+        if meta["format"] not in (1, FORMAT):
             raise CongraspError(f"{path} has format {meta['format']}, not {FORMAT}.", remedy)
         facts = {name: meta[name] for name in _FACTS}
         facts["constraints"] = tuple(facts["constraints"])
-        _check_shapes(arrays)
-        return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS})
+        goal = {_OLDER.get(name, name): arrays.pop(name) for name in set(arrays) - set(_ARRAYS)}
+        _check_shapes({**arrays, **goal}, {**_ARRAYS, **{name: _GOALS[name] for name in goal}})
+        return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, goal=goal)
     except OSError as error:
         raise CongraspError(f"The motion {path} cannot be read: {error.strerror or error}.", remedy) from None
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
@@ -193,10 +192,10 @@ def load_motion(path: pathlib.Path) -> GraspMotion:
         raise CongraspError(f"{path} is not a grasp motion ({why}).", remedy) from None
 
 
-def _check_shapes(arrays: dict[str, np.ndarray]) -> None:
+def _check_shapes(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> None:
     """A ValueError where an array has another shape than its meaning says, or none, or a face names no vertex."""
     sizes: dict[str, int] = {}
-    for name, meaning in _ARRAYS.items():
+    for name, meaning in meanings.items():
         words = meaning[1 : meaning.index(")")]
         letters, shape = words.replace(",", " ").split(), arrays[name].shape
         if 0 in shape:

@@ -10,9 +10,8 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from common.policy.bundle import PolicyBundle
-from common.policy.network import TRUNK
+from common.policy.network import TRUNK, gated
 from common.policy.normalizer import LIMIT
-from common.task.types import MASKS
 
 OPSET = 17
 """Old enough for every runtime in use; the graph needs nothing newer."""
@@ -57,7 +56,7 @@ def policy_model(bundle: PolicyBundle, meta: Mapping[str, Any]) -> onnx.ModelPro
     for (name, size), end in zip(layout, ends, strict=True):
         _slice(graph, "normalised", end - size, end, name)
     parts = list(TRUNK)
-    for bit, name in enumerate(MASKS):
+    for bit, name in enumerate(gated(layout)):
         code = graph.node("Elu", [graph.dense(layers, name, name, f"{name}.dense")], f"{name}.code")
         gate = _slice(graph, "mask", bit, bit + 1, f"{name}.bit")
         parts.append(graph.node("Mul", [code, gate], f"{name}.gated"))

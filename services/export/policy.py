@@ -21,8 +21,9 @@ from common.hands.mjcf import WRIST_JOINTS
 from common.hands.spec import link_origin
 from common.objects.mjcf import CONTACT
 from common.policy.bundle import PolicyBundle, content_hash, mean_action
-from common.task.observation import FORCE_SCALE
-from common.task.types import MASKS
+from common.policy.network import gated
+from common.task import observation
+from common.task.geometry import FORCE_SCALE
 from common.wire.codec import encode
 
 TOLERANCE = 1e-5
@@ -46,7 +47,7 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
         "control_dt": task.control_dt,
         "layout": [[name, size] for name, size in bundle.spec.layout],
         "observation": observation_fields(bundle),
-        "masks": list(MASKS),
+        "masks": list(gated(bundle.spec.layout)),
         "action": action_meaning(bundle),
         "action_std": np.exp(np.asarray(bundle.params["actor"]["log_std"])).tolist(),
         "joints": joints,
@@ -75,49 +76,11 @@ def observation_fields(bundle: PolicyBundle) -> list[dict[str, Any]]:
 
     "wrist" is the wrist frame, in which all vectors are unless something else is said.
     """
-    hand, task = get_hand(bundle.spec.hand), bundle.task
-    f, n, p = len(hand.joints), len(hand.links), len(hand.keypoints)
-    table = {
-        "state": [
-            ("q", f, "rad, finger joints in the order of 'joints'"),
-            ("u", 6, "m and rad, wrist joints in the order of 'wrist_joints', from the wrist's pose at the start"),
-            ("q_target - q", f, "rad, by what the last action's finger targets are ahead"),
-            ("u_target - u", 6, "m and rad, the same for the wrist"),
-            ("q_velocity", f, "rad/s"),
-            ("u_velocity", 6, "m/s and rad/s"),
-            ("touching", n, "1 where a link, in the order of 'links', touches the object, else 0"),
-            ("force", 3 * n, "f / (|f| + force_scale) of the object's net force f on each link, N, wrist frame"),
-            ("nearest", 3 * p, "m, from each keypoint to the nearest surface point, wrist frame"),
-            ("object_velocity", 3, "m/s of the centre of mass, wrist frame"),
-            ("object_angular_velocity", 3, "rad/s, wrist frame"),
-            ("object_displacement", 3, "m since the start, wrist frame"),
-            ("object_rotation", 3, "twice the vector part of the rotation since the start (w >= 0), wrist frame"),
-            ("time", 1, "control steps over (approach_steps + hold_steps), at most 1"),
-            ("table", 1, "1 while the table is there"),
-        ],
-        "heading": [
-            ("center", 3, "m, middle between thumb's tip and the other tips' mean, wrist frame"),
-            ("heading_position", 3, "m, where the centre should be, wrist frame"),
-            ("heading_position - center", 3, "m, wrist frame"),
-            ("heading_direction", 3, "unit, the way the hand should come, wrist frame"),
-            ("object_matrix", 9, "rotation matrix from object to wrist frame, row by row"),
-        ],
-        "affordance": [
-            ("nearest_minus", 3 * p, "m, from each keypoint to the nearest point that must not be touched"),
-            ("force_minus", 3 * n, "as force, of contacts that must not be"),
-        ],
-        "pose_finger": [
-            ("pose_q - q", f, "rad, to the reference pose"),
-            ("pose_keypoints - keypoints", 3 * p, "m, wrist frame"),
-        ],
-        "pose_wrist": [("pose_u - u", 6, "m and rad, wrist joints of the reference pose, less the present ones")],
-        "trajectory": [("waypoint_u - u", 6 * task.trajectory_points, "m and rad, the same for every waypoint")],
-        "mask": [("mask", len(MASKS), "1 for each active constraint in the order of 'masks'; else its block is zero")],
-    }
+    described = observation.fields(get_hand(bundle.spec.hand), bundle.task)
     return [
-        {"block": block, "field": field, "size": size, "meaning": meaning}
+        {"block": block, "field": field.name, "size": field.size, "meaning": field.meaning}
         for block, _ in bundle.spec.layout
-        for field, size, meaning in table[block]
+        for field in described[block]
     ]
 
 
@@ -145,12 +108,13 @@ def sample_observations(bundle: PolicyBundle, count: int, seed: int = 0) -> np.n
     seen = bundle.observation
     spread = np.sqrt(np.asarray(seen.m2) / max(float(seen.count), 1.0)) + 1e-3
     drawn = np.asarray(seen.mean) + 3.0 * spread * rng.normal(size=(count, len(spread)))
-    start, mask = 0, rng.integers(0, 2, (count, len(MASKS)))
+    names = gated(bundle.spec.layout)
+    start, mask = 0, rng.integers(0, 2, (count, len(names)))
     for name, size in bundle.spec.layout:
         block = slice(start, start + size)
         start += size
-        if name in MASKS:
-            drawn[:, block] *= mask[:, MASKS.index(name), None]
+        if name in names:
+            drawn[:, block] *= mask[:, names.index(name), None]
         elif name == "mask":
             drawn[:, block] = mask
     return drawn.astype(np.float32)

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from actors.taskset import TaskSet, build_taskset
+from actors.bank import build_bank
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.files import write_atomically
@@ -14,6 +14,7 @@ from common.hands.spec import Hand
 from common.objects import store
 from common.objects.pool import object_scale, sized
 from common.objects.spec import GraspObject
+from common.task.bank import ConstraintBank
 from common.wire.codec import Message, decode, encode
 
 SUFFIX = ".constraints.safetensors"
@@ -45,7 +46,7 @@ _MEANING = {
 
 
 def make_sets(
-    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, taskset: TaskSet | None = None
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, bank: ConstraintBank | None = None
 ) -> list[Message]:
     """The constraint set of each object, as training and evaluation make it.
 
@@ -54,18 +55,18 @@ def make_sets(
       task: geometry of the approach.
       objects: the objects.
       seed: of the constraints.
-      taskset: of these objects in the hand's size, where it is there already; its reference poses are kept.
+      bank: of these objects in the hand's size, where it is there already; its reference poses are kept.
 
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
     fitting = sized(hand, task, objects)
-    taskset = TaskSet(*(np.asarray(field) for field in taskset or build_taskset(hand, task, fitting, seed)))
+    bank = ConstraintBank(*(np.asarray(field) for field in bank or build_bank(hand, task, fitting, seed)))
     scale = object_scale(hand, task)
     return [
         set_of(
             hand,
-            TaskSet(*(field[n] for field in taskset)),
+            ConstraintBank(*(field[n] for field in bank)),
             fitting[n],
             seed,
             {"object_scale": scale, "object_digest": store.digest(obj)},
@@ -74,7 +75,9 @@ def make_sets(
     ]
 
 
-def set_of(hand: Hand, row: TaskSet, obj: GraspObject, seed: int, about: dict[str, Any] | None = None) -> Message:
+def set_of(
+    hand: Hand, row: ConstraintBank, obj: GraspObject, seed: int, about: dict[str, Any] | None = None
+) -> Message:
     """The constraint set of one object.
 
     Args:
@@ -138,7 +141,7 @@ def _split(shape: tuple[int, ...], seed: int) -> np.ndarray:
     return np.broadcast_to(order < np.ceil(_TRAINING * shape[1]), shape).copy()
 
 
-def taskset_of(sets: Sequence[Message], split: Split = "all") -> TaskSet:
+def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
     """The task set that episodes are drawn from, of constraint sets of one hand.
 
     Sets may differ in their numbers of resting poses, headings and references: they are repeated to the largest.
@@ -169,10 +172,12 @@ def taskset_of(sets: Sequence[Message], split: Split = "all") -> TaskSet:
                 )
     rows = [_row(made, split) for made in sets]
     most = {axis: max(row.pose_valid.shape[axis] for row in rows) for axis in (1, 2)}
-    return TaskSet(*(np.stack(column) for column in zip(*(_filled(row, *most.values()) for row in rows), strict=True)))
+    return ConstraintBank(
+        *(np.stack(column) for column in zip(*(_filled(row, *most.values()) for row in rows), strict=True))
+    )
 
 
-def _row(made: Message, split: Split) -> TaskSet:
+def _row(made: Message, split: Split) -> ConstraintBank:
     """One set as a row of a task set, with what belongs to the split alone, and resting poses that allow a heading."""
     arrays = made.arrays
     heading, pose = (
@@ -187,7 +192,7 @@ def _row(made: Message, split: Split) -> TaskSet:
     heading, back = heading[:, usable], arrays["heading/back"][:, usable]
     count = heading.shape[-1]
     index = np.array([[np.resize(np.flatnonzero(row) if row.any() else [0], count) for row in v] for v in heading])
-    return TaskSet(
+    return ConstraintBank(
         points=arrays["surface/points"],
         minus=arrays["surface/minus"],
         rest=arrays["rest"][usable],
@@ -211,11 +216,13 @@ def _belongs(training: np.ndarray, split: Split) -> np.ndarray:
     return {"all": np.ones_like(training), "training": training, "held-out": ~training}[split]
 
 
-def _filled(row: TaskSet, rests: int, poses: int) -> TaskSet:
+def _filled(row: ConstraintBank, rests: int, poses: int) -> ConstraintBank:
     """The row with its resting poses and references repeated to these numbers."""
     r = np.resize(np.arange(len(row.rest)), rests)
     m = np.resize(np.arange(row.pose_q.shape[1]), poses)
-    per_pose = [name for name in TaskSet._fields if name.startswith(("pose_", "trajectory_")) and name != "pose_valid"]
+    per_pose = [
+        name for name in ConstraintBank._fields if name.startswith(("pose_", "trajectory_")) and name != "pose_valid"
+    ]
     return row._replace(
         rest=row.rest[r],
         has_affordance=row.has_affordance[r],

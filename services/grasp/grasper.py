@@ -14,26 +14,29 @@ import pathlib
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 
+from actors.attempts import Attempts, Outcome
 from actors.episode import episode_message
-from actors.rollout import Trace, goal_of_world
-from actors.trials import Beginnings, Outcome, Trials
-from common.constraints.contradictions import Wishes, contradictions
-from common.constraints.priority import Request, explain
+from actors.initial import RequestedEpisodes
+from actors.rollout import Trace
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects.spec import GraspObject
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
 from common.policy.pretrained import policy_file
-from common.task.types import MASKS, Goal, Surface
+from common.request import GraspRequest
+from common.task.constraints import CONSTRAINTS, goal_of, optional, require_known
+from common.task.constraints.priority import contradictions, explain
+from common.task.types import Goal, Surface
 from common.wire.codec import Message
 from services.assets.objects.meshes import ImportOptions
 from services.assets.objects.named import one_object
 from services.export.motion_file import GraspMotion, motion_of_episode
-from services.grasp.asked import Asked, read_asked
-from services.grasp.beginnings import headings, valid_rests
+from services.grasp.approaches import headings, prescribed, valid_rests
+from services.grasp.parse import read_request
 
 TRIES = 16
 """Grasps that are simulated side by side."""
@@ -41,18 +44,8 @@ ROUNDS = 4
 """How often that many others are tried while none holds."""
 HOLD_SECONDS = 2.0
 """How long the object should be held without the table."""
-_SCALES = {
-    "heading_rad": 0.2,
-    "heading_m": 0.02,
-    "pose_rad": 0.25,
-    "pose_m": 0.02,
-    "trajectory_rad": 0.2,
-    "trajectory_m": 0.03,
-    "affordance_ratio": 0.05,
-    "moved_at_removal": 0.03,
-    "force_link_max": 10.0,
-    "slip": 0.02,
-}
+_SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
+_SCALES |= {"moved_at_removal": 0.03, "force_link_max": 10.0, "slip": 0.02}
 """What weighs as much as one another, among grasps that hold: errors, the object's way before the table goes (m), the
 strongest link's force (N), and the object's way after it went (m)."""
 _UNLIKELY = 0.5
@@ -126,109 +119,101 @@ class Grasper:
         """
         self.hand = get_hand(policy.spec.hand)
         self.task = dataclasses.replace(policy.task, end_when_fallen=False)
-        self._policy, self._tries, self._rounds, self._seed = policy, tries, rounds, seed
+        self._policy, self._attempts_count, self._rounds, self._seed = policy, tries, rounds, seed
         self._compiled = False
         hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
-        self._trials = Trials(self.hand, self.task, policy, hold=hold, threads=threads or os.cpu_count() or 1)
+        self._attempts = Attempts(self.hand, self.task, policy, hold=hold, threads=threads or os.cpu_count() or 1)
 
     def grasp(
-        self, obj: GraspObject, asked: Asked | None = None, progress: Progress = lambda what, done, total: None
+        self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
     ) -> Grasp:
         """The best grasp of some tries.
 
         Args:
           obj: the object.
-          asked: constraints on it; any grasp by default.
+          request: constraints on it; any grasp by default.
           progress: told how far it is.
 
         Raises:
           CongraspError: the constraints contradict one another, or the table is in the way of all of them.
         """
-        asked = asked or Asked()
-        best: tuple[float, Outcome, int, int] | None = None
+        request = request or GraspRequest()
+        require_known(request.constraints, self.task)
+        best: tuple[float, Outcome, Goal, int, int] | None = None
         held = tried = 0
         for round_ in range(self._rounds):
-            beginnings, rests, different = self._beginnings(obj, asked, np.random.default_rng((self._seed, round_)))
+            episodes, rests, different = self._episodes(obj, request, np.random.default_rng((self._seed, round_)))
             progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
             self._compiled = True
             what = f"Trying others ({round_ + 1})" if round_ else "Trying"
-            outcome = self._trials.run(
-                obj, beginnings, functools.partial(lambda what, step: progress(what, step, self._trials.steps), what)
+            outcome = self._attempts.run(
+                obj, episodes, functools.partial(lambda what, step: progress(what, step, self._attempts.steps), what)
             )
             _check_aligned(outcome)
-            cost = (costs(outcome, _active(asked)) + _UNLIKELY * rests)[:different]
+            cost = (costs(outcome, tuple(request.constraints)) + _UNLIKELY * rests)[:different]
             tried += different
             holds = outcome.metrics["held"][:different] > 0
             held += int(holds.sum())
-            if asked.minus is not None:  # one that holds it by what must not be touched is not what was asked for
+            if request.avoid is not None:  # one that holds it by what must not be touched is not what was asked for
                 holds &= outcome.metrics["affordance_ratio"][:different] < _TOUCHED
             index = int(cost.argmin())
             if best is None or cost[index] < best[0]:
-                best = (float(cost[index]), outcome, index, int(rests[index]))
-            if holds.any() or asked.pose or asked.trajectory:
+                best = (float(cost[index]), outcome, episodes.goal, index, int(rests[index]))
+            if holds.any() or prescribed(request) is not None:
                 break
         assert best is not None
-        _, outcome, index, rest = best
-        return self._result(obj, asked, outcome, index, rest, tried, held)
+        _, outcome, wanted, index, rest = best
+        return self._result(obj, request, outcome, wanted, index, rest, tried, held)
 
     def close(self) -> None:
         """Ends the physics' threads."""
-        self._trials.close()
+        self._attempts.close()
 
-    def _beginnings(
-        self, obj: GraspObject, asked: Asked, rng: np.random.Generator
-    ) -> tuple[Beginnings, np.ndarray, int]:
-        """Tries under the constraints, (B,) the resting pose of each, and how many of them are different."""
-        batch, points = self._tries, self.task.surface_points
-        labelled = obj if asked.minus is None else with_minus(obj, asked.minus)
-        reference = valid_rests(self.hand, obj, asked) if asked.pose or asked.trajectory else None
-        if reference is None:
-            position, direction, cross, rests = headings(labelled, asked, batch, self.task.back_off, rng)
+    def _episodes(
+        self, obj: GraspObject, request: GraspRequest, rng: np.random.Generator
+    ) -> tuple[RequestedEpisodes, np.ndarray, int]:
+        """Attempts under the constraints, (B,) the resting pose of each, and how many of them are different."""
+        batch = self._attempts_count
+        labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
+        one = goal_of(self.hand, self.task, request)
+        goal = jax.tree.map(lambda array: np.broadcast_to(array, (batch, *np.shape(array))), one)
+        if prescribed(request) is None:
+            position, direction, cross, rests = headings(labelled, request, batch, self.task.back_off, rng)
+            found = {"position": position, "direction": direction, "cross": cross}
+            goal = goal.replace("heading", **{name: value.astype(np.float32) for name, value in found.items()})
+            different = batch
         else:
-            rests = np.resize(reference, batch)
-            position, cross = np.zeros((batch, 3)), np.tile([1.0, 0.0, 0.0], (batch, 1))
-            direction = np.tile([0.0, 0.0, -1.0], (batch, 1))
-        pose_q, pose_position, pose_quaternion = (
-            (asked.pose.q, asked.pose.position, asked.pose.quaternion)
-            if asked.pose
-            else (self.hand.q_open, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-        )
-        count = self.task.trajectory_points
-        path, turns = asked.trajectory or (np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
-
-        def all_of(value: np.ndarray) -> np.ndarray:
-            return np.broadcast_to(np.asarray(value, np.float32), (batch, *np.shape(value)))
-
-        goal = Goal(
-            heading_position=position.astype(np.float32),
-            heading_direction=direction.astype(np.float32),
-            heading_cross=cross.astype(np.float32),
-            pose_q=all_of(pose_q),
-            pose_position=all_of(pose_position),
-            pose_quaternion=all_of(pose_quaternion),
-            trajectory_position=all_of(path),
-            trajectory_quaternion=all_of(turns),
-            mask=np.zeros((batch, len(MASKS)), np.float32),
-        )
-        flags = [np.full(batch, flag is not None) for flag in (asked.minus, asked.pose, asked.trajectory)]
-        minus = labelled.non_graspable_points[:points]
-        surface = Surface(all_of(obj.points[:points]), np.broadcast_to(minus, (batch, points)))
+            reference = valid_rests(self.hand, obj, request)
+            rests, different = np.resize(reference, batch), min(batch, len(reference))
+        surface = self._surface(labelled)
+        surface = Surface(*(np.broadcast_to(field, (batch, *field.shape)) for field in surface))
+        asked = {c.name: np.full(batch, c.name in request.constraints) for c in optional(self.task)}
         rest = np.asarray(obj.rest_poses, np.float32)[rests]
-        different = batch if reference is None else min(batch, len(reference))
-        return Beginnings(Request(goal, *flags), surface, rest), rests, different
+        return RequestedEpisodes(goal, asked, surface, rest), rests, different
+
+    def _surface(self, obj: GraspObject) -> Surface:
+        points = self.task.surface_points
+        return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points])
 
     def _result(
-        self, obj: GraspObject, asked: Asked, outcome: Outcome, index: int, rest: int, tries: int, held: int
+        self,
+        obj: GraspObject,
+        request: GraspRequest,
+        outcome: Outcome,
+        wanted: Goal,
+        index: int,
+        rest: int,
+        tries: int,
+        held: int,
     ) -> Grasp:
         metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
-        labelled = obj if asked.minus is None else with_minus(obj, asked.minus)
-        points = self.task.surface_points
+        labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
         episode = episode_message(
             self.hand,
             self.task,
             Trace(*(field[:, index] for field in outcome.trace)),
-            goal_of_world(outcome.goal, index),
-            Surface(obj.points[:points], labelled.non_graspable_points[:points]),
+            outcome.goal.row(index),
+            self._surface(labelled),
             obj,
             {
                 "version": self._policy.version,
@@ -241,15 +226,11 @@ class Grasper:
                 "object_file_origin": [-x for x in obj.origin],
             },
         )
-        words = explain(
-            affordance=asked.minus is not None,
-            pose=asked.pose is not None,
-            trajectory=asked.trajectory is not None,
-            redirected=bool(outcome.redirected[index]),
-        )
-        pose = (asked.pose.q, asked.pose.position, asked.pose.quaternion) if asked.pose else None
-        wishes = Wishes(asked.direction, asked.position, asked.minus, pose, asked.trajectory)
-        words += [found.words for found in contradictions(self.hand, obj.points, wishes)]
+        asked = tuple(request.constraints)
+        words = explain(asked, bool(outcome.redirected[index]))
+        written = [name for name in asked if name != "heading" or request.constraints[name]]
+        avoid = labelled.non_graspable_points
+        words += [found.words for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
         return Grasp(episode, motion_of_episode(episode), tries, held, rest, tuple(words))
 
 
@@ -262,7 +243,7 @@ def grasp(
     tries: int = TRIES,
     seed: int = 0,
     progress: Progress = lambda what, done, total: None,
-    **constraints: str,
+    **constraints: Any,
 ) -> Grasp:
     """The best grasp motion of an object under constraints; what is compiled is kept for the next call.
 
@@ -274,7 +255,7 @@ def grasp(
       tries: grasps that are simulated side by side.
       seed: draws what is tried.
       progress: told how far it is.
-      **constraints: heading, at, affordance, avoid, pose, trajectory; see `services.grasp.asked.read_asked`.
+      **constraints: heading, at, affordance, avoid, pose, trajectory, …; see `services.grasp.parse.read_request`.
 
     Raises:
       CongraspError: the object cannot be imported, or a constraint cannot be read or kept.
@@ -284,8 +265,8 @@ def grasp(
     obj = (
         thing if isinstance(thing, GraspObject) else one_object(pathlib.Path(thing), options or ImportOptions("guess"))
     )
-    asked = read_asked(obj, grasper.hand, grasper.task.trajectory_points, **constraints)
-    return grasper.grasp(obj, asked, progress)
+    request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **constraints)
+    return grasper.grasp(obj, request, progress)
 
 
 @functools.lru_cache(maxsize=2)
@@ -293,20 +274,15 @@ def _grasper(file: pathlib.Path, changed: int, tries: int, seed: int) -> Grasper
     return Grasper(bundles.load(file), tries=tries, seed=seed)
 
 
-def with_minus(obj: GraspObject, minus: np.ndarray) -> GraspObject:
-    """The object with another O-, (512,) bool."""
+def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
+    """The object with another avoid region, (512,) bool."""
     return dataclasses.replace(
-        obj, part_names=("graspable", "non-graspable"), graspable=np.array([True, False]), labels=minus.astype(np.int32)
+        obj, part_names=("graspable", "non-graspable"), graspable=np.array([True, False]), labels=avoid.astype(np.int32)
     )
 
 
-def _active(asked: Asked) -> tuple[str, ...]:
-    others = (("affordance", asked.minus), ("pose", asked.pose), ("trajectory", asked.trajectory))
-    return ("heading", *(name for name, value in others if value is not None))
-
-
 def _errors_of(constraints: tuple[str, ...]) -> list[str]:
-    names = [name for name in _SCALES if name.split("_")[0] in constraints]
+    names = [spec.name for c in CONSTRAINTS if c.name in constraints for spec in c.errors]
     return [*names, "moved_at_removal", "force_link_max"]
 
 

@@ -17,9 +17,9 @@ from common.objects.spec import GraspObject
 from services.assets.objects.meshes import ImportOptions, check_options, import_source
 from services.assets.objects.sizes import size_in_words
 from services.assets.objects.sources import Source, find_sources
-from services.grasp.asked import numbered, read_asked
 from services.grasp.files import OBJECT, THUMBNAIL, VIDEO, finished, key_of, save_grasp
 from services.grasp.grasper import Grasper, Progress
+from services.grasp.parse import numbered, read_request
 from services.viz.import_sheet import import_sheet, mesh_of_file
 from services.viz.sheets import contact_sheet, save_png
 
@@ -53,8 +53,8 @@ class Settings(NamedTuple):
 
     out: pathlib.Path
     options: ImportOptions
-    constraints: dict[str, str]
-    """See `services.grasp.asked.read_asked`."""
+    constraints: dict[str, Any]
+    """See `services.grasp.parse.read_request`."""
     identity: tuple[Any, ...]
     """What else makes a grasp: policy, seed, tries."""
     video: bool
@@ -120,7 +120,11 @@ def run_job(job: Job, grasper: Grasper, settings: Settings, progress: Progress) 
     """Grasps one object and writes its folder, unless that is done already."""
     folder = settings.out / job.name
     try:
-        given = {name: _content(text) for name, text in settings.constraints.items() if text}
+        given = {
+            name: [_content(part) for part in ([text] if isinstance(text, str) else text)]
+            for name, text in settings.constraints.items()
+            if text
+        }
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
         key = key_of(job.content(), options, given, settings.identity)
         before = None if settings.again else finished(folder, key)
@@ -128,10 +132,10 @@ def run_job(job: Job, grasper: Grasper, settings: Settings, progress: Progress) 
             return Result(job.name, before, skipped=True)
         progress("Importing", 0, 1)
         obj = job.load(settings.options)
-        asked = read_asked(obj, grasper.hand, grasper.task.trajectory_points, **settings.constraints)
+        request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **settings.constraints)
         if settings.pictures and job.source:
             save_png(folder / OBJECT, import_sheet(grasper.hand, obj, mesh_of_file(job.source)))
-        found = grasper.grasp(obj, asked, progress)
+        found = grasper.grasp(obj, request, progress)
         progress("Drawing", 0, 1)
         about = {
             "key": key,

@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 from common.hands import get_hand
 from common.hands.mjcf import WRIST_JOINTS
 from common.hands.spec import Capsule, Hand, Link, link_origin
-from common.task.types import MASKS
 from common.wire.codec import Message, encode
 from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
+from services.record.goals import active_blocks
 from services.record.poses import link_poses
 
 EPISODE_SCHEMA = "congrasp.Episode"
@@ -128,11 +128,11 @@ def _label(meta: Mapping[str, Any]) -> str:
 
 
 def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mapping[str, np.ndarray], now: int) -> None:
-    mask = dict(zip(MASKS, arrays["goal/mask"] > 0, strict=True))
+    active = active_blocks(arrays)
     direction = arrays["goal/heading_direction"]
     heading = _entity(update, "constraint/heading", frame, now)
     _add_arrow(heading, arrays["goal/heading_position"] - _ARROW * direction, direction, _ARROW, 0.006, _HEADING)
-    if mask["trajectory"]:
+    if active.get("trajectory"):
         entity = _entity(update, "constraint/trajectory", frame, now)
         line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.003)
         line.pose.orientation.w = 1.0
@@ -140,13 +140,13 @@ def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mappin
         for point in arrays["goal/trajectory_position"]:
             _set_vector(line.points.add(), point)
             _add_sphere(entity, point, 0.004, _WAYPOINT)
-    if mask["pose_finger"] or mask["pose_wrist"]:
+    if active.get("pose_finger") or active.get("pose_wrist"):
         entity = _entity(update, "constraint/pose", frame, now)
         wrist = Rotation.from_quat(arrays["goal/pose_quaternion"], scalar_first=True)
         origin = arrays["goal/pose_position"]
         for axis, colour in zip(wrist.as_matrix().T, _AXES, strict=True):
             _add_arrow(entity, origin, axis, 0.05, 0.003, colour)
-        if mask["pose_finger"]:
+        if active.get("pose_finger"):
             position, quaternion = link_poses(hand, arrays["goal/pose_q"])
             for k, link in enumerate(hand.links):
                 turn = wrist * Rotation.from_quat(quaternion[k], scalar_first=True)

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from common.config import TaskConfig
-from common.constraints.priority import Request, explain, resolve
 from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.policy.bundle import Acting, mean_action
 from common.task import control, observation
-from common.task.features import features
-from common.task.types import MASKS, Goal, SceneState, Surface
+from common.task.constraints.priority import explain, resolve
+from common.task.features import scene_of
+from common.task.types import SceneState, Surface
 from services.serve.requests import STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)
@@ -62,16 +62,13 @@ class PolicyFunction:
         """For states (B, S): answers (A + F + 6), the flags redirected and aligned, and checks (C), in one (B, ...)."""
         hand, task = self.layout.hand, self.layout.task
         fields, checks = self.layout.complete(vectors)
-        flags = {name: fields[name] > 0.5 for name in ("contact_found", "table", "surface_minus", "asked")}
-        state = SceneState(**{name: {**fields, **flags}[name] for name in SceneState._fields})
-        surface = Surface(fields["surface_points"], flags["surface_minus"])
-        mask = jnp.zeros((len(vectors), len(MASKS)))
-        asked = Goal(**{name: mask if name == "mask" else fields[name] for name in Goal._fields})
-        resolution = resolve(hand, surface, Request(asked, *jnp.moveaxis(flags["asked"][:, 1:], -1, 0)))
-        seen = features(hand, task, state, surface, resolution.goal)
-        observed = observation.observe(task, state, seen, resolution.goal)
-        mean = mean_action(observation.layout(hand, task), weights, observed)
-        action = control.decode(hand, task.control, state, seen, resolution.goal, mean)
+        asked = {c.name: fields["asked"][:, i] > 0.5 for i, c in enumerate(self.layout.known) if c.optional}
+        surface = Surface(fields["surface_points"], fields["surface_minus"])
+        resolution = resolve(hand, surface, self.layout.goal(fields), asked)
+        state = SceneState(**{name: fields[name] for name in SceneState._fields})
+        scene = scene_of(hand, task, state, surface, resolution.goal)
+        mean = mean_action(observation.layout(hand, task), weights, observation.observe(scene))
+        action = control.decode(scene, task.control, mean)
         notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
         return jnp.concatenate([mean, action.q_target, action.u_target, notes, checks], -1)
 
@@ -87,7 +84,6 @@ class PolicyFunction:
                 "The constraints contradict each other: the trajectory ends nearer to O- than to O+ of the affordance.",
                 "Change the trajectory or the affordance.",
             )
-        asked = {name: name in query.asked for name in ("affordance", "pose", "trajectory")}
         flags = redirected.tolist()
-        words = {flag: explain(**asked, redirected=flag > 0) for flag in set(flags)}
+        words = {flag: explain(query.asked, redirected=flag > 0) for flag in set(flags)}
         return Answer(vectors, [words[flag] for flag in flags])

@@ -75,18 +75,18 @@ def example_episode(seed: int, hand: str = "human") -> dict[str, Any]:
     """The start of an episode with a procedural object and one of its headings: arguments of `reset` and of `act`."""
     import jax
 
-    from actors import environment
-    from actors.taskset import build_taskset
+    from actors import initial
+    from actors.bank import build_bank
     from common.config import TaskConfig
     from common.hands import get_hand
     from common.objects import procedural
     from common.objects.pool import sized
 
-    task = TaskConfig(hand=hand, p_affordance=0.0, p_pose=0.0, p_trajectory=0.0)
+    task = TaskConfig(hand=hand, constraints=("heading",))
     found = get_hand(hand)
     (obj,) = sized(found, task, [procedural.generate(seed)])
-    env = environment.start(found, task, build_taskset(found, task, [obj], seed), jax.random.key(seed), 1)
-    world = {name: np.asarray(value)[0] for name, value in env.world._asdict().items()}
+    begun = initial.sample(found, task, build_bank(found, task, [obj], seed), jax.random.key(seed), 1)
+    world = {name: np.asarray(value)[0] for name, value in begun.world._asdict().items()}
     pose = world["object_position"], world["object_quaternion"]
     return {
         "hand": found.name,
@@ -95,11 +95,9 @@ def example_episode(seed: int, hand: str = "human") -> dict[str, Any]:
             "q": world["q"],
             "wrist": (world["base_position"], world["base_quaternion"]),
             "obj": pose,
-            "surface": np.asarray(env.surface.points)[0],
+            "surface": np.asarray(begun.surface.points)[0],
             "constraints": ["heading"],
-            "heading_position": np.asarray(env.goal.heading_position)[0],
-            "heading_direction": np.asarray(env.goal.heading_direction)[0],
-            "heading_cross": np.asarray(env.goal.heading_cross)[0],
+            **begun.goal.row(0).flat(),
         },
         "state": {"q": world["q"], "u": np.zeros(6), "object_position": pose[0], "object_quaternion": pose[1]},
     }

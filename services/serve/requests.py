@@ -23,18 +23,10 @@ from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.spec import Hand
-from common.task.types import CONTACTS_PER_LINK, Goal, SceneState
+from common.task.constraints import known, require_known
+from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from common.wire.codec import Message
 
-CONSTRAINTS = ("heading", "affordance", "pose", "trajectory")
-"""Names that a query may ask for, and the order of their bits."""
-GOAL_FIELDS = {
-    "heading": ("heading_position", "heading_direction"),
-    "affordance": (),
-    "pose": ("pose_q", "pose_position", "pose_quaternion"),
-    "trajectory": ("trajectory_position", "trajectory_quaternion"),
-}
-"""Goal fields that each constraint needs; `heading_cross` may come along."""
 STATES_LIMIT = 64
 """Most states in one query."""
 SURFACE_LIMIT = 4096
@@ -42,7 +34,6 @@ SURFACE_LIMIT = 4096
 PACKED = "packed"
 """The one array of a packed query."""
 _UNIT_TOLERANCE = 0.02
-_DOWN, _IDENTITY = np.array((0, 0, -1), np.float32), np.array((1, 0, 0, 0), np.float32)
 _OPTIONAL_STATE = (
     "q_velocity",
     "u_velocity",
@@ -76,25 +67,30 @@ class Layout:
         fingers, links, points = len(hand.joints), len(hand.links), task.surface_points
         contacts = (links, CONTACTS_PER_LINK)
         special: dict[str, tuple[int, ...]] = {
-            **dict.fromkeys(("q", "q_velocity", "q_target", "q_initial", "pose_q"), (fingers,)),
+            **dict.fromkeys(("q", "q_velocity", "q_target", "q_initial"), (fingers,)),
             **dict.fromkeys(("u", "u_velocity", "u_target"), (6,)),
             **dict.fromkeys(("contact_force", "contact_position"), (*contacts, 3)),
             **dict.fromkeys(("time", "table"), ()),
             "contact_found": contacts,
-            "trajectory_position": (task.trajectory_points, 3),
-            "trajectory_quaternion": (task.trajectory_points, 4),
         }
-        names = (*SceneState._fields, *(name for name in Goal._fields if name != "mask"))
         self.hand = hand
         self.task = task
-        self.shapes = {name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in names}
-        self.shapes |= {"surface_points": (points, 3), "surface_minus": (points,), "asked": (len(CONSTRAINTS),)}
+        self.known = known(task)
+        self._arrays = {f"{c.name}_{name}": (c, name, array) for c in self.known for name, array in c.arrays.items()}
+        self._neutral = {
+            f"{c.name}_{name}": value for c in self.known for name, value in c.neutral(hand, task)._asdict().items()
+        }
+        self.shapes = {name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in SceneState._fields}
+        self.shapes |= {name: np.shape(value) for name, value in self._neutral.items()}
+        self.shapes |= {"surface_points": (points, 3), "surface_minus": (points,), "asked": (len(self.known),)}
         self.offsets = {}
         self.size = 0
         for name, shape in self.shapes.items():
             self.offsets[name] = self.size
             self.size += math.prod(shape)
-        self._directions = ["heading_direction", *(name for name in self.shapes if "quaternion" in name)]
+        own = [name for name, (_, _, array) in self._arrays.items() if array.kind in ("direction", "quaternion")]
+        self._flags = [name for name, (_, _, array) in self._arrays.items() if array.kind == "flag"]
+        self._directions = [*(name for name in SceneState._fields if "quaternion" in name), *own]
         self.digest = hashlib.sha256(json.dumps(self.description()).encode()).hexdigest()[:16]
 
     def description(self) -> dict[str, Any]:
@@ -120,9 +116,9 @@ class Layout:
         if hand != self.hand.name:
             get_hand(hand)
             raise CongraspError(f"This server's policy is for the hand '{self.hand.name}', not '{hand}'.")
-        asked = _asked(meta.get("constraints", ["heading"]))
+        asked = self._asked(meta.get("constraints", ["heading"]))
         vectors = self._packed(message) if PACKED in message.arrays else self._named(message.arrays, asked)[None]
-        vectors[:, self._places("asked")] = [name in asked for name in CONSTRAINTS]
+        vectors[:, self._places("asked")] = [constraint.name in asked for constraint in self.known]
         return Query(vectors, asked)
 
     def _packed(self, message: Message) -> np.ndarray:
@@ -140,8 +136,9 @@ class Layout:
         if unknown:
             raise CongraspError(f"The query has an unknown field '{unknown[0]}'.", f"Known: {', '.join(self.shapes)}.")
         required = [name for name in SceneState._fields if name not in _OPTIONAL_STATE]
-        required += ["surface_points", *(name for constraint in asked for name in GOAL_FIELDS[constraint])]
-        required += ["surface_minus"] if "affordance" in asked else []
+        required += ["surface_points"]
+        required += [n for n, (c, _, array) in self._arrays.items() if c.name in asked and array.required]
+        required += [name for constraint in self.known if constraint.name in asked for name in constraint.needs]
         for name in required:
             if name not in arrays:
                 raise CongraspError(f"The query lacks the field '{name}'.")
@@ -163,19 +160,28 @@ class Layout:
 
         Returns:
           The fields (B, ...) by name, zero where a query is not finite, and what `complaint` looks at (B, C): whether
-          it is finite and has an affordance's two sides, as 1 or 0, and lengths that must be 1.
+          it is finite and each of its constraints valid, as 1 or 0, and lengths that must be 1.
         """
         finite = jnp.isfinite(vectors).all(1)
         fields = self.unpack(jnp.where(finite[:, None], vectors, 0.0))
-        asked, minus = fields["asked"] > 0.5, fields["surface_minus"] > 0.5
-        checks = [finite, ~asked[:, CONSTRAINTS.index("affordance")] | minus.any(1) & ~minus.all(1)]
+        asked = fields["asked"] > 0.5
+        for name in ("contact_found", "table", "surface_minus", *self._flags):
+            fields[name] = fields[name] > 0.5
+        lengths = []
         for name in self._directions:
-            owner = _owner(name)
-            wanted = jnp.ones_like(finite) if owner is None else asked[:, owner]
-            fields[name], lengths = _unit(fields[name], wanted, _IDENTITY if "quaternion" in name else _DOWN)
-            checks.append(lengths)
+            constraint = self._arrays[name][0] if name in self._arrays else None
+            wanted = jnp.ones_like(finite) if constraint is None else asked[:, self.known.index(constraint)]
+            default = self._neutral.get(name, np.array((1, 0, 0, 0), np.float32))
+            fields[name], length = _unit(fields[name], wanted, default)
+            lengths.append(length)
         fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"])
-        return fields, jnp.stack(checks, 1)
+        surface, goal = Surface(fields["surface_points"], fields["surface_minus"]), self.goal(fields)
+        fitting = [~asked[:, i] | c.valid(surface, goal[c.name]) for i, c in enumerate(self.known)]
+        return fields, jnp.stack([finite, *fitting, *lengths], 1)
+
+    def goal(self, fields: Mapping[str, Any]) -> Goal:
+        """The goal arrays of completed fields, before the priority rules."""
+        return Goal({c.name: c.goal(**{name: fields[f"{c.name}_{name}"] for name in c.arrays}) for c in self.known}, {})
 
     def complaint(self, query: Query, checks: np.ndarray) -> CongraspError | None:
         """What is wrong with the values of a query's first bad state, by what `complete` found (n, C): see there."""
@@ -184,17 +190,29 @@ class Layout:
             return None
         state = int(wrong.any(1).argmax())
         which = f" of state {state}" if len(checks) > 1 else ""
-        finite, sided, *lengths = ~wrong[state]
+        finite, rest = not wrong[state, 0], ~wrong[state, 1:]
+        fitting, lengths = rest[: len(self.known)].tolist(), rest[len(self.known) :].tolist()
         if not finite:
             fields = self.unpack(query.vectors[state, None])
             bad = next(name for name, value in fields.items() if not np.isfinite(value).all())
             return CongraspError(f"The field '{bad}'{which} is not finite.")
-        if not sided:
-            text = "An affordance needs surface points on both sides."
-            return CongraspError(text, "Set some of 'surface_minus'.")
+        if not all(fitting):
+            return CongraspError(*self.known[fitting.index(False)].invalid)
         bad = lengths.index(False)
-        name, length = self._directions[bad], checks[state, 2 + bad]
+        name, length = self._directions[bad], checks[state, 1 + len(self.known) + bad]
         return CongraspError(f"The field '{name}'{which} has length {length:.3f}, not 1.")
+
+    def _asked(self, names: Any) -> tuple[str, ...]:
+        """Names of the constraints that a query asks for, weakest first."""
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise CongraspError("The query's 'constraints' must be a list of names.")
+        require_known(names, self.task, "This server's policy")
+        leading = [constraint.name for constraint in self.known if constraint.guides]
+        if not set(leading) & set(names):
+            raise CongraspError(
+                "The query asks for nothing that guides the wrist.", f"Add one of: {', '.join(leading)}."
+            )
+        return tuple(constraint.name for constraint in self.known if constraint.name in names)
 
     def _surface(self, arrays: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Points and labels, brought to the number that the policy looks at."""
@@ -212,11 +230,6 @@ class Layout:
         return points[index], minus[index]
 
 
-def _owner(name: str) -> int | None:
-    """Which constraint, of CONSTRAINTS, a field belongs to; None for the state's."""
-    return next((number for number, constraint in enumerate(CONSTRAINTS) if name in GOAL_FIELDS[constraint]), None)
-
-
 def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[jax.Array, jax.Array]:
     """Vectors (B, ..., n) made unit where they are wanted (B,), the default elsewhere.
 
@@ -228,17 +241,6 @@ def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[j
     every = lengths.reshape(len(vectors), -1)
     worst = jnp.where(every.max(1) - 1.0 > 1.0 - every.min(1), every.max(1), every.min(1))
     return jnp.where(usable, vectors / jnp.where(usable, lengths, 1.0), default), jnp.where(wanted, worst, 1.0)
-
-
-def _asked(names: Any) -> tuple[str, ...]:
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise CongraspError("The query's 'constraints' must be a list of names.")
-    unknown = [name for name in names if name not in CONSTRAINTS]
-    if unknown:
-        raise CongraspError(f"There is no constraint '{unknown[0]}'.", f"Choose from: {', '.join(CONSTRAINTS)}.")
-    if not {"heading", "pose", "trajectory"} & set(names):
-        raise CongraspError("The query asks for neither a heading, a pose nor a trajectory.", "One of them is needed.")
-    return tuple(name for name in CONSTRAINTS if name in names)
 
 
 def _orthogonal(cross: jax.Array, direction: jax.Array) -> jax.Array:

@@ -1,6 +1,7 @@
 """Named configurations to start from; every field can be overridden on the command line."""
 
 import dataclasses
+from typing import Any
 
 from common.config import (
     CurriculumConfig,
@@ -76,16 +77,12 @@ def _robot(
     """
     human = PRESETS["human"]
     first, ramp = human.task.reward, human.curriculum
-    last = dataclasses.replace(ramp.reward, force_max=force_max, **weights)
+    last = dataclasses.replace(ramp.reward, **{"force_max": force_max, **weights})
+    task: dict[str, Any] = {"hand": hand, "p_affordance": p_affordance}
     return dataclasses.replace(
         human,
         name=hand,
-        task=dataclasses.replace(
-            human.task,
-            hand=hand,
-            p_affordance=p_affordance,
-            reward=dataclasses.replace(first, force_max=force_max),
-        ),
+        task=dataclasses.replace(human.task, **task, reward=dataclasses.replace(first, **{"force_max": force_max})),
         curriculum=dataclasses.replace(ramp, reward=last),
         objects=objects or human.objects,
     )

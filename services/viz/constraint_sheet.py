@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.constraints.headings import INWARD
 from common.hands import get_hand
+from common.task.sampling.headings import INWARD
 from common.wire.codec import Message
 from services.viz.raycast import Shape
 from services.viz.render import (

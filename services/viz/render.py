@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.spec import Hand, link_origin
-from common.task.types import MASKS
 from common.wire.codec import Message
+from services.record.goals import active_blocks
 from services.record.poses import link_poses
 from services.record.reader import read_episodes
 from services.viz.raster import Raster
@@ -127,7 +127,7 @@ def episode_shapes(episode: Message, step: int) -> list[Shape]:
 
 def _object(episode: Message, step: int) -> Shape:
     arrays = episode.arrays
-    affordance = arrays["goal/mask"][MASKS.index("affordance")] > 0
+    affordance = active_blocks(arrays).get("affordance", False)
     minus = np.asarray(arrays["surface_minus"], bool)
     painted = affordance and bool(minus.any())
     return Shape(
@@ -148,7 +148,7 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
     arrays = episode.arrays
     origin = np.asarray(arrays["object_position"][step], float)
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
-    mask = dict(zip(MASKS, arrays["goal/mask"] > 0, strict=True))
+    active = active_blocks(arrays)
     direction = turn.apply(arrays["goal/heading_direction"])
     # The target lies inside the object: the arrow ends where its line enters.
     off = arrays["surface_points"] - arrays["goal/heading_position"]
@@ -157,10 +157,10 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
     depth = max(0.0, -float(along[across < _ARROW_SEARCH].min(initial=0.0))) + _ARROW_GAP
     tip = turn.apply(arrays["goal/heading_position"]) + origin - depth * direction
     shapes = arrow(tip - 0.08 * direction, tip, 0.0028, APPROACH)
-    if mask["trajectory"]:
+    if active.get("trajectory"):
         points = turn.apply(arrays["goal/trajectory_position"]) + origin
         shapes.append(beads(points, 0.0035, WAYPOINT))
-    if mask["pose_finger"]:
+    if active.get("pose_finger"):
         wrist = turn * Rotation.from_quat(arrays["goal/pose_quaternion"], scalar_first=True)
         position = turn.apply(arrays["goal/pose_position"]) + origin
         shapes += posed_hand(hand, arrays["goal/pose_q"], position, wrist, APPROACH, alpha=0.25)
@@ -215,7 +215,7 @@ def _extent(episode: Message, step: int) -> np.ndarray:
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
     low, high = arrays["visual_vertices"].min(0), arrays["visual_vertices"].max(0)
     points = [np.where(np.indices((2, 2, 2)).reshape(3, -1).T, high, low)]
-    if arrays["goal/mask"][MASKS.index("trajectory")] > 0:
+    if active_blocks(arrays).get("trajectory"):
         points.append(arrays["goal/trajectory_position"])
     return np.concatenate([around, turn.apply(np.concatenate(points)) + arrays["object_position"][step]])
 
@@ -318,8 +318,8 @@ def key_steps(table: np.ndarray, moments: int) -> list[int]:
 
 def episode_title(episode: Message) -> str:
     """Hand, object, constraints and result in one line."""
-    meta, mask = episode.meta, episode.arrays["goal/mask"]
-    names = [name.replace("_", " ") for name, bit in zip(MASKS, mask, strict=True) if bit > 0]
+    meta, active = episode.meta, active_blocks(episode.arrays)
+    names = [name.replace("_", " ") for name, on in active.items() if on]
     result = "success" if meta["success"] else "no success"
     metrics = meta.get("metrics", {})
     shown = [

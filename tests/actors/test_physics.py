@@ -17,7 +17,7 @@ from actors.physics.engine import World
 from actors.physics.mjx import MjxPhysics
 from actors.physics.native import NativePhysics
 from actors.physics.slots import LEAVES, Pool
-from actors.taskset import build_taskset
+from actors.bank import build_bank
 from common import rotations
 from common.config import TaskConfig
 from common.errors import CongraspError
@@ -34,11 +34,11 @@ WORLDS = 3
 
 @pytest.fixture(scope="module")
 def env():
-    taskset = build_taskset(HAND, TASK, OBJECTS, 0)
-    fresh = start(HAND, TASK, taskset, jax.random.key(1), WORLDS)
+    bank = build_bank(HAND, TASK, OBJECTS, 0)
+    fresh = start(HAND, TASK, bank, jax.random.key(1), WORLDS)
     # One world for each object.
     index = jnp.arange(WORLDS)
-    rest = taskset.rest[index, 0]
+    rest = bank.rest[index, 0]
     return fresh._replace(
         world=fresh.world._replace(object_index=index, object_position=rest[:, :3], object_quaternion=rest[:, 3:])
     )

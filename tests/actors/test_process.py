@@ -96,7 +96,7 @@ def heard(monkeypatch):
     def run(rollout: Rollout):
         monkeypatch.setattr(InventedWorker, "rollout", rollout, raising=False)
         monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
-        monkeypatch.setattr(process, "build_taskset", lambda *args: None)
+        monkeypatch.setattr(process, "build_bank", lambda *args: None)
         monkeypatch.setattr(process, "load_pool", lambda *args: [procedural.generate(0, "box")])
         broker, stop = MemoryHub(), threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:

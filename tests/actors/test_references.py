@@ -9,10 +9,10 @@ import pytest
 
 from actors.physics.engine import where_worlds
 from actors.references import Grasps, renew
-from actors.taskset import POSES, build_taskset, make_references
+from actors.bank import POSES, build_bank, make_references
 from common import rotations
 from common.config import TaskConfig
-from common.constraints.poses import Poses
+from common.task.sampling.closed_poses import Poses
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
@@ -25,24 +25,24 @@ F = len(HAND.joints)
 
 
 @pytest.fixture(scope="module")
-def taskset():
-    return build_taskset(HAND, TASK, OBJECTS, 0)
+def bank():
+    return build_bank(HAND, TASK, OBJECTS, 0)
 
 
-def test_headings_of_a_flat_object_stay_above_the_table(taskset):
-    rest = np.asarray(taskset.rest)
+def test_headings_of_a_flat_object_stay_above_the_table(bank):
+    rest = np.asarray(bank.rest)
     for n in range(len(OBJECTS)):
         for r in range(rest.shape[1]):
-            index = np.asarray(taskset.heading_index)[n, 0, r]
-            position = np.asarray(taskset.heading_position)[n, 0, index]
-            direction = np.asarray(taskset.heading_direction)[n, 0, index]
-            position = position - np.asarray(taskset.heading_back)[n, 0, r][:, None] * direction
+            index = np.asarray(bank.heading_index)[n, 0, r]
+            position = np.asarray(bank.heading_position)[n, 0, index]
+            direction = np.asarray(bank.heading_direction)[n, 0, index]
+            position = position - np.asarray(bank.heading_back)[n, 0, r][:, None] * direction
             quaternion = np.broadcast_to(rest[n, r, 3:], (len(index), 4))
             height = np.asarray(rotations.rotate(quaternion, position))[:, 2] + rest[n, r, 2]
             assert height.min() >= 0.01 - 1e-5
             assert np.asarray(rotations.rotate(quaternion, direction))[:, 2].max() <= 0.1 + 1e-5
-    assert (np.asarray(taskset.heading_back) > 0).any()  # the hammer is thinner than twice two centimetres
-    assert (np.asarray(taskset.heading_back) <= 0.02 + 1e-5).all()
+    assert (np.asarray(bank.heading_back) > 0).any()  # the hammer is thinner than twice two centimetres
+    assert (np.asarray(bank.heading_back) <= 0.02 + 1e-5).all()
 
 
 def _pointing(z: float) -> jax.Array:
@@ -68,10 +68,10 @@ def test_an_object_that_cannot_be_approached_is_named():
     wide = dataclasses.replace(OBJECTS[1], name="wide", points=OBJECTS[1].points * 10)
     lifted = dataclasses.replace(wide, rest_poses=np.array([[0, 0, -5.0, 1, 0, 0, 0]]))
     with pytest.raises(CongraspError, match="'wide' cannot be approached"):
-        build_taskset(HAND, TASK, [lifted], 0)
+        build_bank(HAND, TASK, [lifted], 0)
 
 
-def test_a_grasp_replaces_one_reference_of_its_object_and_variant(taskset):
+def test_a_grasp_replaces_one_reference_of_its_object_and_variant(bank):
     found = jnp.array([True, False])
     grasps = Grasps(
         found,
@@ -82,7 +82,7 @@ def test_a_grasp_replaces_one_reference_of_its_object_and_variant(taskset):
         jnp.stack([_pointing(-1.0)] * 2),
     )
     # A grasp from straight above is possible where the object is not turned.
-    flat = taskset._replace(rest=taskset.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
+    flat = bank._replace(rest=bank.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
     used = flat._replace(pose_valid=jnp.ones_like(flat.pose_valid).at[1, 1, :, 7].set(False))
     new = renew(HAND, TASK, used, grasps, jax.random.key(1))
     assert np.flatnonzero((new.pose_q != used.pose_q).any(-1)[1, 1]).tolist() == [7]  # where there was none to use

@@ -12,7 +12,7 @@ from actors.environment import EPISODE_FIELDS, METRICS
 from actors.physics.engine import Readout, where_worlds
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker, finished_episodes
-from actors.taskset import build_taskset
+from actors.bank import build_bank
 from common import rotations
 from common.config import TaskConfig
 from common.hands import get_hand
@@ -29,8 +29,8 @@ SIZE = sum(size for _, size in layout(HAND, TASK))
 
 
 @pytest.fixture(scope="module")
-def taskset():
-    return build_taskset(HAND, TASK, OBJECTS, 0)
+def bank():
+    return build_bank(HAND, TASK, OBJECTS, 0)
 
 
 def _noise(parameters, observation, key):
@@ -38,13 +38,13 @@ def _noise(parameters, observation, key):
     return action, -jnp.sum(action**2, -1)
 
 
-def _worker(taskset, task=TASK, seed=0, batch=BATCH):
+def _worker(bank, task=TASK, seed=0, batch=BATCH):
     physics = NativePhysics(HAND, task, OBJECTS, 2)
-    return RolloutWorker(HAND, task, physics, taskset, _noise, batch=batch, seed=seed, half=True)
+    return RolloutWorker(HAND, task, physics, bank, _noise, batch=batch, seed=seed, half=True)
 
 
-def test_masks_are_drawn_as_in_the_paper(taskset):
-    _, goal, _, _, hold = environment.sample_episodes(HAND, TASK, taskset, jax.random.key(0), 4000)
+def test_masks_are_drawn_as_in_the_paper(bank):
+    _, goal, _, _, hold = environment.sample_episodes(HAND, TASK, bank, jax.random.key(0), 4000)
     mask = np.asarray(goal.mask)
     named = dict(zip(MASKS, mask.T, strict=True))
     assert abs(named["trajectory"].mean() - 0.5) < 0.08
@@ -54,8 +54,8 @@ def test_masks_are_drawn_as_in_the_paper(taskset):
     assert np.all(np.asarray(hold) == TASK.hold_steps)
 
 
-def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(taskset):
-    world, goal, *_ = environment.sample_episodes(HAND, TASK, taskset, jax.random.key(1), 256)
+def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(bank):
+    world, goal, *_ = environment.sample_episodes(HAND, TASK, bank, jax.random.key(1), 256)
     trajectory = np.asarray(goal.mask)[:, 3] > 0
     first = rotations.compose_pose(
         world.object_position,
@@ -77,8 +77,8 @@ def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(t
     np.testing.assert_allclose(np.asarray(world.q)[~pose], np.tile(HAND.q_open, (256 - pose.sum(), 1)), atol=1e-6)
 
 
-def test_rollouts_go_through_whole_episodes_and_on(taskset):
-    worker = _worker(taskset)
+def test_rollouts_go_through_whole_episodes_and_on(bank):
+    worker = _worker(bank)
     first = worker.collect(None, 75)
     assert first.observation.shape == (75, BATCH, SIZE) and first.observation.dtype == np.float16
     assert np.isfinite(np.asarray(first.observation, np.float32)).all()
@@ -104,10 +104,10 @@ def test_rollouts_go_through_whole_episodes_and_on(taskset):
     worker.physics.close()
 
 
-def test_success_needs_the_object_to_stay_up(taskset):
+def test_success_needs_the_object_to_stay_up(bank):
     """With idle hands far away every object falls, and nobody is credited."""
     task = dataclasses.replace(TASK, back_off=0.5, p_pose=0.0, p_trajectory=0.0)
-    away = build_taskset(HAND, task, OBJECTS, 0)
+    away = build_bank(HAND, task, OBJECTS, 0)
     physics = NativePhysics(HAND, task, OBJECTS, 2)
     still = lambda p, o, k: (jnp.zeros((o.shape[0], 26)).at[:, 20:23].set(-20.0), jnp.zeros(o.shape[0]))  # noqa: E731
     worker = RolloutWorker(HAND, task, physics, away, still, batch=BATCH, seed=0, half=False)
@@ -119,9 +119,9 @@ def test_success_needs_the_object_to_stay_up(taskset):
     physics.close()
 
 
-def test_a_lifted_object_that_stays_is_a_success(taskset):
+def test_a_lifted_object_that_stays_is_a_success(bank):
     """The protocol's bookkeeping on invented readouts: held up, against dropped by more than 5 cm."""
-    env = environment.start(HAND, TASK, taskset, jax.random.key(2), 2)
+    env = environment.start(HAND, TASK, bank, jax.random.key(2), 2)
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     readout = physics.read(physics.start(env.world))
     found = np.zeros(readout.contact_found.shape, bool)
@@ -141,10 +141,10 @@ def test_a_lifted_object_that_stays_is_a_success(taskset):
 
 
 @pytest.mark.parametrize(("end_when_fallen", "ends"), [(False, [90, 90]), (True, [90, 81])])
-def test_a_longer_hold_changes_neither_success_nor_the_errors(taskset, end_when_fallen, ends):
+def test_a_longer_hold_changes_neither_success_nor_the_errors(bank, end_when_fallen, ends):
     """Errors and forces are those of the paper's 25 steps; only `held` looks at the end of the hold."""
     task = dataclasses.replace(TASK, hold_steps_max=40, end_when_fallen=end_when_fallen)
-    env = environment.start(HAND, task, taskset, jax.random.key(2), 2)
+    env = environment.start(HAND, task, bank, jax.random.key(2), 2)
     env = env._replace(hold=jnp.full(2, 40))
     physics = NativePhysics(HAND, task, OBJECTS, 1)
     readout = physics.read(physics.start(env.world))
@@ -168,8 +168,8 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(taskset, end_when_
     physics.close()
 
 
-def test_workers_with_the_same_seed_agree_bit_for_bit(taskset):
-    a, b = (_worker(taskset, seed=5, batch=3).collect(None, 20) for _ in range(2))
+def test_workers_with_the_same_seed_agree_bit_for_bit(bank):
+    a, b = (_worker(bank, seed=5, batch=3).collect(None, 20) for _ in range(2))
     np.testing.assert_array_equal(a.reward, b.reward)
     np.testing.assert_array_equal(a.observation, b.observation)
 
@@ -214,8 +214,8 @@ class _Touching:
         )
 
 
-def test_a_world_that_goes_on_keeps_its_contacts_when_another_restarts(taskset):
-    worker = RolloutWorker(HAND, TASK, _Touching(), taskset, _noise, batch=2, seed=0, half=False)
+def test_a_world_that_goes_on_keeps_its_contacts_when_another_restarts(bank):
+    worker = RolloutWorker(HAND, TASK, _Touching(), bank, _noise, batch=2, seed=0, half=False)
     worker.env = worker.env._replace(time=jnp.array([70, 70]), hold=jnp.array([25, 100]), links_at_removal=jnp.ones(2))
     rollout = worker.collect(None, 7)
     flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from common.constraints.headings import (
+from common.task.sampling.headings import (
     INWARD,
     MAX_WIDTH,
     Headings,

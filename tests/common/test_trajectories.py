@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.constraints.trajectories import AMPLITUDE, CONE, DISTANCE, ROTATION, make_trajectories
+from common.task.sampling.approach_paths import AMPLITUDE, CONE, DISTANCE, ROTATION, make_trajectories
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from tests.scenes import quaternions

@@ -10,15 +10,16 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from actors.taskset import HEADINGS, TaskSet, clear_of_table, headings_of
+from actors.bank import HEADINGS, clear_of_table, headings_of
 from common.config import TaskConfig
-from common.constraints.headings import Headings
 from common.errors import CongraspError
 from common.hands.human import HUMAN
 from common.hands.spec import Hand
 from common.objects import store
 from common.objects.pool import object_scale
 from common.objects.spec import GraspObject
+from common.task.bank import ConstraintBank
+from common.task.sampling.headings import Headings
 from common.wire.codec import Message
 from services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
 from services.assets.captures.objects import load_object
@@ -218,7 +219,7 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
     q, position, quaternion = (values.astype(np.float32) for values in posed)
     clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, np.stack([fields["rest"]] * len(position))))
     nearer = _ends_nearer_to_plus(position[:, -1], fields["points"], fields["minus"])
-    row = TaskSet(
+    row = ConstraintBank(
         **{name: value for name, value in fields.items() if not name.startswith("chosen")},
         pose_q=_twice(q),
         pose_position=_twice(position[:, -1]),

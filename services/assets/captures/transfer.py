@@ -10,12 +10,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.constraints.headings import Headings
-from common.constraints.poses import closed_poses
 from common.hands.human import HUMAN
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
+from common.task.sampling.closed_poses import closed_poses
+from common.task.sampling.headings import Headings
 from services.assets.captures.extract import Demonstration, continuous
 from services.assets.captures.fit import joint_positions
 

@@ -4,23 +4,28 @@ import dataclasses
 import os
 from typing import Any
 
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from actors.attempts import Attempts, Outcome
 from actors.episode import episode_message
-from actors.rollout import Trace, goal_of_world
-from actors.trials import Beginnings, Outcome, Trials
-from common.constraints.priority import Request
+from actors.initial import RequestedEpisodes
+from actors.rollout import Trace
+from common.config import TaskConfig
 from common.errors import CongraspError, TransportError
 from common.hands import get_hand
-from common.task.types import Goal, Surface
+from common.hands.spec import Hand
+from common.objects.spec import GraspObject
+from common.request import GraspRequest
+from common.task.constraints import goal_of, known, optional, require_known
+from common.task.types import Surface
 from common.wire.codec import Message
 from services.grasp.grasper import costs
 from services.serve.server import Source
 from services.viz.studio.jobs import Progress
-from services.viz.studio.state import OPTIONAL, Asked
 
-TRIES = 8
+ATTEMPTS = 8
 """Grasps side by side: the one that was drawn, and others near it."""
 HOLD_SECONDS = 2.0
 _ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
@@ -53,7 +58,7 @@ class PolicyGrasping:
         self.hand = get_hand(first.spec.hand)
         self.task = dataclasses.replace(first.task, end_when_fallen=False)
         hold = max(self.task.hold_steps, round(HOLD_SECONDS / self.task.control_dt))
-        self._trials = Trials(self.hand, self.task, first, hold=hold, threads=threads or os.cpu_count() or 1)
+        self._attempts = Attempts(self.hand, self.task, first, hold=hold, threads=threads or os.cpu_count() or 1)
         self._compiled = False
 
     def newest(self) -> dict[str, Any]:
@@ -65,7 +70,7 @@ class PolicyGrasping:
         try:
             newer = self._source(self._policy.version)
             if newer is not None:
-                self._trials.renew(newer)
+                self._attempts.renew(newer)
                 self._policy = newer
             self._trouble = ""
         except TransportError:
@@ -73,7 +78,7 @@ class PolicyGrasping:
         except CongraspError as error:
             self._trouble = str(error)
 
-    def grasp(self, asked: Asked, progress: Progress) -> Message:
+    def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
         """The episode of the grasp that was drawn if it holds, else of the best of those near it.
 
         Its meta `note` says which it is.
@@ -81,20 +86,20 @@ class PolicyGrasping:
         first_time = not self._compiled
         progress("compiling: the first grasp takes some seconds more" if first_time else "newest weights", 0.02)
         self.refresh()
-        beginnings, aside = _beginnings(asked, self.task.surface_points)
-        steps = self._trials.steps
-        outcome = self._trials.run(asked.obj, beginnings, lambda step: progress("grasping", step / steps))
+        require_known(request.constraints, self.task)
+        episodes, aside = _episodes(self.hand, self.task, obj, request)
+        steps = self._attempts.steps
+        outcome = self._attempts.run(obj, episodes, lambda step: progress("grasping", step / steps))
         self._compiled = True
-        index = _best(outcome, asked.constraints)
+        index = _best(outcome, tuple(request.constraints))
         metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
-        points = self.task.surface_points
         return episode_message(
             self.hand,
             self.task,
             Trace(*(field[:, index] for field in outcome.trace)),
-            goal_of_world(outcome.goal, index),
-            Surface(asked.obj.points[:points], asked.obj.non_graspable_points[:points]),
-            asked.obj,
+            outcome.goal.row(index),
+            _surface(self.task, obj),
+            obj,
             {
                 "version": self._policy.version,
                 "actor": "studio",
@@ -105,41 +110,48 @@ class PolicyGrasping:
         )
 
 
-def _beginnings(asked: Asked, points: int) -> tuple[Beginnings, np.ndarray]:
-    """`TRIES` episodes, the first as drawn; and (B,) metres by which each comes beside that."""
+def _episodes(
+    hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest
+) -> tuple[RequestedEpisodes, np.ndarray]:
+    """`ATTEMPTS` episodes, the first as drawn; and (B,) metres by which each comes beside that."""
     rng = np.random.default_rng(0)
-    goal = Goal(*(np.repeat(np.asarray(value, np.float32)[None], TRIES, 0) for value in asked.goal))
-    shift = rng.normal(0.0, _ASIDE, (TRIES, 3)) * (np.arange(TRIES) > 0)[:, None]
-    tilt, roll = (rng.normal(0.0, sigma, TRIES) * (np.arange(TRIES) > 0) for sigma in (_TILT, _ROLL))
-    direction, cross = goal.heading_direction, goal.heading_cross
+    goal = jax.tree.map(lambda array: np.repeat(np.asarray(array)[None], ATTEMPTS, 0), goal_of(hand, task, request))
+    others = np.arange(ATTEMPTS) > 0
+    shift = (rng.normal(0.0, _ASIDE, (ATTEMPTS, 3)) * others[:, None]).astype(np.float32)
+    tilt, roll = (rng.normal(0.0, sigma, ATTEMPTS) * others for sigma in (_TILT, _ROLL))
+    direction, cross = goal["heading"].direction, goal["heading"].cross
     third = np.cross(direction, cross)
-    way = rng.uniform(0.0, 2 * np.pi, TRIES)
+    way = rng.uniform(0.0, 2 * np.pi, ATTEMPTS)
     axis = np.cos(way)[:, None] * cross + np.sin(way)[:, None] * third
     turn = Rotation.from_rotvec(tilt[:, None] * axis + roll[:, None] * direction)
-    goal = goal._replace(
-        heading_position=goal.heading_position + shift.astype(np.float32),
-        heading_direction=turn.apply(direction).astype(np.float32),
-        heading_cross=turn.apply(cross).astype(np.float32),
-        pose_position=goal.pose_position + shift.astype(np.float32),
-        trajectory_position=goal.trajectory_position + shift[:, None].astype(np.float32),
-    )
-    flags = (np.full(TRIES, name in asked.constraints) for name in OPTIONAL)
-    surface = (asked.obj.points[:points], asked.obj.non_graspable_points[:points])
-    rest = np.repeat(asked.obj.rest_poses[asked.rest][None].astype(np.float32), TRIES, 0)
-    same = Surface(*(np.repeat(np.asarray(field)[None], TRIES, 0) for field in surface))
-    return Beginnings(Request(goal, *flags), same, rest), np.linalg.norm(shift, axis=-1)
+    turned = {"direction": turn.apply(direction).astype(np.float32), "cross": turn.apply(cross).astype(np.float32)}
+    goal = goal.replace("heading", **turned)
+    for constraint in known(task):
+        if "position" in constraint.arrays:
+            place = goal[constraint.name].position
+            goal = goal.replace(constraint.name, position=place + shift.reshape(-1, *[1] * (place.ndim - 2), 3))
+    asked = {
+        constraint.name: np.full(ATTEMPTS, constraint.name in request.constraints) for constraint in optional(task)
+    }
+    surface = Surface(*(np.repeat(np.asarray(field)[None], ATTEMPTS, 0) for field in _surface(task, obj)))
+    rest = np.repeat(obj.rest_poses[request.rest or 0][None].astype(np.float32), ATTEMPTS, 0)
+    return RequestedEpisodes(goal, asked, surface, rest), np.linalg.norm(shift, axis=-1)
+
+
+def _surface(task: TaskConfig, obj: GraspObject) -> Surface:
+    return Surface(obj.points[: task.surface_points], obj.non_graspable_points[: task.surface_points])
 
 
 def _best(outcome: Outcome, constraints: tuple[str, ...]) -> int:
     """The one that was drawn, unless another is clearly better: it holds, or keeps to the constraints."""
-    return int(np.argmin(costs(outcome, ("heading", *constraints)) + _OTHER * (np.arange(TRIES) > 0)))
+    return int(np.argmin(costs(outcome, constraints) + _OTHER * (np.arange(ATTEMPTS) > 0)))
 
 
 def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
     held = outcome.metrics["held"] > 0
     if not held.any():
-        return f"Neither what was drawn nor {TRIES - 1} others near it held. Try another arrow."
+        return f"Neither what was drawn nor {ATTEMPTS - 1} others near it held. Try another arrow."
     if index:
         why = "did better" if held[0] else "held, which what was drawn did not"
-        return f"Of {TRIES - 1} others near what was drawn, this one {why}: {1000 * aside[index]:.0f} mm beside it."
+        return f"Of {ATTEMPTS - 1} others near what was drawn, this one {why}: {1000 * aside[index]:.0f} mm beside it."
     return ""

@@ -15,6 +15,7 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
+from common.request import GraspRequest
 from common.wire.codec import Message
 from services.export.motion import FORMATS, export_motions
 from services.export.motion_file import hand_arrays, motion_of_episode, save_motion
@@ -25,7 +26,7 @@ from services.viz.studio.jobs import Jobs, Progress
 from services.viz.studio.lanes import for_page
 from services.viz.studio.recordings import Recordings
 from services.viz.studio.server import Download, Get, Post
-from services.viz.studio.state import Asked, Studio
+from services.viz.studio.state import Studio
 from services.viz.studio.training import TrainingWindow
 
 EXPORTS = ("npz", "mcap", *FORMATS)
@@ -43,7 +44,7 @@ class Grasping(Protocol):
     def newest(self) -> dict[str, Any]:
         """Where the policy comes from and its version, after a look for newer weights."""
 
-    def grasp(self, asked: Asked, progress: Progress) -> Message:
+    def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
         """The episode of a grasp."""
 
 
@@ -281,11 +282,11 @@ class Session:
         self._object, self._notes = name, list(notes)
 
     def _grasp(self) -> None:
-        asked = self._studio.request
+        request, obj = self._studio.request, self._studio.labelled
         grasping = self._grasping
 
         def work(progress: Progress) -> str:
-            episode = grasping.grasp(asked, progress)
+            episode = grasping.grasp(obj, request, progress)
             with self._lock:
                 self._number += 1
                 self._motions[str(self._number)] = episode
@@ -313,7 +314,7 @@ class Session:
         }
 
 
-_ACTIONS = ("lay", "ask", "point", "aim", "roll", "paint", "fill", "close_hand", "draw", "suggest")
+_ACTIONS = ("lay", "ask", "point", "aim", "roll", "paint", "fill", "choose", "close_hand", "draw", "suggest")
 """Methods of `Studio` that a page may call, with their arguments by name."""
 
 

@@ -8,25 +8,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors.environment import initial_wrist
+from actors.initial import initial_hand
 from common import rotations
 from common.config import TaskConfig
-from common.constraints.headings import BACK_OFF, INWARD
-from common.constraints.poses import Poses, closed_poses
-from common.constraints.priority import Request, Resolution, explain, resolve
 from common.errors import CongraspError
 from common.hands import kinematics
 from common.hands.spec import Hand
 from common.objects.shapes import matrix
 from common.objects.spec import GraspObject
-from common.task.types import MASKS, Goal, Surface, first
+from common.request import GraspRequest
+from common.task.constraints import get_constraint, goal_of, optional, require_known
+from common.task.constraints.priority import Resolution, explain, resolve
+from common.task.sampling.closed_poses import Poses, closed_poses
+from common.task.sampling.headings import BACK_OFF, INWARD
+from common.task.types import Goal, Surface
 from common.wire.codec import Message
 from services.grasp.constraint_sets import make_sets
-from services.grasp.grasper import with_minus
+from services.grasp.grasper import with_avoid
 from services.viz.studio.canvas import Canvas
 
-OPTIONAL = ("affordance", "pose", "trajectory")
-"""Constraints that can be asked for; the heading always is."""
+TOOLS = ("affordance", "pose", "trajectory")
+"""Constraints that have tools of their own; the page makes toggles for the flags of the others."""
 _LEAST_PATH = 0.03  # m
 
 
@@ -48,19 +50,6 @@ class Path(NamedTuple):
     """(K, 3) m."""
     quaternion: np.ndarray
     """(K, 4) w x y z."""
-
-
-class Asked(NamedTuple):
-    """What is to be grasped, and how."""
-
-    obj: GraspObject
-    """With the painted labels."""
-    rest: int
-    """Which of its resting poses."""
-    goal: Goal
-    """Values without a batch axis; those of absent constraints are finite and mean nothing."""
-    constraints: tuple[str, ...]
-    """Some of `OPTIONAL`."""
 
 
 class Studio:
@@ -86,6 +75,9 @@ class Studio:
         self.canvas = Canvas(obj)
         self.pose: Poses | None = None
         self.path: Path | None = None
+        self.others: dict[str, dict[str, np.ndarray]] = {
+            c.name: c.suggested(self.hand, self.task) for c in optional(self.task) if c.name not in TOOLS
+        }
         self._sets: tuple[bytes, Message] | None = None
         self._next = {"heading": 0, "pose": 0, "trajectory": 0}
         self.arrow = self._from_above()
@@ -99,8 +91,7 @@ class Studio:
 
     def ask(self, constraint: str, on: bool) -> None:
         """Switches an optional constraint; what it needs and is not there yet is suggested."""
-        if constraint not in OPTIONAL:
-            raise CongraspError(f"There is no constraint '{constraint}'.", f"Choose from: {', '.join(OPTIONAL)}.")
+        require_known([constraint], self.task)
         if on and constraint == "affordance" and not self.canvas.minus.any():
             self.canvas.take_parts()
         if on and constraint == "pose" and self.pose is None:
@@ -108,6 +99,16 @@ class Studio:
         if on and constraint == "trajectory" and self.path is None:
             self.suggest("trajectory")
         (self.asked.add if on else self.asked.discard)(constraint)
+
+    def choose(self, constraint: str, field: str, values: Any) -> None:
+        """Sets the flags of a constraint without tools of its own, and asks for it."""
+        if constraint not in self.others or field not in self.others[constraint]:
+            raise CongraspError(f"There is nothing to choose for '{constraint}'.", f"Choose for: {list(self.others)}.")
+        flags = self.others[constraint][field]
+        if not isinstance(values, list) or len(values) != len(flags):
+            raise CongraspError(f"'{constraint}' takes {len(flags)} flags.")
+        self.others[constraint] = {**self.others[constraint], field: np.array([bool(value) for value in values])}
+        self.asked.add(constraint)
 
     def point(self, position: Any, direction: Any, cross: Any = None) -> None:
         """Puts the approach arrow somewhere.
@@ -209,10 +210,10 @@ class Studio:
     @property
     def labelled(self) -> GraspObject:
         """The object with the painted regions as its parts."""
-        return with_minus(self.obj, self.canvas.minus)
+        return with_avoid(self.obj, self.canvas.minus)
 
     @property
-    def request(self) -> Asked:
+    def request(self) -> GraspRequest:
         """What a policy is asked for.
 
         Raises:
@@ -220,23 +221,29 @@ class Studio:
         """
         if trouble := self.trouble:
             raise CongraspError(trouble)
-        names = tuple(name for name in OPTIONAL if name in self.asked)
-        return Asked(self.labelled, self.rest, self._goal(), names)
+        return self._request()
+
+    def _request(self) -> GraspRequest:
+        given: dict[str, dict[str, np.ndarray]] = {"affordance": {}, **self.others}
+        given |= {name: part._asdict() for name, part in (("pose", self.pose), ("trajectory", self.path)) if part}
+        constraints = {"heading": self.arrow._asdict()}
+        constraints |= {c.name: given[c.name] for c in optional(self.task) if c.name in self.asked}
+        avoid = self.canvas.minus if "affordance" in self.asked else None
+        return GraspRequest(constraints, avoid, rest=self.rest)
 
     @property
     def resolution(self) -> Resolution:
         """What the priority rules make of it, without batch axes."""
-        flags = (np.array([name in self.asked]) for name in OPTIONAL)
-        goal = Goal(*(np.asarray(value, np.float32)[None] for value in self._goal()))
+        asked = {c.name: np.array([c.name in self.asked]) for c in optional(self.task)}
+        goal = jax.tree.map(lambda array: np.asarray(array)[None], goal_of(self.hand, self.task, self._request()))
         surface = Surface(np.asarray(self.obj.points, np.float32)[None], self.canvas.minus[None])
-        found = _resolve(self.hand, surface, Request(goal, *flags))
-        return Resolution(first(found.goal), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0])
+        found = _resolve(self.hand, surface, goal, asked)
+        return Resolution(found.goal.row(0), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0])
 
     @property
     def words(self) -> list[str]:
         """What the priority rules do, strongest constraint first."""
-        flags: dict[str, bool] = {name: name in self.asked for name in OPTIONAL}
-        return explain(**flags, redirected=bool(self.resolution.redirected))
+        return explain(self.asked, bool(self.resolution.redirected))
 
     @property
     def trouble(self) -> str:
@@ -244,13 +251,22 @@ class Studio:
         if "affordance" in self.asked and (self.canvas.minus.all() or not self.canvas.minus.any()):
             what = "Everything is" if self.canvas.minus.any() else "Nothing is"
             return f"{what} painted as not to be touched. Paint a part of the object with the brush."
+        for name in self.asked - {"affordance"}:
+            own = jax.tree.map(
+                lambda array: np.asarray(array)[None], goal_of(self.hand, self.task, self._request())[name]
+            )
+            if not get_constraint(name).valid(Surface(np.asarray(self.obj.points)[None], self.canvas.minus[None]), own)[
+                0
+            ]:
+                return " ".join(get_constraint(name).invalid)
         found = self.resolution
         if not found.aligned:
             return "The wrist path ends nearer to what must not be touched. Draw another path, or paint elsewhere."
-        start = self._world(found.goal.heading_position - BACK_OFF * found.goal.heading_direction)
+        heading = found.goal["heading"]
+        start = self._world(heading.position - BACK_OFF * heading.direction)
         if "trajectory" not in self.asked and start[2] < 0:
             return "The approach begins under the table. Turn the arrow so that it comes from above."
-        if "trajectory" in self.asked and min(self._world(p)[2] for p in found.goal.trajectory_position) < 0:
+        if "trajectory" in self.asked and min(self._world(p)[2] for p in found.goal["trajectory"].position) < 0:
             return "The wrist path goes through the table. Draw it higher, or take another suggestion."
         return ""
 
@@ -258,7 +274,7 @@ class Studio:
         """Everything that a page shows of it, as JSON; object frame but for the resting pose."""
         resolution = self.resolution
         goal = resolution.goal
-        bits = dict(zip(MASKS, (bool(bit > 0) for bit in goal.mask), strict=True))
+        active = {block: bool(on) for block, on in goal.active.items()}
         size = np.ptp(self.obj.visual_vertices, axis=0)
         return {
             "hand": self.hand.name,
@@ -271,12 +287,15 @@ class Studio:
             },
             "rest": {"index": self.rest, **_pose(self.obj.rest_poses[self.rest])},
             "asked": sorted(self.asked),
+            "known": [constraint.name for constraint in optional(self.task)],
+            "others": [self._toggles(name, fields) for name, fields in self.others.items()],
             "arrow": {name: part.tolist() for name, part in self.arrow._asdict().items()},
             "active": {
-                "masks": bits,
-                "position": goal.heading_position.tolist(),
-                "direction": goal.heading_direction.tolist(),
-                "overruled": bool(resolution.redirected) or not self.asked.isdisjoint(("pose", "trajectory")),
+                "masks": active,
+                "position": goal["heading"].position.tolist(),
+                "direction": goal["heading"].direction.tolist(),
+                "overruled": bool(resolution.redirected)
+                or any("heading" in get_constraint(n).overrides for n in self.asked),
             },
             "words": self.words,
             "trouble": self.trouble,
@@ -290,19 +309,18 @@ class Studio:
     def _repainted(self) -> None:
         (self.asked.add if self.canvas.minus.any() else self.asked.discard)("affordance")
 
-    def _goal(self) -> Goal:
-        waypoints = self.task.trajectory_points
-        rest = np.array([1.0, 0.0, 0.0, 0.0])
-        pose = self.pose or Poses(self.hand.q_open, np.zeros(3), rest)
-        path = self.path or Path(np.zeros((waypoints, 3)), np.tile(rest, (waypoints, 1)))
-        return Goal(*self.arrow, *pose, *path, np.zeros(len(MASKS)))
+    def _toggles(self, name: str, fields: dict[str, np.ndarray]) -> dict[str, Any]:
+        """A constraint without tools of its own, as the page shows it."""
+        constraint = get_constraint(name)
+        labels = constraint.labels(self.hand)
+        shown = {field: dict(zip(labels[field], fields[field].tolist(), strict=True)) for field in labels}
+        return {"name": name, "title": constraint.title, "flags": shown}
 
     def _start(self, goal: Goal) -> dict[str, Any]:
         """Link frames (L, 3), (L, 4) in the world from which a grasp would begin."""
-        one = Goal(*(np.asarray(value, np.float32)[None] for value in goal))
-        flags = (np.array([name in self.asked]) for name in ("pose", "trajectory"))
+        one = jax.tree.map(lambda array: np.asarray(array)[None], goal)
         rest = np.asarray(self.obj.rest_poses[self.rest], np.float32)[None]
-        position, quaternion = _begin(self.hand, self.task, one, *flags, rest)
+        position, quaternion = _begin(self.hand, self.task, one, rest)
         return {"position": np.asarray(position).tolist(), "quaternion": np.asarray(quaternion).tolist()}
 
     def _ghost(self, pose: Poses) -> dict[str, Any]:
@@ -334,16 +352,13 @@ class Studio:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _resolve(hand: Hand, surface: Surface, request: Request) -> Resolution:
-    return resolve(hand, surface, request)
+def _resolve(hand: Hand, surface: Surface, goal: Goal, asked: dict[str, jax.Array]) -> Resolution:
+    return resolve(hand, surface, goal, asked)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _begin(
-    hand: Hand, task: TaskConfig, goal: Goal, pose: jax.Array, trajectory: jax.Array, rest: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    q = jnp.where(pose[:, None], goal.pose_q, jnp.array(hand.q_open))
-    position, quaternion = initial_wrist(hand, task, goal, q, trajectory, rest[:, :3], rest[:, 3:])
+def _begin(hand: Hand, task: TaskConfig, goal: Goal, rest: jax.Array) -> tuple[jax.Array, jax.Array]:
+    q, position, quaternion = initial_hand(hand, task, goal, rest)
     return _links(hand, q[0], position[0], quaternion[0])
 
 

@@ -69,7 +69,7 @@ def test_every_pool_of_objects_gets_its_share_of_the_episodes(monkeypatch):
             yield Sample(values, np.ones((episodes, 25, 16)), np.ones((episodes, 25, 20)))
 
     monkeypatch.setattr(Evaluator, "samples_of_pools", samples_of_pools)
-    monkeypatch.setattr("services.evaluate.evaluator.build_taskset", lambda *arguments: built.append(arguments))
+    monkeypatch.setattr("services.evaluate.evaluator.build_bank", lambda *arguments: built.append(arguments))
     pools = procedural_pools(6, 1_000_000, largest=3)
     settings = {"physics": "native", "batch": 0, "threads": 1, "seed": 0, "friction": 1.0, "progress": told.append}
     whole, *groups = evaluate_objects(untrained(CONFIG), pools, 15, **settings)
@@ -83,11 +83,11 @@ def test_every_pool_of_objects_gets_its_share_of_the_episodes(monkeypatch):
 def test_other_pools_take_the_place_of_the_first(monkeypatch):
     worker, built = mock.Mock(), []
 
-    def build_taskset(hand, task, objects, seed):
+    def build_bank(hand, task, objects, seed):
         built.append((list(objects), seed))
         return len(built)
 
-    monkeypatch.setattr("services.evaluate.evaluator.build_taskset", build_taskset)
+    monkeypatch.setattr("services.evaluate.evaluator.build_bank", build_bank)
     evaluator = Evaluator(untrained(CONFIG), OBJECTS[:1], seed=5)
     monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
     monkeypatch.setattr(evaluator, "_gather", lambda worker, names, episodes, progress: {"heading": evaluator.objects})
@@ -118,9 +118,9 @@ def test_rows_are_mixed_only_in_what_differs_between_them():
 
 
 def test_a_pool_that_never_allows_a_constraint_is_an_error(evaluator, monkeypatch):
-    taskset = evaluator._taskset
-    none = taskset._replace(has_affordance=np.zeros_like(taskset.has_affordance))
-    monkeypatch.setattr(evaluator, "_taskset", none)
+    bank = evaluator._bank
+    none = bank._replace(has_affordance=np.zeros_like(bank.has_affordance))
+    monkeypatch.setattr(evaluator, "_bank", none)
     with pytest.raises(CongraspError, match="None of the 3 objects allows the constraint 'affordance'"):
         evaluator.samples(["heading", "affordance"], 1)
     names, errors = evaluator.allowed(["heading", "affordance"])
@@ -138,7 +138,7 @@ def test_numbers_out_of_range_are_refused(policy, arguments):
 
 
 def test_nominal_mass_and_friction(monkeypatch):
-    monkeypatch.setattr("services.evaluate.evaluator.build_taskset", lambda *arguments: None)
+    monkeypatch.setattr("services.evaluate.evaluator.build_bank", lambda *arguments: None)
     ranged = dataclasses.replace(CONFIG.task, mass_range=(0.8, 1.5), friction_range=(0.6, 1.0))
     task = Evaluator(untrained(CONFIG), OBJECTS, task=ranged).task
     assert task.mass_range == (1.0, 1.0) and task.friction_range == (1.0, 1.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from actors.taskset import build_taskset
+from actors.bank import build_bank
 from common.config import NetworkConfig, RunConfig, TaskConfig
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
@@ -23,23 +23,23 @@ OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
 
 
 @pytest.fixture(scope="module")
-def taskset():
-    return build_taskset(HAND, TaskConfig(), OBJECTS, 3)
+def bank():
+    return build_bank(HAND, TaskConfig(), OBJECTS, 3)
 
 
-def test_joint_noise_has_its_size_and_stays_within_the_limits(taskset):
-    noisy = disturbed(HAND, taskset, Noise("pose", "joints", 0.1), 0)
-    q = np.asarray(taskset.pose_q)
+def test_joint_noise_has_its_size_and_stays_within_the_limits(bank):
+    noisy = disturbed(HAND, bank, Noise("pose", "joints", 0.1), 0)
+    q = np.asarray(bank.pose_q)
     away = (noisy.pose_q - q)[(q > HAND.lower + 0.4) & (q < HAND.upper - 0.4)]
     assert 0.095 < away.std() < 0.105 and abs(away.mean()) < 0.005
     assert np.all(noisy.pose_q >= HAND.lower) and np.all(noisy.pose_q <= HAND.upper)
-    np.testing.assert_array_equal(noisy.pose_position, taskset.pose_position)
+    np.testing.assert_array_equal(noisy.pose_position, bank.pose_position)
 
 
-def test_poses_sink_along_the_heading(taskset):
-    noisy = disturbed(HAND, taskset, Noise("pose", "depth", 0.01), 0)
-    moved = np.asarray(noisy.pose_position) - np.asarray(taskset.pose_position)
-    w, *v = np.moveaxis(np.asarray(taskset.pose_quaternion, float), -1, 0)
+def test_poses_sink_along_the_heading(bank):
+    noisy = disturbed(HAND, bank, Noise("pose", "depth", 0.01), 0)
+    moved = np.asarray(noisy.pose_position) - np.asarray(bank.pose_position)
+    w, *v = np.moveaxis(np.asarray(bank.pose_quaternion, float), -1, 0)
     axis = np.broadcast_to(grasp_frame(HAND).heading, moved.shape)
     v = np.stack(v, -1)
     heading = axis + 2 * np.cross(v, np.cross(v, axis) + w[..., None] * axis)
@@ -48,16 +48,16 @@ def test_poses_sink_along_the_heading(taskset):
     np.testing.assert_allclose(moved, depth[..., None] * heading, atol=1e-6)
 
 
-def test_jitter_moves_every_waypoint(taskset):
-    noisy = disturbed(HAND, taskset, Noise("trajectory", "jitter", 0.01), 0)
-    away = np.asarray(noisy.trajectory_position) - np.asarray(taskset.trajectory_position)
+def test_jitter_moves_every_waypoint(bank):
+    noisy = disturbed(HAND, bank, Noise("trajectory", "jitter", 0.01), 0)
+    away = np.asarray(noisy.trajectory_position) - np.asarray(bank.trajectory_position)
     assert 0.0098 < away.std() < 0.0102 and np.all(np.abs(away).max((0, 1, 2, 4)) > 0)
-    np.testing.assert_array_equal(noisy.trajectory_quaternion, taskset.trajectory_quaternion)
+    np.testing.assert_array_equal(noisy.trajectory_quaternion, bank.trajectory_quaternion)
 
 
-def test_the_same_references_are_disturbed_in_every_row(taskset, monkeypatch, tmp_path):
+def test_the_same_references_are_disturbed_in_every_row(bank, monkeypatch, tmp_path):
     config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
-    evaluator = Evaluator(untrained(config), OBJECTS, taskset=taskset)
+    evaluator = Evaluator(untrained(config), OBJECTS, bank=bank)
     worker, told = mock.Mock(), []
     monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
 
@@ -72,25 +72,25 @@ def test_the_same_references_are_disturbed_in_every_row(taskset, monkeypatch, tm
     assert told == [5 * (i + 1) for i in range(len(LEVELS))]
     given = [call.args[1] for call in worker.replace_objects.call_args_list]
     for noise, seen in zip(LEVELS, given, strict=True):
-        expected = disturbed(HAND, taskset, noise, 0)
+        expected = disturbed(HAND, bank, noise, 0)
         for name in ("pose_q", "pose_position", "trajectory_position"):
             np.testing.assert_array_equal(getattr(seen, name), getattr(expected, name))
 
 
 @pytest.mark.parametrize("most", [20, 5])
-def test_references_are_renewed_until_their_places_are_filled_or_none_is_added(taskset, monkeypatch, most):
+def test_references_are_renewed_until_their_places_are_filled_or_none_is_added(bank, monkeypatch, most):
     config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
-    flat = taskset._replace(has_affordance=np.array([[True], [False]]).repeat(taskset.rest.shape[1], 1))
-    evaluator = Evaluator(untrained(config), OBJECTS, taskset=flat)
-    worker, told = mock.Mock(taskset=flat), []
+    flat = bank._replace(has_affordance=np.array([[True], [False]]).repeat(bank.rest.shape[1], 1))
+    evaluator = Evaluator(untrained(config), OBJECTS, bank=flat)
+    worker, told = mock.Mock(bank=flat), []
 
     def forget():
-        worker.taskset = flat._replace(pose_valid=np.zeros_like(flat.pose_valid))
+        worker.bank = flat._replace(pose_valid=np.zeros_like(flat.pose_valid))
 
     def renew():
-        valid = np.array(worker.taskset.pose_valid)
+        valid = np.array(worker.bank.pose_valid)
         valid[:, :, 0, min(valid[0, 0].any(0).sum(), most - 1)] = True
-        worker.taskset = flat._replace(pose_valid=valid)
+        worker.bank = flat._replace(pose_valid=valid)
 
     worker.forget_references.side_effect, worker.renew_references.side_effect = forget, renew
     monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
@@ -115,22 +115,22 @@ def test_curves_show_every_kind_of_noise(tmp_path):
         assert (blue - red > 100).sum() > 50
 
 
-def test_a_task_set_comes_back_from_its_files(taskset):
+def test_a_task_set_comes_back_from_its_files(bank):
     sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 3)
-    back = constraint_sets.taskset_of(sets)
+    back = constraint_sets.bank_of(sets)
     for name in ("points", "minus", "heading_position", "pose_q", "trajectory_position", "pose_quaternion"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(taskset, name))
+        np.testing.assert_array_equal(getattr(back, name), getattr(bank, name))
     for n in range(len(OBJECTS)):
         rests = len(sets[n].arrays["rest"])
-        np.testing.assert_array_equal(back.pose_valid[n, :, :rests], taskset.pose_valid[n, :, :rests])
+        np.testing.assert_array_equal(back.pose_valid[n, :, :rests], bank.pose_valid[n, :, :rests])
         for v, r in np.ndindex(2, rests):
-            if v == 0 or taskset.has_affordance[n, r]:
-                asked, found = taskset.heading_index[n, v, r], back.heading_index[n, v, r]
+            if v == 0 or bank.has_affordance[n, r]:
+                asked, found = bank.heading_index[n, v, r], back.heading_index[n, v, r]
                 assert set(np.asarray(asked)) == set(np.asarray(found))
-                back_of = dict(zip(np.asarray(asked), np.asarray(taskset.heading_back[n, v, r]), strict=True))
+                back_of = dict(zip(np.asarray(asked), np.asarray(bank.heading_back[n, v, r]), strict=True))
                 np.testing.assert_allclose([back_of[i] for i in found], back.heading_back[n, v, r])
-        np.testing.assert_array_equal(back.has_affordance[n, :rests], taskset.has_affordance[n, :rests])
-    held = constraint_sets.taskset_of(sets, "held-out")
-    training = constraint_sets.taskset_of(sets, "training")
+        np.testing.assert_array_equal(back.has_affordance[n, :rests], bank.has_affordance[n, :rests])
+    held = constraint_sets.bank_of(sets, "held-out")
+    training = constraint_sets.bank_of(sets, "training")
     assert not np.any(held.pose_valid[:, 0, 0] & training.pose_valid[:, 0, 0])
     assert 0 < held.pose_valid[:, 0].any(1).mean() < training.pose_valid[:, 0].any(1).mean()

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from actors.taskset import build_taskset
+from actors.bank import build_bank
 from common.config import TaskConfig
-from common.constraints.headings import Headings, clear_table, feasible
+from common.task.sampling.headings import Headings, clear_table, feasible
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural, store
@@ -44,13 +44,13 @@ def test_every_array_is_explained_and_has_the_shape_that_is_written_down(sets):
 
 
 def test_a_set_is_what_training_draws_from(sets):
-    taskset = build_taskset(HAND, TaskConfig(), OBJECTS, 3)
+    bank = build_bank(HAND, TaskConfig(), OBJECTS, 3)
     for n, constraints in enumerate(sets):
         arrays = constraints.arrays
-        np.testing.assert_array_equal(arrays["heading/position"], taskset.heading_position[n])
-        np.testing.assert_array_equal(arrays["pose/q"], taskset.pose_q[n])
+        np.testing.assert_array_equal(arrays["heading/position"], bank.heading_position[n])
+        np.testing.assert_array_equal(arrays["pose/q"], bank.pose_q[n])
         rest = arrays["rest"]
-        assert len(np.unique(rest, axis=0)) == len(rest) <= taskset.rest.shape[1]
+        assert len(np.unique(rest, axis=0)) == len(rest) <= bank.rest.shape[1]
         for r, pose in enumerate(rest):
             headings = Headings(*(arrays[f"heading/{name}"][0] for name in Headings._fields))
             cleared = clear_table(headings, pose)
@@ -95,7 +95,7 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     monkeypatch.setattr(
         constraint_sets,
         "make_sets",
-        lambda hand, task, objects, seed, taskset: made.extend(obj.name for obj in objects) or [],
+        lambda hand, task, objects, seed, bank: made.extend(obj.name for obj in objects) or [],
     )
     store.Catalogue(tmp_path / "objects").add(OBJECTS[1])
     folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]

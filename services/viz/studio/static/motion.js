@@ -2,7 +2,6 @@
 
 import { blend, mix, norm } from "./math.js";
 
-const MASKS = ["affordance", "pose_finger", "pose_wrist", "trajectory"];
 
 function rows({ shape, data }) {
   const width = shape[shape.length - 1];
@@ -27,8 +26,8 @@ export class Motion {
     this.table = arrays.table.data;
     this.steps = this.objects.length;
     this.center = this.objects[0];
-    const mask = arrays["goal/mask"].data;
-    this.active = MASKS.filter((_, i) => mask[i] > 0);
+    const bits = Object.keys(arrays).filter((name) => name.startsWith("active/"));
+    this.active = bits.filter((name) => arrays[name].data[0] > 0).map((name) => name.slice("active/".length));
     this.goal = {
       position: Array.from(arrays["goal/heading_position"].data),
       direction: Array.from(arrays["goal/heading_direction"].data),

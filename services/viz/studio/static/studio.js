@@ -3,7 +3,7 @@
 import { ask, download, tell, upload } from "./wire.js";
 
 const $ = (id) => document.getElementById(id);
-const MASK_NAMES = { affordance: "affordance", pose_finger: "pose: fingers", pose_wrist: "pose: wrist", trajectory: "trajectory" };
+const MASK_NAMES = { pose_finger: "pose: fingers", pose_wrist: "pose: wrist" };
 const POLL = 200; // ms between two looks at a job
 
 function fill(select, names, chosen) {
@@ -98,7 +98,11 @@ export class StudioPanel {
     const { size_cm: size, mass_g: mass, faces } = studio.object;
     $("facts").textContent = [`${size.join(" × ")} cm, ${mass} g, ${faces} faces`, ...state.notes].join(". ");
     $("policy").textContent = `${state.policy.source}, version ${state.policy.version}`;
-    for (const box of document.querySelectorAll("[data-ask]")) box.checked = studio.asked.includes(box.dataset.ask);
+    this.#toggles(studio.others);
+    for (const box of document.querySelectorAll("[data-ask]")) {
+      box.checked = studio.asked.includes(box.dataset.ask);
+      box.closest(".constraint").hidden = !studio.known.includes(box.dataset.ask);
+    }
     $("share").textContent = studio.minus ? `${Math.round(100 * studio.minus)} % painted` : "nothing painted";
     $("masks").replaceChildren(...Object.entries({ heading: true, ...studio.active.masks }).map(([name, on]) => {
       const mask = document.createElement("span");
@@ -114,6 +118,30 @@ export class StudioPanel {
     $("grasp").disabled = Boolean(studio.trouble) || state.job.running;
     this.#motions(state.motions);
     return this.app.takeState(state);
+  }
+
+  // Constraints without tools of their own: a box to ask for each, and one for each of its flags.
+  #toggles(others) {
+    const shown = JSON.stringify(others);
+    if (shown === this.others) return;
+    this.others = shown;
+    $("other-constraints").replaceChildren(...others.map(({ name, title, flags }) => {
+      const part = Object.assign(document.createElement("div"), { className: "constraint" });
+      const box = (text, checked, change) => {
+        const input = Object.assign(document.createElement("input"), { type: "checkbox", checked });
+        input.addEventListener("change", () => change(input));
+        const label = document.createElement("label");
+        label.append(input, ` ${text}`);
+        part.append(label);
+        return input;
+      };
+      box(title[0].toUpperCase() + title.slice(1), false, (input) => this.act("ask", { constraint: name, on: input.checked })).dataset.ask = name;
+      for (const [field, labels] of Object.entries(flags)) {
+        const boxes = Object.entries(labels).map(([text, on]) => box(text, on, () =>
+          this.act("choose", { constraint: name, field, values: boxes.map((input) => input.checked) })));
+      }
+      return part;
+    }));
   }
 
   // Shows a job's progress while it runs, and once what came of it.

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from actors.taskset import HEADINGS
+from actors.bank import HEADINGS
 from common.hands import get_hand
 from common.hands.human import HUMAN
 from common.hands.kinematics import grasp_frame, keypoints, link_transforms
 from services.assets.captures.fit import joint_positions
-from services.grasp.constraint_sets import describe, taskset_of
+from services.grasp.constraint_sets import describe, bank_of
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write
 
@@ -58,4 +58,4 @@ def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_pa
         np.testing.assert_allclose(arrays["heading/position"][0, m], wanted[-1], atol=1e-3)
         np.testing.assert_array_equal(arrays["pose/position"][0, m], arrays["trajectory/position"][0, m, -1])
     assert arrays["heading/position"].shape[1] == HEADINGS
-    assert taskset_of([made]).pose_q.shape[-1] == len(hand.joints)
+    assert bank_of([made]).pose_q.shape[-1] == len(hand.joints)

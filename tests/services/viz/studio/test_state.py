@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.config import TaskConfig
-from common.constraints.headings import BACK_OFF, INWARD
+from common.task.sampling.headings import BACK_OFF, INWARD
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame

@@ -1,13 +1,8 @@
-"""What episodes are drawn from: objects, resting poses, heading sets, reference poses and wrist trajectories.
-
-Stacked over the N objects of a pool, so that a compiled reset gathers by object index. The axis V has two variants:
-0 for the whole surface, 1 for the affordance region O+.
-"""
+"""Builds constraint banks: resting poses, heading sets, reference poses and wrist trajectories of a pool of objects."""
 
 import functools
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +10,16 @@ import numpy as np
 
 from common import rotations
 from common.config import TaskConfig
-from common.constraints.headings import (
+from common.errors import CongraspError
+from common.hands.kinematics import grasp_frame
+from common.hands.spec import Hand
+from common.objects.pool import object_scale
+from common.objects.spec import SURFACE_POINTS, GraspObject
+from common.parallel import parallel_map
+from common.task.bank import ConstraintBank
+from common.task.sampling.approach_paths import make_trajectories
+from common.task.sampling.closed_poses import Poses, closed_poses
+from common.task.sampling.headings import (
     INWARD,
     MAX_WIDTH,
     Headings,
@@ -24,14 +28,6 @@ from common.constraints.headings import (
     feasible,
     sample_headings,
 )
-from common.constraints.poses import Poses, closed_poses
-from common.constraints.trajectories import make_trajectories
-from common.errors import CongraspError
-from common.hands.kinematics import grasp_frame
-from common.hands.spec import Hand
-from common.objects.pool import object_scale
-from common.objects.spec import SURFACE_POINTS, GraspObject
-from common.parallel import parallel_map
 from common.task.types import Array
 
 HEADINGS = 256
@@ -42,48 +38,13 @@ _STEEPEST_UP = 0.1
 """Largest upward component of a reference pose's approach direction."""
 
 
-class TaskSet(NamedTuple):
-    """N objects; R resting poses, H headings and M reference poses each; object frame unless said otherwise."""
-
-    points: Array
-    """(N, P, 3) surface points."""
-    minus: Array
-    """(N, P) bool, O-."""
-    rest: Array
-    """(N, R, 7) resting poses in the world; unused rows repeat earlier ones."""
-    heading_position: Array
-    """(N, V, H, 3)."""
-    heading_direction: Array
-    """(N, V, H, 3)."""
-    heading_cross: Array
-    """(N, V, H, 3)."""
-    heading_index: Array
-    """(N, V, R, H) feasible headings of each resting pose, repeated to fill the row."""
-    heading_back: Array
-    """(N, V, R, H) metres by which the position of `heading_index` moves back to stay clear of the table."""
-    pose_q: Array
-    """(N, V, M, F)."""
-    pose_position: Array
-    """(N, V, M, 3)."""
-    pose_quaternion: Array
-    """(N, V, M, 4)."""
-    trajectory_position: Array
-    """(N, V, M, K, 3); trajectory m ends at pose m."""
-    trajectory_quaternion: Array
-    """(N, V, M, K, 4)."""
-    pose_valid: Array
-    """(N, V, R, M) bool: pose and trajectory stay above the table in the resting pose."""
-    has_affordance: Array
-    """(N, R) bool: the object has an O-, and its O+ can be approached in the resting pose."""
-
-
-def build_taskset(
+def build_bank(
     hand: Hand,
     task: TaskConfig,
     objects: Sequence[GraspObject],
     seed: int,
     given: Sequence[Headings | None] | None = None,
-) -> TaskSet:
+) -> ConstraintBank:
     """Heading sets by the paper's rules, and procedural reference poses and trajectories, for a pool of objects.
 
     Args:
@@ -120,7 +81,7 @@ def build_taskset(
     rest = jnp.repeat(columns["rest"], 2 * POSES, axis=0)
     path, turns, valid = make_references(hand, flat, rest, jax.random.key(seed), task.trajectory_points)
     shape = (len(objects), 2, POSES)
-    return TaskSet(
+    return ConstraintBank(
         **columns,
         pose_q=poses.q,
         pose_position=poses.position,
@@ -212,10 +173,10 @@ def headings_of(
             f"Scale it so that some part is narrower than {100 * scale * MAX_WIDTH:.0f} cm, or leave it out.",
         )
     reachable, rest = reachable[:, usable], obj.rest_poses[usable]
-    index = np.array([[_repeated(row) for row in variant] for variant in reachable])
+    index = np.array([[_repeated(row) for row in region] for region in reachable])
     back = np.array([[_back(headings, pose) for pose in rest] for headings in sets])
     # Reference poses are made at headings that some resting pose allows, where there are any.
-    chosen = [_some(rng, variant.any(0)) for variant in reachable]
+    chosen = [_some(rng, region.any(0)) for region in reachable]
     keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
     minus = obj.non_graspable_points[keep]
     floats = {

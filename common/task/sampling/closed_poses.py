@@ -13,10 +13,10 @@ import numpy as np
 
 from common import rotations
 from common.hands import kinematics
-from common.hands.spec import Hand
-from common.task.control import heading_wrist_pose
-from common.task.features import squared_distances
-from common.task.types import Array, Goal
+from common.hands.spec import Hand, chain_of
+from common.task.constraints.heading import HeadingGoal, heading_wrist_pose
+from common.task.geometry import squared_distances
+from common.task.types import Array
 
 _STEPS = 24
 
@@ -35,17 +35,11 @@ class Poses(NamedTuple):
 @functools.cache
 def _fingers(hand: Hand) -> tuple[np.ndarray, np.ndarray, int]:
     """Finger index of every joint (F,) and of every keypoint (P,; -1 for the palm), and the number of fingers."""
-    parent = {link.name: link.parent for link in hand.links}
-
-    def root(name: str) -> str:
-        while parent[name] != hand.links[0].name:
-            name = parent[name]
-        return name
-
-    roots = sorted({root(link.name) for link in hand.links[1:]})
-    of_link = [-1, *(roots.index(root(link.name)) for link in hand.links[1:])]
+    roots = [next(iter(chain_of(hand, link.name)), "") for link in hand.links]
+    names = [name for name in dict.fromkeys(roots) if name]
+    of_link = np.array([names.index(root) if root else -1 for root in roots])
     joints = [of_link[i] for i, link in enumerate(hand.links) for _ in link.joints]
-    return np.array(joints), np.array([of_link[i] for i in hand.keypoint_links]), len(roots)
+    return np.array(joints), of_link[hand.keypoint_links], len(names)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -66,10 +60,7 @@ def closed_poses(
     joint_finger, point_finger, fingers = _fingers(hand)
     radii = jnp.array(hand.keypoint_radii)
     q_open, q_closed = jnp.array(hand.q_open), jnp.array(hand.q_closed)
-    zeros = jnp.zeros((count, 1, 3))
-    goal = Goal(
-        heading_position, direction, cross, q_open, zeros[:, 0], zeros[:, 0], zeros, zeros, jnp.zeros((count, 4))
-    )
+    goal = HeadingGoal(heading_position, direction, cross)
 
     def close(center: Array) -> Array:
         position, quaternion = heading_wrist_pose(hand, goal, center)

@@ -1,53 +1,55 @@
-"""Where the tries of a grasp begin: headings and resting poses that the table leaves room for."""
+"""Approaches to attempt: headings and resting poses that the table leaves room for."""
 
 import numpy as np
 
 from common import rotations
-from common.constraints.headings import above, clear_table, feasible, sample_headings
 from common.errors import CongraspError
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
-from services.grasp.asked import Asked
+from common.request import GraspRequest
+from common.task.constraints import CONSTRAINTS
+from common.task.sampling.headings import above, clear_table, feasible, sample_headings
 
 _CLEARANCE, _STEEPEST_UP = 0.02, 0.1  # of a wrist over the table, m, and of an approach that rises
 
 
 def headings(
-    obj: GraspObject, asked: Asked, batch: int, back_off: float, rng: np.random.Generator
+    obj: GraspObject, request: GraspRequest, batch: int, back_off: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of tries that the table leaves room for.
+    """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of attempts that the table allows.
 
     Likelier resting poses are tried more often.
     """
-    restricted = asked.minus is not None
-    found = sample_headings(obj, rng, use_affordance=restricted, lenient=True, along=asked.direction, at=asked.position)
+    direction, position = request.given("heading", "direction"), request.given("heading", "position")
+    restricted = request.avoid is not None
+    found = sample_headings(obj, rng, use_affordance=restricted, lenient=True, along=direction, at=position)
     if found is None:
         raise CongraspError(
             f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
             "Make the graspable part larger."
-            if asked.direction is None and asked.position is None
+            if direction is None and position is None
             else "Leave out --heading and --at, or make the graspable part larger.",
         )
     options, weights = [], []
     for r, rest in enumerate(obj.rest_poses):
         cleared = clear_table(found, rest)
         room = feasible(cleared, rest, back_off=back_off)
-        if asked.above:
+        if request.above:
             room &= above(cleared, rest)
         for h in np.flatnonzero(room):
             options.append((r, cleared.position[h], found.direction[h], found.cross[h]))
         weights += [1.0 / ((r + 1) * max(room.sum(), 1))] * int(room.sum())
     if not options:
-        raise CongraspError(*_no_room(obj, asked))
+        raise CongraspError(*_no_room(obj, request))
     shares = np.array(weights) / np.sum(weights)
     chosen = rng.choice(len(options), batch, replace=len(options) < batch, p=shares)
     rests, positions, directions, crosses = zip(*(options[i] for i in chosen), strict=True)
     return np.array(positions), np.array(directions), np.array(crosses), np.array(rests)
 
 
-def _no_room(obj: GraspObject, asked: Asked) -> tuple[str, str]:
-    if asked.direction is None:
+def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
+    if request.given("heading", "direction") is None:
         return (
             f"'{obj.name}' cannot be approached in any of its resting poses.",
             "Scale it so that some part is narrower than 12 cm, or leave out --heading above and --at.",
@@ -64,13 +66,19 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
     return np.asarray(rotations.to_matrix(np.asarray(quaternion, np.float32)))
 
 
-def valid_rests(hand: Hand, obj: GraspObject, asked: Asked) -> np.ndarray:
+def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
+    """Wrist positions (n, 3) and last orientation (4,) that the strongest constraint prescribes, if any does."""
+    for constraint in reversed(CONSTRAINTS):
+        if constraint.name in request.constraints:
+            path = constraint.wrist_path(request.constraints[constraint.name])
+            if path is not None:
+                return path
+    return None
+
+
+def valid_rests(hand: Hand, obj: GraspObject, request: GraspRequest) -> np.ndarray:
     """Resting poses in which a reference pose or trajectory stays over the table and does not come from below."""
-    if asked.trajectory is not None:
-        path, turn = asked.trajectory[0], asked.trajectory[1][-1]
-    else:
-        assert asked.pose is not None
-        path, turn = asked.pose.position[None], asked.pose.quaternion
+    path, turn = prescribed(request) or (np.zeros((0, 3)), np.array([1.0, 0.0, 0.0, 0.0]))
     heading = _matrix(turn) @ grasp_frame(hand).heading
     up = np.array([_matrix(rest[3:])[2] for rest in obj.rest_poses])
     lowest = (up @ path.T).min(-1) + obj.rest_poses[:, 2]

@@ -4,10 +4,10 @@ Files give positions in metres in the axes and with the origin of the object's o
 sets, which know the object's frame, are taken as they are.
 """
 
-import dataclasses
 import json
 import pathlib
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
+from common.request import GraspRequest
+from common.task.constraints import CONSTRAINTS
 from common.wire.codec import Message
 from services.assets.objects.sizes import size_in_words
 from services.export.motion_file import GraspMotion, load_motion
@@ -28,76 +30,66 @@ _FAR = 1.0  # m from an object beyond which nobody grasps it
 _NEAR = 0.004  # m from a part within which a point of the surface belongs to it
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Reference:
-    """A reference pose, object frame."""
+class Written(NamedTuple):
+    """What a person wrote, and for what."""
 
-    q: np.ndarray
-    """(F,) finger angles, rad."""
-    position: np.ndarray
-    """(3,) wrist, m."""
-    quaternion: np.ndarray
-    """(4,) wrist, w x y z."""
+    texts: Mapping[str, Any]
+    """By the names of the constraints' options; empty is none."""
+    obj: GraspObject
+    hand: Hand
+    waypoints: int
+    """K, of wrist trajectories."""
 
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Asked:
-    """Constraints on one object, object frame; what is None is free."""
-
-    direction: np.ndarray | None = None
-    """(3,) unit, the way the hand comes."""
-    above: bool = False
-    """The hand comes within 30 degrees of straight down."""
-    position: np.ndarray | None = None
-    """(3,) m, where the middle of the grasping hand should be."""
-    minus: np.ndarray | None = None
-    """(512,) bool, which points of the surface must not be touched."""
-    pose: Reference | None = None
-    trajectory: tuple[np.ndarray, np.ndarray] | None = None
-    """(K, 3) and (K, 4) wrist waypoints."""
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) m: the object's frame in the coordinates of its file."""
+        return -np.asarray(self.obj.origin)
 
 
-def read_asked(
-    obj: GraspObject,
-    hand: Hand,
-    waypoints: int,
-    *,
-    heading: str = "",
-    at: str = "",
-    affordance: str = "",
-    avoid: str = "",
-    pose: str = "",
-    trajectory: str = "",
-) -> Asked:
-    """The constraints that a user wrote down; empty text is none.
+def option_names() -> tuple[str, ...]:
+    """Names of the options of all constraints."""
+    return tuple(option.name for constraint in CONSTRAINTS for option in constraint.options)
+
+
+def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> GraspRequest:
+    """The constraints that a person wrote down for an object.
 
     Args:
       obj: the object.
       hand: the hand.
-      waypoints: K, of the wrist trajectory.
-      heading: three numbers in the axes of the object's file, or `above`.
-      at: three numbers, m, in the file's axes and with its origin.
-      affordance: what to grasp: a mesh of it in the coordinates of the object's file, or names of the object's parts.
-      avoid: what not to touch, likewise.
-      pose: a motion (.npz), a constraint set (FILE:NUMBER takes that one of its poses), or JSON.
-      trajectory: a motion, a constraint set, JSON, or CSV.
+      waypoints: K, of wrist trajectories.
+      **texts: by the names of the constraints' options (`Constraint.options`); empty is none.
 
     Raises:
       CongraspError: something cannot be read or does not fit; the line names it.
     """
-    origin = -np.asarray(obj.origin)
-    position = _numbers(at, 3, "--at") - origin if at else None
-    if position is not None:
-        _check_near(obj, position, "--at")
-    direction = None if heading in ("", ABOVE) else _unit(_numbers(heading, 3, "--heading"), "--heading")
-    return Asked(
-        direction=direction,
-        above=heading == ABOVE,
-        position=position,
-        minus=_minus(obj, affordance, avoid) if affordance or avoid else None,
-        pose=_pose(pose, hand, obj, origin) if pose else None,
-        trajectory=_trajectory(trajectory, hand, obj, origin, waypoints) if trajectory else None,
-    )
+    written = Written({**dict.fromkeys(option_names(), ""), **texts}, obj, hand, waypoints)
+    if unknown := sorted(set(texts) - set(option_names())):
+        raise CongraspError(f"There is no constraint option '{unknown[0]}'.", f"Known: {', '.join(option_names())}.")
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for constraint in CONSTRAINTS:
+        reader = READERS.get(constraint.name)
+        given = reader(written) if reader else constraint.parse(written.texts, hand)
+        if given is not None:
+            found[constraint.name] = given
+    avoid = _avoid(written) if "affordance" in found else None
+    return GraspRequest({"heading": {}, **found}, avoid, above=written.texts["heading"] == ABOVE)
+
+
+def _heading(written: Written) -> dict[str, np.ndarray] | None:
+    """Direction and position, as far as they are given."""
+    heading, at = written.texts["heading"], written.texts["at"]
+    found = {}
+    if at:
+        found["position"] = _numbers(at, 3, "--at") - written.origin
+        _check_near(written.obj, found["position"], "--at")
+    if heading not in ("", ABOVE):
+        found["direction"] = _unit(_numbers(heading, 3, "--heading"), "--heading")
+    return found or None
+
+
+def _affordance(written: Written) -> dict[str, np.ndarray] | None:
+    return {} if written.texts["affordance"] or written.texts["avoid"] else None
 
 
 def _numbers(text: str, count: int, name: str) -> np.ndarray:
@@ -120,8 +112,9 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
     return vector / size
 
 
-def _minus(obj: GraspObject, affordance: str, avoid: str) -> np.ndarray:
-    """(512,) bool, O-; what is named on both sides belongs to the nearer one."""
+def _avoid(written: Written) -> np.ndarray:
+    """(512,) bool, the avoid region; what is named on both sides belongs to the nearer one."""
+    obj, affordance, avoid = written.obj, written.texts["affordance"], written.texts["avoid"]
     plus_distance = _distance(obj, affordance, "--affordance") if affordance else None
     minus_distance = _distance(obj, avoid, "--avoid") if avoid else None
     if plus_distance is None:
@@ -182,16 +175,19 @@ def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
     return cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0]
 
 
-def _pose(text: str, hand: Hand, obj: GraspObject, origin: np.ndarray) -> Reference:
+def _pose(written: Written) -> dict[str, np.ndarray] | None:
+    text, hand, obj, origin = written.texts["pose"], written.hand, written.obj, written.origin
+    if not text:
+        return None
     path, index = numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand)
         last = _removal(motion)
         position, quaternion = _wrist_on_object(motion, last)
-        return Reference(motion.joint_position[last], position[last], quaternion[last])
+        return _reference(motion.joint_position[last], position[last], quaternion[last])
     if path.name.endswith(constraint_sets.SUFFIX):
         arrays = _set_of(path, hand, obj, index).arrays
-        return Reference(*(arrays[f"pose/{name}"][0, index] for name in ("q", "position", "quaternion")))
+        return {name: arrays[f"pose/{name}"][0, index] for name in ("q", "position", "quaternion")}
     given = _json(path, "--pose", ("joints", "position", "quaternion"))
     joints, names = given["joints"], [joint.name for joint in hand.joints]
     if isinstance(joints, dict):
@@ -204,12 +200,18 @@ def _pose(text: str, hand: Hand, obj: GraspObject, origin: np.ndarray) -> Refere
     if np.abs(q).max() > 2 * np.pi:
         raise CongraspError(f"--pose: a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians.")
     turn = _unit(_floats(given["quaternion"], (4,), f"--pose: 'quaternion' of {path}"), "--pose: the quaternion")
-    return Reference(np.clip(q, hand.lower, hand.upper), position, turn)
+    return _reference(np.clip(q, hand.lower, hand.upper), position, turn)
 
 
-def _trajectory(
-    text: str, hand: Hand, obj: GraspObject, origin: np.ndarray, waypoints: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _reference(q: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> dict[str, np.ndarray]:
+    return {"q": q, "position": position, "quaternion": quaternion}
+
+
+def _trajectory(written: Written) -> dict[str, np.ndarray] | None:
+    text, hand, obj, origin = written.texts["trajectory"], written.hand, written.obj, written.origin
+    waypoints = written.waypoints
+    if not text:
+        return None
     path, index = numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand)
@@ -304,9 +306,7 @@ def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     return array
 
 
-def _resampled(
-    position: np.ndarray, quaternion: np.ndarray, waypoints: int, what: str
-) -> tuple[np.ndarray, np.ndarray]:
+def _resampled(position: np.ndarray, quaternion: np.ndarray, waypoints: int, what: str) -> dict[str, np.ndarray]:
     """`waypoints` poses evenly spread along a path (n, 3), (n, 4)."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=-1))])
     kept = np.concatenate([[True], np.diff(along) > 1e-6])
@@ -321,4 +321,13 @@ def _resampled(
     places = np.stack([np.interp(wanted, along, column) for column in position.T], -1)
     turns = Slerp(along, Rotation.from_quat(quaternion, scalar_first=True))(wanted).as_quat(scalar_first=True)
     signs = np.where(np.concatenate([[1.0], np.einsum("ij,ij->i", turns[1:], turns[:-1])]) < 0, -1.0, 1.0)
-    return places, turns * np.cumprod(signs)[:, None]  # continuous in sign
+    return {"position": places, "quaternion": turns * np.cumprod(signs)[:, None]}  # continuous in sign
+
+
+READERS: dict[str, Callable[[Written], dict[str, np.ndarray] | None]] = {
+    "heading": _heading,
+    "affordance": _affordance,
+    "pose": _pose,
+    "trajectory": _trajectory,
+}
+"""Readers of constraints that take files or the object's own coordinates; the others parse by themselves."""

@@ -1,0 +1,106 @@
+"""Attempts: grasps side by side that begin as they are asked to, all of them recorded.
+
+Training and evaluation draw their episodes at random; here someone asks for certain ones.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from actors import initial
+from actors.env import metric_names
+from actors.initial import RequestedEpisodes
+from actors.physics.native import NativePhysics
+from actors.rollout import RolloutWorker, Trace
+from common.config import TaskConfig
+from common.hands.spec import Hand
+from common.objects.spec import GraspObject
+from common.policy.bundle import PolicyBundle, mean_action
+from common.task.types import Array, Goal
+
+
+class Outcome(NamedTuple):
+    """Outcome of a batch of attempts."""
+
+    goal: Goal
+    """Active constraints after the priority rules."""
+    redirected: np.ndarray
+    """(B,) bool, see `common.task.constraints.priority.Resolution`."""
+    aligned: np.ndarray
+    """(B,) bool."""
+    metrics: dict[str, np.ndarray]
+    """(B,) each, by the names in `actors.env.metric_names`."""
+    trace: Trace
+    """(T, B, ...)."""
+
+
+class Attempts:
+    """A policy that grasps one object after another, each in several ways at once, by its mean action."""
+
+    def __init__(self, hand: Hand, task: TaskConfig, bundle: PolicyBundle, *, hold: int, threads: int):
+        """Compiles nothing yet.
+
+        Args:
+          hand: the hand.
+          task: the task; of its hold only the part that counts for success is taken.
+          bundle: the policy.
+          hold: control steps without the table.
+          threads: threads of the physics.
+        """
+        self._hand, self._task, self._bundle = hand, task, bundle
+        self._hold, self._threads = hold, threads
+        self._worker: RolloutWorker | None = None
+        self._initial = jax.jit(functools.partial(initial.given, hand, task, hold=hold))
+
+    @property
+    def steps(self) -> int:
+        """T, control steps of an episode."""
+        return self._task.approach_steps + self._hold
+
+    def run(
+        self, obj: GraspObject, request: RequestedEpisodes, progress: Callable[[int], None] = lambda step: None
+    ) -> Outcome:
+        """Grasps an object in B ways; another B than the last one is compiled anew.
+
+        Args:
+          obj: the object.
+          request: the episodes.
+          progress: told how many of the T control steps are done.
+        """
+        conditions, resolution = self._initial(request)
+        batch = len(request.rest)
+        if self._worker is None or self._worker.batch != batch:
+            self.close()
+            self._worker = self._new_worker(obj, batch)
+        self._worker.replace_objects([obj], None)
+        self._worker.begin(conditions)
+        rollout = self._worker.collect(self._bundle.acting, self.steps, progress)
+        names = metric_names(self._task)
+        values = np.asarray(rollout.episodes)[:, : len(names)].T
+        flags = (np.asarray(resolution.redirected), np.asarray(resolution.aligned))
+        return Outcome(resolution.goal, *flags, dict(zip(names, values, strict=True)), rollout.trace)
+
+    def renew(self, bundle: PolicyBundle) -> None:
+        """Newer weights of the same policy; nothing is compiled anew."""
+        self._bundle.spec.require(bundle.spec, "that was to take its place")
+        self._bundle = bundle
+
+    def close(self) -> None:
+        """Ends the physics' threads."""
+        if self._worker is not None:
+            self._worker.physics.close()
+
+    def _new_worker(self, obj: GraspObject, batch: int) -> RolloutWorker:
+        layout = self._bundle.spec.layout
+
+        def policy(parameters: Any, observation: Array, key: Array) -> tuple[Array, Array]:
+            return mean_action(layout, parameters, observation), jnp.zeros(observation.shape[0])
+
+        physics = NativePhysics(self._hand, self._task, [obj], self._threads)
+        return RolloutWorker(
+            self._hand, self._task, physics, None, policy, batch=batch, seed=0, half=False, traced=slice(None)
+        )

@@ -1,0 +1,94 @@
+"""Reference poses and trajectories from the policy's own grasps (paper, section Hand Morphology).
+
+Successful episodes under a heading alone leave their final states behind; now and then these replace poses of the task
+set, so that what later episodes ask for is what this hand can do.
+"""
+
+import functools
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from actors.bank import make_references
+from actors.physics.engine import where_worlds
+from common import rotations
+from common.config import TaskConfig
+from common.hands.spec import Hand
+from common.task.bank import ConstraintBank
+from common.task.constraints import get_constraint, optional
+from common.task.constraints.base import Scene
+from common.task.sampling.closed_poses import Poses
+from common.task.types import Array
+
+if TYPE_CHECKING:
+    from actors.env import EnvState
+
+
+class Grasps(NamedTuple):
+    """Final states of the grasps of a batch of worlds, in the object frame."""
+
+    found: Array
+    """(B,) bool: the world had a successful episode since its grasp was last taken."""
+    object_index: Array
+    """(B,) int."""
+    region: Array
+    """(B,) int, the axis V of the constraint bank."""
+    q: Array
+    """(B, F) finger angles."""
+    position: Array
+    """(B, 3) wrist."""
+    quaternion: Array
+    """(B, 4)."""
+
+
+def collect(
+    task: TaskConfig, state: "EnvState", scene: Scene, error: Mapping[str, tuple[Array, Array]], up: Array
+) -> Grasps:
+    """The grasps, with those that succeeded just now near to their heading, and under nothing drawn from references."""
+    now = (state.time == task.approach_steps + task.hold_steps) & up
+    for spec in get_constraint("heading").errors:
+        now &= error[spec.name][0] < spec.tolerance
+    for constraint in optional(task):
+        if constraint.from_reference:
+            now &= ~constraint.active(state.goal)
+    position, quaternion = rotations.relative_pose(
+        scene.state.object_position,
+        scene.state.object_quaternion,
+        scene.features.wrist_position,
+        scene.features.wrist_quaternion,
+    )
+    fresh = Grasps(now, state.world.object_index, state.region, scene.state.q, position, quaternion)
+    taken = where_worlds(now, fresh[1:], state.grasps[1:])
+    return Grasps(state.grasps.found | now, *taken)
+
+
+@functools.partial(jax.jit, static_argnames=("hand", "task"))
+def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, key: Array) -> ConstraintBank:
+    """The constraint bank with each grasp in the place of a random reference pose of its object and region.
+
+    Places whose pose no resting pose allows are taken first.
+    """
+    slot_key, path_key = jax.random.split(key)
+    objects = bank.pose_q.shape[0]
+    fresh = Poses(grasps.q, grasps.position, grasps.quaternion)
+    path, turns, valid = make_references(hand, fresh, bank.rest[grasps.object_index], path_key, task.trajectory_points)
+    unused = ~bank.pose_valid[grasps.object_index, grasps.region].any(1)
+    slot = jnp.argmax(unused + jax.random.uniform(slot_key, unused.shape), -1)
+    place = grasps.object_index, grasps.region, slot
+    # Of several grasps for one place the last is taken, in all arrays: a scatter would mix them on a GPU.
+    number = jnp.arange(slot.size)
+    usable = grasps.found & valid.any(-1)
+    taken = jnp.full(bank.pose_q.shape[:3], -1).at[place].max(jnp.where(usable, number, -1))
+    # What is written outside of an array is dropped.
+    row = jnp.where(usable & (taken[place] == number), grasps.object_index, objects)
+    where = row, grasps.region, slot
+    return bank._replace(
+        pose_q=bank.pose_q.at[where].set(fresh.q, mode="drop"),
+        pose_position=bank.pose_position.at[where].set(fresh.position, mode="drop"),
+        pose_quaternion=bank.pose_quaternion.at[where].set(fresh.quaternion, mode="drop"),
+        trajectory_position=bank.trajectory_position.at[where].set(path, mode="drop"),
+        trajectory_quaternion=bank.trajectory_quaternion.at[where].set(turns, mode="drop"),
+        pose_valid=bank.pose_valid.at[row, grasps.region, :, slot].set(valid, mode="drop"),
+    )

@@ -1,0 +1,170 @@
+"""Initial conditions: what episodes start from, drawn from a constraint bank (paper, sections Training Setup and Hand
+Initialization) or given."""
+
+import zlib
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from actors.physics.engine import World
+from common import rotations
+from common.config import TaskConfig
+from common.hands.spec import Hand
+from common.task.bank import ConstraintBank, Draw
+from common.task.constraints import known, optional
+from common.task.constraints.priority import Resolution, resolve
+from common.task.types import Array, Goal, Surface
+
+
+class InitialConditions(NamedTuple):
+    """B episodes that are about to begin."""
+
+    world: World
+    """Object, hand and masses at the start."""
+    goal: Goal
+    """Active constraints, after the priority rules."""
+    surface: Surface
+    """Labelled surface points of the objects."""
+    region: Array
+    """(B,) int: the region of the constraint bank that they were drawn from."""
+    hold: Array
+    """(B,) int: control steps without the table before the episode ends."""
+
+
+class RequestedEpisodes(NamedTuple):
+    """What a batch of episodes is asked for, before the priority rules; object frame."""
+
+    goal: Goal
+    """Goal arrays; those of absent constraints may hold anything finite, and what it says is active is ignored."""
+    asked: dict[str, Array]
+    """(B,) bool by the name of each optional constraint."""
+    surface: Surface
+    rest: Array
+    """(B, 7) the object's pose on the table."""
+
+
+def sample(
+    hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, batch: int, stationary: Array | bool = False
+) -> InitialConditions:
+    """Objects, resting poses, constraints and initial hands, drawn at random.
+
+    Each constraint draws from a key of its own, so that one more leaves the draws of the others as they were.
+
+    Args:
+      hand: the hand.
+      task: probabilities of the constraints, and ranges.
+      bank: what is drawn from.
+      key: random key.
+      batch: B.
+      stationary: () bool, holds the objects in place (the paper's first phase).
+    """
+    keys = iter(jax.random.split(key, 7))
+    uniform = lambda: jax.random.uniform(next(keys), (batch,))  # noqa: E731
+    objects = jax.random.randint(next(keys), (batch,), 0, bank.points.shape[0])
+    rests = jax.random.randint(next(keys), (batch,), 0, bank.rest.shape[1])
+    draw = Draw(bank, objects, rests, jnp.zeros(batch, jnp.int32), jnp.zeros(batch, jnp.int32))
+    asked: dict[str, Array] = {}
+    for constraint in optional(task):
+        wanted = jax.random.uniform(own_key(key, constraint.name, 0), (batch,)) < getattr(task, f"p_{constraint.name}")
+        asked[constraint.name] = wanted & constraint.available(draw)
+        draw = draw._replace(region=jnp.maximum(draw.region, constraint.region * asked[constraint.name]))
+    order = jax.random.uniform(next(keys), draw.allowed.shape)
+    draw = draw._replace(reference=jnp.argmax(jnp.where(draw.allowed, order, -1.0), -1))
+    values = {c.name: c.sample(hand, draw, own_key(key, c.name, 1)) for c in known(task)}
+    surface = Surface(bank.points[objects], bank.minus[objects])
+    goal = resolve(hand, surface, Goal(values, {}), asked).goal
+    low, high = task.mass_range
+    friction_low, friction_high = task.friction_range
+    world = start(
+        hand,
+        task,
+        goal,
+        bank.rest[objects, rests],
+        objects=objects,
+        mass_scale=low + (high - low) * uniform(),
+        friction=friction_low + (friction_high - friction_low) * uniform(),
+        stationary=jnp.broadcast_to(stationary, (batch,)),
+    )
+    # Squared, so that short holds, whose beginning every episode shares, stay the rule.
+    longer = jnp.floor(uniform() ** 2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
+    hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
+    return InitialConditions(world, goal, surface, draw.region, hold)
+
+
+def own_key(key: Array, name: str, stage: int) -> Array:
+    """The random key of one stage of a constraint's draws."""
+    return jax.random.fold_in(jax.random.fold_in(key, zlib.crc32(name.encode())), stage)
+
+
+def given(hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int) -> tuple[InitialConditions, Resolution]:
+    """Episodes as they are asked for, of one object of nominal mass and friction, and what the priority rules did.
+
+    Args:
+      hand: the hand.
+      task: geometry of the approach.
+      request: the episodes.
+      hold: control steps without the table.
+    """
+    resolution = resolve(hand, request.surface, request.goal, request.asked)
+    batch = request.rest.shape[0]
+    nominal, index = jnp.ones(batch), jnp.zeros(batch, jnp.int32)
+    world = start(
+        hand,
+        task,
+        resolution.goal,
+        request.rest,
+        objects=index,
+        mass_scale=nominal,
+        friction=nominal,
+        stationary=jnp.zeros(batch, bool),
+    )
+    initial = InitialConditions(world, resolution.goal, request.surface, index, jnp.full(batch, hold, jnp.int32))
+    return initial, resolution
+
+
+def start(
+    hand: Hand,
+    task: TaskConfig,
+    goal: Goal,
+    rest: Array,
+    *,
+    objects: Array,
+    mass_scale: Array,
+    friction: Array,
+    stationary: Array,
+) -> World:
+    """The hand where its constraints let it begin, beside the objects in their resting poses (B, 7)."""
+    q, base_position, base_quaternion = initial_hand(hand, task, goal, rest)
+    return World(
+        object_index=objects,
+        mass_scale=mass_scale,
+        friction=friction,
+        base_position=base_position,
+        base_quaternion=base_quaternion,
+        q=q,
+        object_position=rest[:, :3],
+        object_quaternion=rest[:, 3:],
+        stationary=stationary,
+    )
+
+
+def initial_hand(hand: Hand, task: TaskConfig, goal: Goal, rest: Array) -> tuple[Array, Array, Array]:
+    """Finger angles (B, F) and world wrist poses (B, 3), (B, 4) at the start, as the constraints have it.
+
+    Args:
+      hand: the hand.
+      task: geometry of the approach.
+      goal: after the priority rules.
+      rest: (B, 7) the objects' resting poses.
+    """
+    q = jnp.broadcast_to(jnp.array(hand.q_open), (rest.shape[0], len(hand.joints)))
+    for constraint in known(task):
+        if (fingers := constraint.initial_fingers(goal)) is not None:
+            q = jnp.where(fingers[0][:, None], fingers[1], q)
+    position, quaternion = jnp.zeros_like(rest[:, :3]), jnp.zeros_like(rest[:, 3:])
+    for constraint in known(task):
+        if (wrist := constraint.initial_wrist(hand, task, goal, q)) is not None:
+            where = wrist[0][:, None]
+            position, quaternion = jnp.where(where, wrist[1], position), jnp.where(where, wrist[2], quaternion)
+    return q, *rotations.compose_pose(rest[:, :3], rest[:, 3:], position, quaternion)

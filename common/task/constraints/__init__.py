@@ -1,0 +1,102 @@
+"""The constraints, weakest first: an order on which layouts, masks, tables and the priority rules rest."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common.errors import CongraspError
+from common.hands.spec import Hand
+from common.request import GraspRequest
+from common.task.constraints.affordance import Affordance
+from common.task.constraints.base import Constraint, ErrorSpec, unknown_constraint
+from common.task.constraints.fingers import Fingers
+from common.task.constraints.heading import Heading
+from common.task.constraints.pose import Pose
+from common.task.constraints.trajectory import Trajectory
+
+from common.task.types import Goal
+
+if TYPE_CHECKING:
+    from common.config import TaskConfig
+
+CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers())
+PAPER = ("heading", "affordance", "pose", "trajectory")
+"""Names of the paper's constraints: what a policy knows unless its task says otherwise."""
+
+
+def get_constraint(name: str) -> Constraint:
+    """A constraint by its name.
+
+    Raises:
+      CongraspError: there is none.
+    """
+    for constraint in CONSTRAINTS:
+        if constraint.name == name:
+            return constraint
+    raise unknown_constraint(name, [constraint.name for constraint in CONSTRAINTS])
+
+
+def known(task: "TaskConfig") -> tuple[Constraint, ...]:
+    """The constraints that the task's policy knows, weakest first.
+
+    Raises:
+      CongraspError: the task names one that is not there, or leaves out the heading.
+    """
+    for name in task.constraints:
+        get_constraint(name)
+    if "heading" not in task.constraints:
+        raise CongraspError("The heading is always active.", "Name it among the task's constraints.")
+    return tuple(constraint for constraint in CONSTRAINTS if constraint.name in task.constraints)
+
+
+def optional(task: "TaskConfig") -> tuple[Constraint, ...]:
+    """Those of them that an episode can be without."""
+    return tuple(constraint for constraint in known(task) if constraint.optional)
+
+
+def blocks(task: "TaskConfig") -> tuple[str, ...]:
+    """Names of the gated blocks of the observation, in order; each is a bit of the mask."""
+    return tuple(block for constraint in known(task) for block in constraint.blocks)
+
+
+def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
+    """Errors of several constraints, in order."""
+    return tuple(error for constraint in constraints for error in constraint.errors)
+
+
+def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
+    """The goal arrays of a request, without batch axis, before the priority rules; neutral where it leaves them free."""
+    values = {}
+    for constraint in known(task):
+        given = request.constraints.get(constraint.name, {})
+        neutral = constraint.neutral(hand, task)
+        values[constraint.name] = neutral._replace(
+            **{name: np.asarray(value, getattr(neutral, name).dtype) for name, value in given.items()}
+        )
+    return Goal(values, {})
+
+
+def require_known(names: Iterable[str], task: "TaskConfig", who: str = "The policy") -> None:
+    """Raises `CongraspError` if somebody asks for a constraint that the task's policy does not know."""
+    for name in names:
+        get_constraint(name)
+        if name not in task.constraints:
+            raise CongraspError(
+                f"{who} does not know the constraint '{name}'.",
+                f"It knows {', '.join(task.constraints)}; train one with --task.constraints … {name}.",
+            )
+
+
+__all__ = [
+    "CONSTRAINTS",
+    "PAPER",
+    "Constraint",
+    "blocks",
+    "error_specs",
+    "get_constraint",
+    "goal_of",
+    "known",
+    "optional",
+    "require_known",
+]

@@ -1,0 +1,276 @@
+"""What a constraint is: everything that the rest of the project derives from its one file.
+
+A constraint's module defines a subclass of `Constraint`, and `common.task.constraints.CONSTRAINTS` lists an instance.
+All methods are pure functions of batched arrays (leading axis B) that may be traced; the defaults do nothing.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_type_hints
+
+import jax.numpy as jnp
+import numpy as np
+
+from common.errors import CongraspError
+from common.hands.spec import Hand
+from common.task.types import Array, Goal, SceneState, Surface
+
+if TYPE_CHECKING:
+    from common.config import TaskConfig
+    from common.task.bank import Draw
+    from common.task.features import Contacts, Features
+
+Window = Literal["approach", "hold"]
+"""Over which steps an error is averaged: before the table's removal, or in the `hold_steps` after it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GoalArray:
+    """One of a constraint's goal arrays, as the annotation of its field in the NamedTuple."""
+
+    shape: tuple[int | str, ...]
+    """Without the batch axis; a symbol of `symbol_sizes` or a number each."""
+    meaning: str
+    """Unit, frame, and what it says."""
+    kind: Literal["real", "direction", "quaternion", "flag"] = "real"
+    """Directions and quaternions must be unit vectors; flags are true or false."""
+    neutral: tuple[float, ...] = ()
+    """Last axis of what stands where nobody asks; zeros by default."""
+    required: bool = True
+    """Whether who asks for the constraint must give it."""
+
+
+class Weight(NamedTuple):
+    """One term of the reward."""
+
+    name: str
+    """Of the term and of its weight."""
+    default: float
+    meaning: str
+    """Symbol in the paper, and unit."""
+
+
+class ErrorSpec(NamedTuple):
+    """How one error of a constraint is measured; the paper's definitions are in its section Metrics."""
+
+    name: str
+    """`heading_rad` and so on: of the episode's metric."""
+    unit: str
+    """rad, m, or empty for a ratio."""
+    window: Window
+    tolerance: float
+    """Up to where the constraint counts as met in one step."""
+    scale: float
+    """Which error of this kind weighs as much as one of another, where grasps are compared."""
+    meaning: str
+    """What is met up to the tolerance, for people."""
+    column: str = ""
+    """Name in tables and their JSON; the same as `name` if empty."""
+    ratio: bool = False
+    """Sums of two numbers over the window are divided, instead of a mean over its steps."""
+
+
+class ObservationField(NamedTuple):
+    """Some numbers of the observation, one after the other."""
+
+    name: str
+    size: int
+    meaning: str
+    """Unit and frame; "wrist" is the wrist frame."""
+
+
+class Relation(NamedTuple):
+    """How a constraint stands to a weaker one where both are asked for and cannot both be met."""
+
+    weaker: str
+    """Name of the other constraint."""
+    settled: Literal["overridden", "redirected", "refused"]
+    """What becomes of the weaker one; a refused request is an error."""
+    measure: Any
+    """(hand, surface, goal) -> dict of arrays (B, ...): how far the two are apart."""
+    contradicts: Any
+    """measured -> (B,) bool."""
+    message: Any
+    """(hand, measured of one environment, as NumPy) -> one or two sentences with the numbers."""
+
+
+class Scene(NamedTuple):
+    """One control step as the terms of a constraint see it."""
+
+    hand: Hand
+    task: "TaskConfig"
+    state: SceneState
+    features: "Features"
+    goal: Goal
+
+    def gate(self, block: str) -> Array:
+        """(B,) 1 where a block is active, else 0."""
+        return self.goal.active[block].astype(jnp.float32)
+
+
+class Option(NamedTuple):
+    """What a person writes to ask for a constraint, as an option of `congrasp grasp`."""
+
+    name: str
+    help: str
+    many: bool = False
+    """Takes several words."""
+
+
+class Constraint:
+    """One constraint; subclasses set the attributes and override what they need."""
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    """For people, in lower case."""
+    goal: ClassVar[type]
+    """NamedTuple of the goal arrays; its fields are annotated with `GoalArray`."""
+    blocks: ClassVar[tuple[str, ...]] = ()
+    """Blocks of the observation that it gates, each with a bit of its own; the heading, always active, has none."""
+    overrides: ClassVar[tuple[str, ...]] = ()
+    """Weaker constraints, or single blocks of theirs, that are inactive where this one is asked for."""
+    guides: ClassVar[str] = ""
+    """Block whose activity hands the wrist's guidance to `guidance`; empty if it leads no wrist."""
+    region: ClassVar[int] = 0
+    """Region of the constraint bank that its episodes draw from: 0 the whole surface, 1 the graspable region."""
+    from_reference: ClassVar[bool] = False
+    """Whether it is drawn from reference grasps; grasps under it then make no new ones."""
+    weights: ClassVar[tuple[Weight, ...]] = ()
+    errors: ClassVar[tuple[ErrorSpec, ...]] = ()
+    relations: ClassVar[tuple[Relation, ...]] = ()
+    options: ClassVar[tuple[Option, ...]] = ()
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Fields of a query, beside its goal arrays, that who asks for it must give."""
+    invalid: ClassVar[tuple[str, str]] = ("", "")
+    """What is wrong with arrays that are not `valid`, and the remedy."""
+
+    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+        """What stands in each of its blocks of the observation, in order."""
+        return ()
+
+    def labels(self, hand: Hand) -> dict[str, tuple[str, ...]]:
+        """Names of the elements of flag arrays, by field, for pages and command lines."""
+        return {}
+
+    # Sampling and the start of an episode.
+
+    def available(self, draw: "Draw") -> Array:
+        """(B,) bool: whether the drawn objects, in their resting poses and regions, allow it."""
+        return jnp.ones(draw.objects.shape, bool)
+
+    def sample(self, hand: Hand, draw: "Draw", key: Array) -> Any:
+        """Its goal arrays for the drawn episodes, whether or not they ask for it."""
+        raise NotImplementedError
+
+    def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
+        """The goal with what this constraint, where it is asked for, puts in the place of weaker ones' arrays."""
+        return goal
+
+    def initial_fingers(self, goal: Goal) -> tuple[Array, Array] | None:
+        """(B,) bool where an episode begins with other finger angles than the open hand's, and these (B, F)."""
+        return None
+
+    def initial_wrist(self, hand: Hand, task: "TaskConfig", goal: Goal, q: Array) -> tuple[Array, Array, Array] | None:
+        """(B,) bool where it says at which wrist pose an episode begins, and the pose (B, 3), (B, 4), object frame.
+
+        Args:
+          hand: the hand.
+          task: geometry of the approach.
+          goal: after the priority rules.
+          q: (B, F) finger angles at the start.
+        """
+        return None
+
+    def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
+        """Goal arrays by field to begin with, where a person switches it on."""
+        return self.neutral(hand, task)._asdict()
+
+    def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+        """Wrist positions (n, 3), object frame, and last orientation (4,) that it prescribes; None if it does not."""
+        return None
+
+    # One control step.
+
+    def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> Any:
+        """Geometry of its own that observation, reward and errors share, as a pytree."""
+        return ()
+
+    def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
+        """World wrist pose (B, 3), (B, 4) that it leads to, on the object's current or initial pose."""
+        raise NotImplementedError
+
+    def observe(self, scene: Scene) -> tuple[Sequence[Array], ...]:
+        """For each block the parts (B, ...) that are laid side by side; they are gated afterwards."""
+        return ()
+
+    def earning(self, scene: Scene, touching: Array, force: Array) -> tuple[Array, Array]:
+        """Contacts that earn the grasp reward: what it leaves of flags (B, L) and forces (B, L, 3) of the links."""
+        return touching, force
+
+    def reward(self, scene: Scene) -> dict[str, Array]:
+        """Terms (B,) by the names of `weights`, signed, before the weight, zero where it is inactive."""
+        return {}
+
+    def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
+        """Errors (B,) of one step by the names of `errors`, active or not; numerator and denominator of a ratio."""
+        return {}
+
+    # What people see.
+
+    def valid(self, surface: Surface, own: Any) -> Array:
+        """(B,) bool: whether goal arrays of the right shapes, finite and unit, make sense together."""
+        return jnp.ones(surface.points.shape[0], bool)
+
+    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
+        """What the priority rules do with it where it is asked for, in sentences.
+
+        Args:
+          overridden: names of the stronger constraints that are asked for and override it or one of its blocks.
+          redirected: whether it turned the heading.
+        """
+        return []
+
+    def parse(self, given: Mapping[str, Any], hand: Hand) -> dict[str, np.ndarray] | None:
+        """Goal arrays by field (without batch axis) from what a person wrote for `options`; None if nothing.
+
+        Raises:
+          CongraspError: an option cannot be read.
+        """
+        return None
+
+    # What follows from the above.
+
+    @property
+    def optional(self) -> bool:
+        """Whether an episode can be without it."""
+        return bool(self.blocks)
+
+    @property
+    def arrays(self) -> dict[str, GoalArray]:
+        """The goal arrays by field name."""
+        hints = get_type_hints(self.goal, include_extras=True)
+        return {name: hints[name].__metadata__[0] for name in self.goal._fields}  # type: ignore[attr-defined]
+
+    def neutral(self, hand: Hand, task: "TaskConfig") -> Any:
+        """Goal arrays (without batch axis) that stand where nobody asks."""
+        symbols = symbol_sizes(hand, task)
+        made = {}
+        for name, array in self.arrays.items():
+            shape = tuple(symbols[n] if isinstance(n, str) else n for n in array.shape)
+            fill = np.asarray(array.neutral or 0.0, np.float32)
+            made[name] = np.broadcast_to(fill, shape).astype(bool if array.kind == "flag" else np.float32)
+        return self.goal(**made)
+
+    def active(self, goal: Goal) -> Array:
+        """(B,) bool: whether any block of it is active; only optional constraints have any."""
+        return jnp.any(jnp.stack([goal.active[block] for block in self.blocks]), 0)
+
+
+def symbol_sizes(hand: Hand, task: "TaskConfig") -> dict[str, int]:
+    """Sizes that the symbols of goal arrays stand for: F finger joints, G fingers, K waypoints."""
+    return {"F": len(hand.joints), "G": len(hand.fingers), "K": task.trajectory_points}
+
+
+def unknown_constraint(name: str, known: Sequence[str]) -> CongraspError:
+    """The error of someone who asks for a constraint that is not there."""
+    return CongraspError(f"There is no constraint '{name}'.", f"Choose from: {', '.join(known)}.")

@@ -1,0 +1,129 @@
+"""Fingers: which of them may touch the object (ours). Thumb and index make a pinch, with the middle one a tripod."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from common.errors import CongraspError
+from common.hands.spec import Hand
+from common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Scene, Weight
+from common.task.geometry import flat, squash
+from common.task.types import Array, Surface
+
+if TYPE_CHECKING:
+    from common.config import TaskConfig
+    from common.task.bank import Draw
+
+MARGIN, SHARPNESS = 0.01, 0.003
+"""Metres that the skin of the other fingers should keep from the object, and how sharply that is felt."""
+
+
+class FingersGoal(NamedTuple):
+    """Fingers by the order of `Hand.fingers`, thumb first."""
+
+    allowed: Annotated[Array, GoalArray(("G",), "fingers that may touch the object", "flag")]
+
+
+class Fingers(Constraint):
+    """A set of fingers; the palm belongs to all of them."""
+
+    name, title, goal = "fingers", "fingers", FingersGoal
+    blocks = ("fingers",)
+    weights = (
+        Weight("fingers_distance", 0.02, "For each unit of softplus((margin - d)/sharpness), finger by finger."),
+        Weight("fingers_contact", 0.3, "For each link of another finger that touches the object."),
+    )
+    errors = (ErrorSpec("fingers_ratio", "", "hold", 0.0, 0.1, "share of touching links of other fingers", ratio=True),)
+    options = (
+        Option("fingers", "Which fingers may touch the object, such as: thumb index. All by default.", many=True),
+    )
+
+    invalid = ("The constraint 'fingers' allows fewer than two fingers.", "Allow two or more.")
+
+    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+        """The set, the room of each other finger, and the forces of their links."""
+        fingers, links = len(hand.fingers), len(hand.links)
+        block = (
+            ObservationField("fingers_allowed", fingers, "1 for each finger that may touch the object, thumb first"),
+            ObservationField("fingers_room", fingers, "m, between the object and each other finger, at most 0.1"),
+            ObservationField("force_other", 3 * links, "as force, on links of the other fingers"),
+        )
+        return (block,)
+
+    def labels(self, hand: Hand) -> dict[str, tuple[str, ...]]:
+        """Names of the fingers."""
+        return {"allowed": hand.fingers}
+
+    def sample(self, hand: Hand, draw: "Draw", key: Array) -> FingersGoal:
+        """The thumb with the first one, two, … of the others, or all of them, with equal probability."""
+        count = jax.random.randint(key, draw.objects.shape, 2, len(hand.fingers) + 1)
+        return FingersGoal(jnp.arange(len(hand.fingers)) < count[:, None])
+
+    def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
+        """A pinch."""
+        return {"allowed": np.arange(len(hand.fingers)) < 2}
+
+    def observe(self, scene: Scene) -> tuple[list[Array], ...]:
+        """The set, the clipped distance of each finger that is not in it, and squashed forces on their links."""
+        allowed, other = scene.goal["fingers"].allowed, other_links(scene)
+        room = jnp.where(allowed, 0.0, jnp.minimum(_room(scene), 0.1))
+        return ([allowed.astype(jnp.float32), room, flat(squash(scene.features.force * other[..., None]))],)
+
+    def earning(self, scene: Scene, touching: Array, force: Array) -> tuple[Array, Array]:
+        """Contacts of the other fingers earn nothing."""
+        other = other_links(scene) & scene.goal.active["fingers"][:, None]
+        return touching & ~other, jnp.where(other[..., None], 0.0, force)
+
+    def reward(self, scene: Scene) -> dict[str, Array]:
+        """A barrier around the object for the other fingers, and a price for their contacts."""
+        active = scene.gate("fingers")
+        near = jnp.where(scene.goal["fingers"].allowed, 0.0, jax.nn.softplus((MARGIN - _room(scene)) / SHARPNESS))
+        return {
+            "fingers_distance": -active * jnp.sum(near, -1),
+            "fingers_contact": -active * jnp.sum(scene.features.touching & other_links(scene), -1),
+        }
+
+    def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
+        """Touching links that belong to other fingers, among all that touch."""
+        touching = scene.features.touching
+        wrong = jnp.sum(touching & other_links(scene), -1)
+        return {"fingers_ratio": (wrong.astype(jnp.float32), jnp.sum(touching, -1).astype(jnp.float32))}
+
+    def valid(self, surface: Surface, own: FingersGoal) -> Array:
+        """Two fingers or more."""
+        return jnp.sum(own.allowed, -1) >= 2
+
+    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
+        """It keeps the others away."""
+        return ["Only the named fingers may touch the object."]
+
+    def parse(self, given: Mapping[str, Any], hand: Hand) -> dict[str, np.ndarray] | None:
+        """Names of fingers."""
+        if not given["fingers"]:
+            return None
+        if unknown := [name for name in given["fingers"] if name not in hand.fingers]:
+            raise CongraspError(
+                f"--fingers: the hand '{hand.name}' has no finger '{unknown[0]}'.", f"Known: {', '.join(hand.fingers)}."
+            )
+        if len(set(given["fingers"])) < 2:
+            raise CongraspError("--fingers names one finger, which cannot hold an object.", "Name two or more.")
+        return {"allowed": np.isin(hand.fingers, given["fingers"])}
+
+
+def other_links(scene: Scene) -> Array:
+    """(B, L) bool: links of fingers that may not touch the object."""
+    owner = scene.hand.link_fingers
+    return ~scene.goal["fingers"].allowed[:, owner] & (owner >= 0)
+
+
+def _room(scene: Scene) -> Array:
+    """(B, G) m between the object and the skin of each finger at its keypoints."""
+    hand = scene.hand
+    skin = jnp.linalg.norm(scene.features.nearest, axis=-1) - jnp.array(hand.keypoint_radii)
+    owner = hand.link_fingers[hand.keypoint_links]
+    return jnp.stack(
+        [jnp.min(jnp.where(owner == finger, skin, jnp.inf), -1) for finger in range(len(hand.fingers))], -1
+    )

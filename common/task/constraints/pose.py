@@ -1,0 +1,212 @@
+"""Reference pose: where wrist and fingers should be in the grasp."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from common import rotations
+from common.hands import kinematics
+from common.hands.spec import Hand
+from common.task.constraints.base import (
+    Constraint,
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Relation,
+    Scene,
+    Weight,
+)
+from common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
+from common.task.geometry import flat, in_world, square, squared_distances, wrist_to_joints
+from common.task.types import Array, Goal, Surface
+
+if TYPE_CHECKING:
+    from common.config import TaskConfig
+    from common.task.bank import Draw
+    from common.task.features import Contacts, Features
+
+TOUCHING = 0.015
+"""Metres from a joint or fingertip of a reference pose to the surface that it is about to touch."""
+_FAR, _TURNED = 0.15, 0.5
+"""Errors (m, rad) beyond which tracking costs no more."""
+_GATE_FAR, _GATE_NEAR = 0.10, 0.03
+
+
+class PoseGoal(NamedTuple):
+    """A wrist pose in the object frame, and finger angles."""
+
+    q: Annotated[Array, GoalArray(("F",), "rad, finger angles (q-bar)")]
+    position: Annotated[Array, GoalArray((3,), "m, object frame: the wrist")]
+    quaternion: Annotated[
+        Array, GoalArray((4,), "wrist frame to object frame", "quaternion", neutral=(1.0, 0.0, 0.0, 0.0))
+    ]
+
+
+class PoseFeatures(NamedTuple):
+    """The reference pose in the wrist frame."""
+
+    keypoints: Array
+    """(B, P, 3) x-bar: keypoints of the reference pose, carried by its wrist pose in the object frame."""
+
+
+class Pose(Constraint):
+    """Finger angles and wrist pose of the grasp; the two are gated apart (paper, section Observation Space)."""
+
+    name, title, goal = "pose", "reference pose", PoseGoal
+    blocks = ("pose_finger", "pose_wrist")
+    overrides = ("heading", "affordance")
+    guides = "pose_wrist"
+    from_reference = True
+    weights = (
+        Weight(
+            "pose_finger",
+            0.1,
+            "w_q of the pose term: per squared radian of the finger joints, gated by the hand's distance.",
+        ),
+        Weight("pose_link", 5.0, "w_x: per square metre of the finger links' positions, gated by the hand's distance."),
+        Weight("pose_wrist_position", 20.0, "w_p: per square metre of the wrist's position."),
+        Weight("pose_wrist_rotation", 0.5, "w_R of the pose term: per square radian of the wrist's rotation."),
+    )
+    errors = (
+        ErrorSpec("pose_rad", "rad", "hold", 0.25, 0.25, "joints and wrist hinges on average"),
+        ErrorSpec("pose_m", "m", "hold", 0.03, 0.02, "wrist's distance"),
+    )
+    options = (
+        Option(
+            "pose",
+            "Reference pose: a grasp.npz, a constraint set (FILE:NUMBER), or JSON with joints, position, quaternion.",
+        ),
+    )
+
+    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+        """Residuals of joints and keypoints; of the virtual wrist joints."""
+        fingers = (
+            ObservationField("pose_q - q", len(hand.joints), "rad, to the reference pose"),
+            ObservationField("pose_keypoints - keypoints", 3 * len(hand.keypoints), "m, wrist frame"),
+        )
+        wrist = ObservationField(
+            "pose_u - u", 6, "m and rad, wrist joints of the reference pose, less the present ones"
+        )
+        return fingers, (wrist,)
+
+    def available(self, draw: "Draw") -> Array:
+        """Where the object has a reference that the table leaves room for."""
+        return jnp.any(draw.allowed, -1)
+
+    def sample(self, hand: Hand, draw: "Draw", key: Array) -> PoseGoal:
+        """One of the object's reference poses."""
+        index = draw.objects, draw.region, draw.reference
+        return PoseGoal(draw.bank.pose_q[index], draw.bank.pose_position[index], draw.bank.pose_quaternion[index])
+
+    def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
+        """The heading becomes that of the reference pose."""
+        own = goal["pose"]
+        return goal.where(asked["pose"], "heading", **heading_of_wrist(hand, own.q, own.position, own.quaternion))
+
+    def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The reference wrist."""
+        return np.asarray(own["position"])[None], np.asarray(own["quaternion"])
+
+    def initial_fingers(self, goal: Goal) -> tuple[Array, Array]:
+        """The reference's own fingers (paper, section Hand Initialization)."""
+        return goal.active["pose_finger"], goal["pose"].q
+
+    def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> PoseFeatures:
+        """Keypoints of the reference."""
+        own = goal["pose"]
+        points = kinematics.keypoints(hand, kinematics.link_transforms(hand, own.q))
+        points = rotations.transform(own.position, own.quaternion, points)
+        return PoseFeatures(rotations.transform(features.object_position, features.object_quaternion, points))
+
+    def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
+        """The reference wrist pose."""
+        own = scene.goal["pose"]
+        return in_world(*object_pose(scene, current=current), own.position, own.quaternion)
+
+    def observe(self, scene: Scene) -> tuple[list[Array], ...]:
+        """q-bar - q and x-bar - x; u-bar - u."""
+        own, state, features = scene.goal["pose"], scene.state, scene.features
+        fingers = [own.q - state.q, flat(features.of["pose"].keypoints - features.keypoints)]
+        wrist = in_world(state.object_position, state.object_quaternion, own.position, own.quaternion)
+        return fingers, [wrist_to_joints(state, *wrist) - state.u]
+
+    def reward(self, scene: Scene) -> dict[str, Array]:
+        """r^pose."""
+        own, state, features, active = scene.goal["pose"], scene.state, scene.features, scene.gate
+        position, quaternion = in_world(state.object_position, state.object_quaternion, own.position, own.quaternion)
+        gate = pose_gate(jnp.min(jnp.linalg.norm(features.nearest, axis=-1), -1)) * active("pose_finger")
+        far = jnp.minimum(square(features.wrist_position - position), _FAR**2)
+        turned = jnp.minimum(rotations.angle(features.wrist_quaternion, quaternion), _TURNED)
+        return {
+            "pose_finger": -gate * square(state.q - own.q),
+            "pose_link": -gate * jnp.sum(square(features.of["pose"].keypoints - features.keypoints), -1),
+            "pose_wrist_position": -active("pose_wrist") * far,
+            "pose_wrist_rotation": -active("pose_wrist") * turned**2,
+        }
+
+    def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
+        """Mean absolute error of the finger joints and the three wrist hinges; distance of the wrist."""
+        own, state = scene.goal["pose"], scene.state
+        position, quaternion = in_world(state.object_position, state.object_quaternion, own.position, own.quaternion)
+        hinges = wrist_to_joints(state, position, quaternion)[..., 3:] - state.u[..., 3:]
+        hinges = jnp.mod(hinges + jnp.pi, 2 * jnp.pi) - jnp.pi
+        angles = jnp.concatenate([state.q - own.q, hinges], -1)
+        return {
+            "pose_rad": jnp.mean(jnp.abs(angles), -1),
+            "pose_m": jnp.linalg.norm(scene.features.wrist_position - position, axis=-1),
+        }
+
+    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
+        """It guides wrist and fingers, or the fingers alone."""
+        if overridden:
+            return ["Of the reference pose only the fingers count: the trajectory decides on the wrist."]
+        return ["The reference pose guides wrist and fingers; the heading follows from it."]
+
+
+def pose_gate(distance: Array) -> Array:
+    """g(d): rises linearly from 0 at 0.10 m to 1 at 0.03 m between hand and object."""
+    return jnp.clip((_GATE_FAR - distance) / (_GATE_FAR - _GATE_NEAR), 0.0, 1.0)
+
+
+def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
+    return {"turn": heading_turn(hand, goal["heading"], goal["pose"].quaternion)}
+
+
+def _heading_message(hand: Hand, apart: Mapping[str, Any]) -> str:
+    return heading_message("pose", apart["turn"])
+
+
+def heading_message(stronger: str, turn: float) -> str:
+    """What a heading that comes another way than a stronger constraint is told; the angle in rad."""
+    return (
+        f"The heading differs by {np.degrees(turn):.0f} degrees from the way in which the {stronger} comes. "
+        f"The {stronger} overrides it: the heading follows from it."
+    )
+
+
+def _touches(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
+    """(B, P) bool: keypoints of the reference pose that would touch the avoid region."""
+    own = goal["pose"]
+    points = kinematics.keypoints(hand, kinematics.link_transforms(hand, own.q))
+    points = rotations.transform(own.position, own.quaternion, points)
+    away = squared_distances(surface.points, points)
+    avoid = jnp.min(jnp.where(surface.minus[..., None], away, jnp.inf), -2)
+    graspable = jnp.min(jnp.where(surface.minus[..., None], jnp.inf, away), -2)
+    return {"touching": (avoid < TOUCHING**2) & (avoid < graspable)}
+
+
+def _affordance_message(hand: Hand, apart: Mapping[str, Any]) -> str:
+    names = dict.fromkeys(hand.links[hand.keypoint_links[i]].name for i in np.flatnonzero(apart["touching"]))
+    return (
+        f"In the reference pose {', '.join(names)} would touch what must not be touched. The pose names its own "
+        "contacts and overrides the affordance."
+    )
+
+
+Pose.relations = (
+    Relation("affordance", "overridden", _touches, lambda apart: jnp.any(apart["touching"], -1), _affordance_message),
+    Relation("heading", "overridden", _apart_from_heading, lambda apart: apart["turn"] > TURNED, _heading_message),
+)

@@ -1,0 +1,216 @@
+"""Wrist trajectory: the path along which the wrist comes."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from common import rotations
+from common.hands.spec import Hand
+from common.task.constraints.base import (
+    Constraint,
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Relation,
+    Scene,
+    Weight,
+)
+from common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
+from common.task.constraints.pose import heading_message
+from common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
+from common.task.types import Array, Goal, Surface
+
+if TYPE_CHECKING:
+    from common.config import TaskConfig
+    from common.task.bank import Draw
+
+APART = 0.02
+"""Metres between a pose's wrist and a trajectory's end from which on they contradict."""
+TWISTED = 0.3
+"""Radians between their orientations, likewise."""
+_FAR, _TURNED = 0.15, 0.5
+"""Errors (m, rad) beyond which tracking costs no more."""
+
+
+class TrajectoryGoal(NamedTuple):
+    """Wrist poses from far to near, object frame."""
+
+    position: Annotated[Array, GoalArray(("K", 3), "m, object frame: wrist waypoints")]
+    quaternion: Annotated[
+        Array, GoalArray(("K", 4), "wrist frame to object frame", "quaternion", neutral=(1.0, 0.0, 0.0, 0.0))
+    ]
+
+
+class Trajectory(Constraint):
+    """A sequence of wrist poses (paper, section Constraint Formulation)."""
+
+    name, title, goal = "trajectory", "wrist trajectory", TrajectoryGoal
+    blocks = ("trajectory",)
+    overrides = ("heading", "pose_wrist")
+    guides = "trajectory"
+    from_reference = True
+    weights = (
+        Weight("trajectory_position", 20.0, "w_traj-p: per square metre between the wrist and the active waypoint."),
+        Weight("trajectory_rotation", 0.5, "w_traj-q: per square radian between the wrist and the active waypoint."),
+    )
+    errors = (
+        ErrorSpec("trajectory_rad", "rad", "approach", 0.3, 0.2, "wrist's turn against the waypoint", "traj_rad"),
+        ErrorSpec("trajectory_m", "m", "approach", 0.03, 0.03, "wrist's distance from the waypoint", "traj_m"),
+    )
+    options = (
+        Option(
+            "trajectory",
+            "Wrist path: a grasp.npz, a constraint set, JSON with position and quaternion, or CSV (x y z w x y z).",
+        ),
+    )
+
+    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+        """Residual virtual wrist joints of every waypoint."""
+        size, meaning = 6 * task.trajectory_points, "m and rad, wrist joints of every waypoint, less the present ones"
+        return ((ObservationField("waypoint_u - u", size, meaning),),)
+
+    def available(self, draw: "Draw") -> Array:
+        """Where the object has a reference that the table leaves room for."""
+        return jnp.any(draw.allowed, -1)
+
+    def sample(self, hand: Hand, draw: "Draw", key: Array) -> TrajectoryGoal:
+        """The trajectory to one of the object's reference poses."""
+        index = draw.objects, draw.region, draw.reference
+        return TrajectoryGoal(draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index])
+
+    def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
+        """The last waypoint is the wrist of a reference pose, and the heading becomes the waypoint's."""
+        here, last = asked["trajectory"], last_waypoint(goal)
+        q = jnp.broadcast_to(jnp.array(hand.q_open), (here.shape[0], len(hand.joints)))
+        if "pose" in goal.values:
+            q = jnp.where(asked["pose"][:, None], goal["pose"].q, q)
+            goal = goal.where(here, "pose", position=last[0], quaternion=last[1])
+        return goal.where(here, "heading", **heading_of_wrist(hand, q, *last))
+
+    def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The waypoints."""
+        return np.asarray(own["position"]), np.asarray(own["quaternion"])[-1]
+
+    def initial_wrist(self, hand: Hand, task: "TaskConfig", goal: Goal, q: Array) -> tuple[Array, Array, Array]:
+        """The first waypoint (paper, section Hand Initialization)."""
+        own = goal["trajectory"]
+        return goal.active["trajectory"], own.position[:, 0], own.quaternion[:, 0]
+
+    def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
+        """The waypoint after the one nearest to the wrist."""
+        return tracked_waypoint(scene, current=current)
+
+    def observe(self, scene: Scene) -> tuple[list[Array], ...]:
+        """u-bar^(k) - u for every waypoint."""
+        own, state = scene.goal["trajectory"], scene.state
+        waypoints = in_world(state.object_position, state.object_quaternion, own.position, own.quaternion)
+        return ([flat(wrist_to_joints(state, *waypoints) - state.u[..., None, :])],)
+
+    def reward(self, scene: Scene) -> dict[str, Array]:
+        """r^traj."""
+        active, features = scene.gate("trajectory"), scene.features
+        position, quaternion = tracked_waypoint(scene, current=True)
+        far = jnp.minimum(square(features.wrist_position - position), _FAR**2)
+        turned = jnp.minimum(rotations.angle(features.wrist_quaternion, quaternion), _TURNED)
+        return {"trajectory_position": -active * far, "trajectory_rotation": -active * turned**2}
+
+    def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
+        """Geodesic distance and distance between the wrist and the tracked waypoint."""
+        position, quaternion = tracked_waypoint(scene, current=True)
+        return {
+            "trajectory_rad": rotations.angle(scene.features.wrist_quaternion, quaternion),
+            "trajectory_m": jnp.linalg.norm(scene.features.wrist_position - position, axis=-1),
+        }
+
+    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
+        """It guides the wrist."""
+        return ["The wrist trajectory guides the wrist; the heading follows from its last waypoint."]
+
+
+def last_waypoint(goal: Goal) -> tuple[Array, Array]:
+    """Wrist pose (B, 3), (B, 4) at the end of the trajectory, object frame."""
+    own = goal["trajectory"]
+    return own.position[:, -1], own.quaternion[:, -1]
+
+
+def active_waypoint(wrist_position: Array, waypoints: Array, lookahead: int) -> Array:
+    """(B,) index min(k* + lookahead, K - 1), with k* the waypoint (B, K, 3) nearest to the wrist (B, 3)."""
+    nearest = jnp.argmin(jnp.sum((waypoints - wrist_position[..., None, :]) ** 2, -1), -1)
+    return jnp.minimum(nearest + lookahead, waypoints.shape[-2] - 1)
+
+
+def tracked_waypoint(scene: Scene, *, current: bool) -> tuple[Array, Array]:
+    """World pose (B, 3), (B, 4) of the active waypoint, on the object's current or initial pose."""
+    own = scene.goal["trajectory"]
+    points, turns = in_world(*object_pose(scene, current=current), own.position, own.quaternion)
+    index = active_waypoint(scene.features.wrist_position, points, scene.task.control.lookahead)[..., None, None]
+    return (
+        jnp.take_along_axis(points, index, -2)[..., 0, :],
+        jnp.take_along_axis(turns, index, -2)[..., 0, :],
+    )
+
+
+def _apart_from_pose(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
+    """Distance (m) and turn (rad) between the reference pose's wrist and the trajectory's end."""
+    position, quaternion = last_waypoint(goal)
+    return {
+        "apart": jnp.linalg.norm(goal["pose"].position - position, axis=-1),
+        "twist": rotations.angle(goal["pose"].quaternion, quaternion),
+    }
+
+
+def _pose_message(hand: Hand, apart: Mapping[str, Any]) -> str:
+    return (
+        f"The reference pose holds the wrist {100 * apart['apart']:.1f} cm and {np.degrees(apart['twist']):.0f} "
+        "degrees from where the trajectory ends. The trajectory decides on the wrist; of the pose only the fingers "
+        "count."
+    )
+
+
+def _apart_from_regions(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
+    """Metres from the trajectory's end to either region."""
+    position, _ = last_waypoint(goal)
+    return {
+        "avoid": least_distance(surface.points, surface.minus, position),
+        "graspable": least_distance(surface.points, ~surface.minus, position),
+    }
+
+
+def _affordance_message(hand: Hand, apart: Mapping[str, Any]) -> str:
+    return (
+        f"The trajectory ends {100 * apart['avoid']:.1f} cm from what must not be touched, and "
+        f"{100 * apart['graspable']:.1f} cm from what may be grasped. Neither overrides the other: let it end nearer "
+        "to the graspable part, or leave one out."
+    )
+
+
+def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
+    return {"turn": heading_turn(hand, goal["heading"], last_waypoint(goal)[1])}
+
+
+Trajectory.relations = (
+    Relation(
+        "pose",
+        "overridden",
+        _apart_from_pose,
+        lambda apart: (apart["apart"] > APART) | (apart["twist"] > TWISTED),
+        _pose_message,
+    ),
+    Relation(
+        "affordance",
+        "refused",
+        _apart_from_regions,
+        lambda apart: apart["avoid"] <= apart["graspable"],
+        _affordance_message,
+    ),
+    Relation(
+        "heading",
+        "overridden",
+        _apart_from_heading,
+        lambda apart: apart["turn"] > TURNED,
+        lambda hand, apart: heading_message("trajectory", apart["turn"]),
+    ),
+)

@@ -1,0 +1,30 @@
+"""What an episode's message says about its constraints."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from common.task.constraints import CONSTRAINTS
+
+_OLDER = ("affordance", "pose_finger", "pose_wrist", "trajectory")
+"""Blocks of the `goal/mask` of recordings that name none."""
+
+
+def active_blocks(arrays: Mapping[str, np.ndarray]) -> dict[str, bool]:
+    """Whether each block of the observation was active, by name."""
+    if "goal/mask" in arrays:
+        return dict(zip(_OLDER, (np.asarray(arrays["goal/mask"]) > 0).tolist(), strict=True))
+    found = {name.removeprefix("active/"): value for name, value in arrays.items() if name.startswith("active/")}
+    return {name: bool(np.asarray(value)) for name, value in found.items()}
+
+
+def active_constraints(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """Names of the active constraints, weakest first; the heading always is."""
+    blocks = active_blocks(arrays)
+    return tuple(c.name for c in CONSTRAINTS if not c.optional or any(blocks.get(block) for block in c.blocks))
+
+
+def goal_arrays(arrays: Mapping[str, np.ndarray], constraint: str) -> dict[str, np.ndarray]:
+    """A constraint's goal arrays by field, object frame."""
+    prefix = f"goal/{constraint}_"
+    return {name.removeprefix(prefix): np.asarray(value) for name, value in arrays.items() if name.startswith(prefix)}
