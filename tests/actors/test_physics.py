@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from actors.environment import start
+
+from actors.bank import build_bank
 from actors.physics import resolve_physics
 from actors.physics.engine import World
 from actors.physics.mjx import MjxPhysics
 from actors.physics.native import NativePhysics
 from actors.physics.slots import LEAVES, Pool
-from actors.bank import build_bank
 from common import rotations
 from common.config import TaskConfig
 from common.errors import CongraspError

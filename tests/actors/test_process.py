@@ -6,9 +6,9 @@ import types
 import jax
 import numpy as np
 import pytest
+from actors.environment import EPISODE_FIELDS
 
 from actors import process
-from actors.environment import EPISODE_FIELDS
 from actors.rollout import Rollout, Trace
 from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
 from common.hands import get_hand

@@ -6,17 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from actors.physics.engine import where_worlds
 from actors.references import Grasps, renew
+
 from actors.bank import POSES, build_bank, make_references
+from actors.physics.engine import where_worlds
 from common import rotations
 from common.config import TaskConfig
-from common.task.sampling.closed_poses import Poses
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from common.objects import procedural
+from common.task.sampling.closed_poses import Poses
 
 HAND = get_hand("human")
 TASK = TaskConfig()

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from actors.environment import EPISODE_FIELDS, METRICS
 
 from actors import environment
-from actors.environment import EPISODE_FIELDS, METRICS
+from actors.bank import build_bank
 from actors.physics.engine import Readout, where_worlds
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker, finished_episodes
-from actors.bank import build_bank
 from common import rotations
 from common.config import TaskConfig
 from common.hands import get_hand

@@ -14,7 +14,6 @@ from common.task.constraints.fingers import Fingers
 from common.task.constraints.heading import Heading
 from common.task.constraints.pose import Pose
 from common.task.constraints.trajectory import Trajectory
-
 from common.task.types import Goal
 
 if TYPE_CHECKING:

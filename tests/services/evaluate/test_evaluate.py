@@ -8,8 +8,8 @@ from unittest import mock
 
 import numpy as np
 import pytest
-
 from actors.environment import METRICS
+
 from common.config import NetworkConfig, RunConfig
 from common.errors import CongraspError
 from common.objects import procedural

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 from PIL import Image
+from services.grasp.asked import read_asked
 
 from actors.bank import build_bank
 from common.config import TaskConfig
-from common.task.sampling.headings import Headings, clear_table, feasible
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural, store
+from common.task.sampling.headings import Headings, clear_table, feasible
 from common.wire.codec import Message
 from services.cli.main import load
 from services.grasp import constraint_sets
-from services.grasp.asked import read_asked
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from common.config import TaskConfig
-from common.task.sampling.headings import BACK_OFF, INWARD
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from common.objects import procedural
 from common.objects.shapes import matrix
+from common.task.sampling.headings import BACK_OFF, INWARD
 from services.viz.studio.state import Studio
 
 MUG = procedural.generate(1, "mug")
