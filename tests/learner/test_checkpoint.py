@@ -10,23 +10,24 @@ import numpy as np
 import pytest
 
 from common.errors import CongraspError
-from learner import update as updates
+from learner.algorithms.ppo import PPO
 from learner.checkpoint import Checkpoints
 from services.bench import toy
-from tests.learner.test_update import rollout
+from tests.learner.test_ppo import rollout
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 
 def run_stream(directory: pathlib.Path, first: int, last: int) -> None:
     """Runs updates `first` to `last` - 1 of a fixed stream, from the checkpoint that is there, and leaves one."""
-    state = updates.init_state(3, toy.LAYOUT, 1, toy.SPEC.network, toy.PPO)
+    algorithm = PPO(toy.SPEC, toy.SETTINGS)
+    state = algorithm.init(3)
     checkpoints = Checkpoints(directory)
     if first:
         state, meta = checkpoints.load(state)
         assert meta == {"next": first}
     for seed in range(first, last):
-        state, _ = updates.update(state, rollout(toy.bundle_of(state), seed), toy.LAYOUT, toy.PPO)
+        state, _ = algorithm.update(state, rollout(toy.bundle_of(state), seed))
     checkpoints.save(state, {"next": last}, state.version)
 
 
