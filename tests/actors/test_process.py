@@ -11,6 +11,7 @@ from actors import process
 from actors.environment import EPISODE_FIELDS
 from actors.rollout import Rollout, Trace
 from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
+from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
 from common.policy.bundle import PolicyBundle, policy_spec
@@ -119,6 +120,11 @@ def heard(monkeypatch):
         return batch, {key.split("/")[3]: message for key, message in received if "/actor/" in key}
 
     return run
+
+
+def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
+    with pytest.raises(CongraspError, match=r"do not record: torque\. Start the actor with the version"):
+        process._Actor(CONFIG, ("reward", "torque"), None, None, "native", 1, lambda values: None)
 
 
 def test_steps_in_which_the_physics_left_contacts_out_are_counted():
