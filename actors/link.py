@@ -35,7 +35,7 @@ class RunFinished(CongraspError):
 
 
 class RunInfo(NamedTuple):
-    """What the learner says about its run."""
+    """What an actor must know of a run."""
 
     config: str
     """The run's configuration as JSON text."""
@@ -263,7 +263,7 @@ class ActorLink:
             raise CongraspError("The link is closed.")
 
     def _note(self, meta: Any) -> None:
-        """Takes in what every answer and announcement of the learner says about itself."""
+        """Takes in the learner's state, which comes with every answer and announcement."""
         self._answered = time.monotonic()
         session = self._learner[1]
         self._learner = int(meta["version"]), str(meta["life"])

@@ -53,7 +53,7 @@ def run_actor(
       physics: engine, where it is not to be the run's.
       threads: threads of the `native` engine.
       patience: seconds without a learner after which the actor gives up.
-      on_rollout: given the figures of every rollout, its version among them.
+      on_rollout: given the metrics of every rollout, its version among them.
       keep: see `ActorLink`.
       journal: see `ActorLink`.
 

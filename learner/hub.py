@@ -147,7 +147,7 @@ class LearnerHub:
         return self._staleness.lag(version)
 
     def publish_weights(self, bundle: Message, version: int) -> None:
-        """Makes a policy bundle the latest one, and says so to everyone.
+        """Makes a policy bundle the latest one, and announces it.
 
         Args:
           bundle: a policy bundle of this run and schema.
@@ -340,7 +340,7 @@ class LearnerHub:
         self._event("warning", f"Dropped as too old at version {self._staleness.version}: {len(stale)} of {actors}.")
 
     def _turn_away(self, key: str) -> Message | None:
-        """What an actor over its rate limit is told before its request is decoded; None for all others."""
+        """The answer to an actor over its rate limit, before its request is decoded; None for all others."""
         if self._rate_limit.admits(key):
             return None
         self._event("warning", f"Too many useless requests of {_sender(key)}: turned away.", kind="turned away")

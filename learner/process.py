@@ -77,7 +77,7 @@ def run_learner(
       ranks: the learner's processes, where there are several.
       audit: keep the journal in `audit/`; it needs rollouts on the host, so not where they stay on a device.
       recorder: entered while the learner runs, for example one that writes the run's logs.
-      on_update: given the figures of every update.
+      on_update: given the metrics of every update.
       on_event: given what is worth a line.
 
     Raises:
@@ -273,7 +273,7 @@ class _Learner:
                 silent_since = time.monotonic()
 
     def _update(self) -> tuple[dict[str, float], int]:
-        """An update of all ranks together; its figures and its environment steps."""
+        """One update, which all ranks make; its metrics and its environment steps."""
         messages = self._hub.next_batch(self._config.ppo.rollouts_per_update, 0.0)
         assert messages is not None, "a batch that was there cannot go away"
         mine = summary(messages, self._hub.lag)

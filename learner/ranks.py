@@ -32,7 +32,7 @@ ROUND_SECONDS = 300.0
 """Seconds that an update, or an exchange between ranks that are alive, may take."""
 _SILENCE_SECONDS = 20.0
 _HEARTBEAT_SECONDS = 2.0
-_RELAY_SECONDS = 2.0  # that rank 0 lives on, so that JAX does not abort the others before they have said why
+_RELAY_SECONDS = 2.0  # that rank 0 lives on, so that JAX does not abort the others before they have printed why
 _LENGTH = struct.Struct("!Q")
 _META = "meta"
 
@@ -216,7 +216,7 @@ class Ranks:
         if self.count == 1 or self._leaving.is_set():
             return
         if not isinstance(error, CongraspError) and self._lost.wait(_RELAY_SECONDS):
-            time.sleep(_SILENCE_SECONDS)  # a collective broke because a peer is gone: that is being said right now
+            time.sleep(_SILENCE_SECONDS)  # a collective broke because a peer is gone, which is being reported right now
         self._leaving.set()
         reason = str(error) or type(error).__name__
         for link in self._links.values():
@@ -330,5 +330,5 @@ def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Lin
 
 
 def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> tuple[int, str] | None:
-    """The first rank whose entry says that training is to end, and its reason."""
+    """The first rank whose entry ends training, and its reason."""
     return next(((rank, entry["end"]) for rank, entry in enumerate(entries) if entry and entry.get("end")), None)

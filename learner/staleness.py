@@ -48,13 +48,13 @@ class Counters:
     granted: int = 0
     """Tickets given out."""
     redeemed: int = 0
-    """Tickets whose rollout arrived, whatever was said to it."""
+    """Tickets whose rollout arrived, whatever its outcome."""
     returned: int = 0
     """Tickets given back, by their owner or by its death."""
     expired: int = 0
     """Tickets whose deadline passed."""
     accepted: int = 0
-    """Rollouts taken in; their actors were told so."""
+    """Rollouts taken in and acknowledged."""
     consumed: int = 0
     """Accepted rollouts that were handed to an update."""
     dropped: int = 0
