@@ -30,7 +30,7 @@ from common.policy.normalizer import Affine, Statistics
 from common.task.types import Array
 from common.wire.schema import RECORDED, Schema
 from learner.algorithms import gae, losses
-from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
+from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
 from learner.batch import partition_specs
 from learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
@@ -64,11 +64,7 @@ class PPO:
 
     def init(self, seed: int, initial: Policy | None = None) -> TrainState:
         """The state before the first update."""
-        layout = self._spec.layout
-        if initial is None:
-            params = network.init(seed, layout, self._spec.action_size, self._spec.network)
-            size = sum(width for _, width in layout)
-            initial = Policy(params, normalizer.empty((size,)), normalizer.empty())
+        initial = initial or random_policy(seed, self._spec)
         params = jax.tree.map(jnp.asarray, initial.params)
         return TrainState(
             params,
@@ -104,8 +100,8 @@ class PPO:
                 "Use fewer minibatches, more environments or longer rollouts.",
             )
         arrays = shard({name: batch[name] for name in RECORDED}, mesh, _SPECS)
-        seen = _observed(arrays["observation"], mesh=mesh)
-        frozen = state.observation if state.observation.count else normalizer.merge(*_ranks(unreplicate(seen, mesh)))
+        moments = _observed(arrays["observation"], mesh=mesh)
+        frozen = state.observation if state.observation.count else normalizer.merge(*_ranks(unreplicate(moments, mesh)))
         learnt, returns, failure, scalars = _optimise(
             *shard(state[:_ON_DEVICE], mesh),
             arrays,
@@ -117,8 +113,8 @@ class PPO:
             minibatches=config.minibatches,
             mesh=mesh,
         )
-        learnt, seen, returns, failure, scalars = unreplicate((learnt, seen, returns, failure, scalars), mesh)
-        seen, returns, failure, scalars = jax.device_get((seen, returns, failure, scalars))
+        learnt, moments, returns, failure, scalars = unreplicate((learnt, moments, returns, failure, scalars), mesh)
+        moments, returns, failure, scalars = jax.device_get((moments, returns, failure, scalars))
         state = TrainState(*learnt, *state[_ON_DEVICE:])
         if failure != _FINE:
             source = "rollouts" if _CHECKED[failure] in _CHECKED_INPUTS else "optimisation"
@@ -126,7 +122,7 @@ class PPO:
         value = normalizer.merge(state.value, *_ranks(returns))
         state = state._replace(
             params=_preserve_values(state.params, normalizer.value_affine(state.value), normalizer.value_affine(value)),
-            observation=normalizer.merge(state.observation, *_ranks(seen)),
+            observation=normalizer.merge(state.observation, *_ranks(moments)),
             value=value,
             version=state.version + 1,
             transitions=state.transitions + arrays["reward"].size,
@@ -262,9 +258,9 @@ def _program(
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
     """What `_optimise` compiles, for one rank."""
     params, optimizer, key = learnt
-    seen = _evaluate(params, batch, normalization, returns_normalization, hyper, collectives, layout)
+    evaluation = _evaluate(params, batch, normalization, returns_normalization, hyper, collectives, layout)
     inputs = [batch[name] for name in _CHECKED_INPUTS]
-    failure = collectives.max(_first_failure(jnp.int32(_FINE), 0, *inputs, seen.value))
+    failure = collectives.max(_first_failure(jnp.int32(_FINE), 0, *inputs, evaluation.value))
     key, epochs_key = jax.random.split(key)
     learning_rate = optimizer.hyperparams["learning_rate"]
     params, optimizer, failure, (terms, norms) = _epochs(
@@ -272,7 +268,7 @@ def _program(
         _with(optimizer, max_grad_norm=jnp.float32(hyper["max_grad_norm"])),
         failure,
         jax.random.split(collectives.own_key(epochs_key), epochs),
-        jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), seen.samples),
+        jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), evaluation.samples),
         normalization,
         params["actor"]["log_std"],
         hyper,
@@ -288,29 +284,32 @@ def _program(
         "learning_rate": learning_rate,
         "action_std": jnp.mean(jnp.exp(params["actor"]["log_std"])),
     }
-    metrics |= _batch_metrics(batch, seen, hyper, collectives)
+    metrics |= _batch_metrics(batch, evaluation, hyper, collectives)
     optimizer = _with(optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
-    return (params, optimizer, key), collectives.gather(normalizer.moments(seen.returns)), failure, metrics
+    return (params, optimizer, key), collectives.gather(normalizer.moments(evaluation.returns)), failure, metrics
 
 
 def _batch_metrics(
-    batch: dict[str, Array], seen: _Evaluation, hyper: dict[str, Array], collectives: Collectives
+    batch: dict[str, Array], evaluation: _Evaluation, hyper: dict[str, Array], collectives: Collectives
 ) -> dict[str, Array]:
     """Scalars about a batch and how old its policy is, over all ranks."""
-    residual, total = collectives.variance(seen.returns - seen.value), collectives.variance(seen.returns)
-    truncated = seen.log_weight > jnp.log(hyper["importance_max"])
+    residual, total = (
+        collectives.variance(evaluation.returns - evaluation.value),
+        collectives.variance(evaluation.returns),
+    )
+    truncated = evaluation.log_weight > jnp.log(hyper["importance_max"])
     return {
-        "importance_max": collectives.max(jnp.max(seen.weight)),
+        "importance_max": collectives.max(jnp.max(evaluation.weight)),
         "explained_variance": 1.0 - residual / (total + 1e-8),
-        "advantage_std": seen.advantage_std,
+        "advantage_std": evaluation.advantage_std,
         **collectives.mean(
             {
-                "importance_mean": jnp.mean(seen.weight),
+                "importance_mean": jnp.mean(evaluation.weight),
                 "importance_truncated": jnp.mean(truncated.astype(jnp.float32)),
-                "behaviour_kl": -jnp.mean(seen.log_weight),
+                "behaviour_kl": -jnp.mean(evaluation.log_weight),
                 "reward_mean": jnp.mean(batch["reward"]),
-                "return_mean": jnp.mean(seen.returns),
-                "value_mean": jnp.mean(seen.value),
+                "return_mean": jnp.mean(evaluation.returns),
+                "value_mean": jnp.mean(evaluation.value),
             }
         ),
     }

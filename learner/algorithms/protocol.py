@@ -10,6 +10,8 @@ from typing import Any, NamedTuple, Protocol
 from jax.sharding import Mesh
 
 from common.errors import PhysicsError
+from common.policy import network, normalizer
+from common.policy.bundle import PolicySpec
 from common.policy.network import Params
 from common.policy.normalizer import Statistics
 from common.task.types import Array
@@ -25,6 +27,12 @@ class Policy(NamedTuple):
     """Of observations (D,), on the host; acting normalises by them."""
     value: Statistics
     """Of returns (), on the host."""
+
+
+def random_policy(seed: int, spec: PolicySpec) -> Policy:
+    """Networks with random weights, and normalisers that have seen nothing."""
+    params = network.init(seed, spec.layout, spec.action_size, spec.network)
+    return Policy(params, normalizer.empty((sum(size for _, size in spec.layout),)), normalizer.empty())
 
 
 class TrainState(NamedTuple):

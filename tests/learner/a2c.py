@@ -13,7 +13,7 @@ from common.policy import network, normalizer
 from common.policy.normalizer import Statistics
 from common.wire.schema import RECORDED
 from learner.algorithms import gae
-from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
+from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
 from learner.batch import partition_specs
 from learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
@@ -28,10 +28,7 @@ class A2C:
         self._spec, self._gamma = spec, config.ppo.gamma
 
     def init(self, seed, initial=None):
-        layout = self._spec.layout
-        if initial is None:
-            params = network.init(seed, layout, self._spec.action_size, self._spec.network)
-            initial = Policy(params, normalizer.empty((sum(size for _, size in layout),)), normalizer.empty())
+        initial = initial or random_policy(seed, self._spec)
         optimizer = OPTIMIZER.init(initial.params)
         return TrainState(initial.params, optimizer, jax.random.PRNGKey(seed), initial.observation, initial.value, 0, 0)
 

@@ -107,7 +107,19 @@ checkpoint.Checkpoints(pathlib.Path(sys.argv[1])).save(tree(2.0), {}, 2)
     assert checkpoints.load(tree(0.0))[0]["host"][0] == 1.0
 
 
-def test_no_checkpoint_a_torn_one_and_one_of_another_shape(tmp_path):
+def test_a_checkpoint_of_a_version_with_another_optimiser_is_one_line(tmp_path):
+    """Adam's moments at the top, and the learning rate beside them."""
+    state = PPO(toy.SPEC, toy.SETTINGS).init(0)
+    _, adam = state.optimizer.inner_state
+    before = {**state._asdict(), "optimizer": adam[0], "learning_rate": jnp.float32(1e-3)}
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(before, {}, 1)
+    with pytest.raises(CongraspError, match=r"'optimizer/.*' is missing .*and the version of congrasp, that") as caught:
+        checkpoints.load(state)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_checkpoint_a_damaged_one_and_one_of_another_shape(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     with pytest.raises(CongraspError, match="no checkpoint"):
         checkpoints.load(tree(0.0))
