@@ -11,7 +11,6 @@ statistics and metrics are averaged inside the program, once in each minibatch, 
 so that all of them come to the same weights and statistics, bit for bit.
 """
 
-import dataclasses
 import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -51,6 +50,18 @@ _RATE_FACTOR = 1.5
 Learnt = tuple[Params, Any, Array]
 """Parameters, the optimiser's state and the random key: the entries of a `TrainState` that live on the device."""
 _ON_DEVICE = 3  # entries of a TrainState
+
+
+class _Given(NamedTuple):
+    """What an update learns from, beside the state."""
+
+    batch: dict[str, Array]
+    observations: Affine
+    """Normalisation of observations, frozen."""
+    returns: Affine
+    """Normalisation of returns, frozen."""
+    hyper: dict[str, Any]
+    """The hyperparameters that are arguments of the compiled program; the others are part of it."""
 
 
 class PPO:
@@ -102,12 +113,15 @@ class PPO:
         arrays = shard({name: batch[name] for name in RECORDED}, mesh, _SPECS)
         moments = _observed(arrays["observation"], mesh=mesh)
         frozen = state.observation if state.observation.count else normalizer.merge(*_ranks(unreplicate(moments, mesh)))
-        learnt, returns, failure, scalars = _optimise(
-            *shard(state[:_ON_DEVICE], mesh),
+        given = _Given(
             arrays,
             normalizer.observation_affine(frozen, layout),
             normalizer.value_affine(state.value),
-            _traced(config),
+            {name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)},
+        )
+        learnt, returns, failure, scalars = _optimise(
+            *shard(state[:_ON_DEVICE], mesh),
+            given,
             layout=layout,
             epochs=config.epochs,
             minibatches=config.minibatches,
@@ -128,13 +142,6 @@ class PPO:
             transitions=state.transitions + arrays["reward"].size,
         )
         return state, {name: float(scalar) for name, scalar in scalars.items()}
-
-
-def _traced(config: PPOConfig) -> dict[str, Any]:
-    """The hyperparameters that are arguments of the compiled program; the others are part of it."""
-    return {
-        name: value for name, value in dataclasses.asdict(config).items() if isinstance(value, float | tuple | bool)
-    }
 
 
 @optax.inject_hyperparams
@@ -170,10 +177,7 @@ def _optimise(
     params: Params,
     optimizer: Any,
     key: Array,
-    batch: dict[str, Array],
-    normalization: Affine,
-    returns_normalization: Affine,
-    hyper: dict[str, Array],
+    given: _Given,
     *,
     layout: Layout,
     epochs: int,
@@ -184,8 +188,8 @@ def _optimise(
     program = functools.partial(
         _program, collectives=Collectives(mesh), layout=layout, epochs=epochs, minibatches=minibatches
     )
-    specs = (REPLICATED, _SPECS, *[REPLICATED] * 3)
-    return shard_map(mesh, program, specs)((params, optimizer, key), batch, normalization, returns_normalization, hyper)
+    specs = REPLICATED, _Given._make([_SPECS, *[REPLICATED] * 3])
+    return shard_map(mesh, program, specs)((params, optimizer, key), given)
 
 
 class _Evaluation(NamedTuple):
@@ -204,29 +208,22 @@ class _Evaluation(NamedTuple):
     """() over all ranks."""
 
 
-def _evaluate(
-    params: Params,
-    batch: dict[str, Array],
-    normalization: Affine,
-    returns_normalization: Affine,
-    hyper: dict[str, Array],
-    collectives: Collectives,
-    layout: Layout,
-) -> _Evaluation:
+def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: Layout) -> _Evaluation:
     """Advantages, targets and importance weights, which stay fixed during the update."""
+    batch, hyper = given.batch, given.hyper
     action, behaviour = batch["action"], batch["log_probability"]
     log_std = params["actor"]["log_std"]
-    observation = normalizer.apply(normalization, batch["observation"])
+    observation = normalizer.apply(given.observations, batch["observation"])
     exact, _ = network.policy(params, layout, observation)
     log_exact = network.log_probability(exact, log_std, action)
     weight = losses.importance_weight(log_exact, behaviour, hyper["importance_max"])
     mean, _ = network.policy(params, layout, observation, exact=False)
 
     def values(normalised: Array) -> Array:
-        return network.value(params, layout, normalised) / returns_normalization.scale + returns_normalization.shift
+        return network.value(params, layout, normalised) / given.returns.scale + given.returns.shift
 
     value = values(observation)
-    last_value = values(normalizer.apply(normalization, batch["last_observation"]))
+    last_value = values(normalizer.apply(given.observations, batch["last_observation"]))
     reward = batch["reward"] * hyper["reward_scale"]
     advantage, returns = gae.advantages(
         reward, value, last_value, batch["terminal"], hyper["gamma"], hyper["gae_lambda"]
@@ -239,27 +236,18 @@ def _evaluate(
         mean_proximal=mean,
         weight=jnp.where(hyper["decoupled"], weight, 1.0),
         advantage=(advantage - collectives.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
-        target=(returns - returns_normalization.shift) * returns_normalization.scale,
+        target=(returns - given.returns.shift) * given.returns.scale,
     )
     return _Evaluation(samples, log_exact - behaviour, weight, value, returns, advantage_std)
 
 
 def _program(
-    learnt: Learnt,
-    batch: dict[str, Array],
-    normalization: Affine,
-    returns_normalization: Affine,
-    hyper: dict[str, Array],
-    *,
-    collectives: Collectives,
-    layout: Layout,
-    epochs: int,
-    minibatches: int,
+    learnt: Learnt, given: _Given, *, collectives: Collectives, layout: Layout, epochs: int, minibatches: int
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
     """What `_optimise` compiles, for one rank."""
-    params, optimizer, key = learnt
-    evaluation = _evaluate(params, batch, normalization, returns_normalization, hyper, collectives, layout)
-    inputs = [batch[name] for name in _CHECKED_INPUTS]
+    (params, optimizer, key), hyper = learnt, given.hyper
+    evaluation = _evaluate(params, given, collectives, layout)
+    inputs = [given.batch[name] for name in _CHECKED_INPUTS]
     failure = collectives.max(_first_failure(jnp.int32(_FINE), 0, *inputs, evaluation.value))
     key, epochs_key = jax.random.split(key)
     learning_rate = optimizer.hyperparams["learning_rate"]
@@ -269,9 +257,8 @@ def _program(
         failure,
         jax.random.split(collectives.own_key(epochs_key), epochs),
         jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), evaluation.samples),
-        normalization,
         params["actor"]["log_std"],
-        hyper,
+        given,
         collectives,
         layout,
         minibatches,
@@ -284,30 +271,26 @@ def _program(
         "learning_rate": learning_rate,
         "action_std": jnp.mean(jnp.exp(params["actor"]["log_std"])),
     }
-    metrics |= _batch_metrics(batch, evaluation, hyper, collectives)
+    metrics |= _batch_metrics(given, evaluation, collectives)
     optimizer = _with(optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
     return (params, optimizer, key), collectives.gather(normalizer.moments(evaluation.returns)), failure, metrics
 
 
-def _batch_metrics(
-    batch: dict[str, Array], evaluation: _Evaluation, hyper: dict[str, Array], collectives: Collectives
-) -> dict[str, Array]:
+def _batch_metrics(given: _Given, evaluation: _Evaluation, collectives: Collectives) -> dict[str, Array]:
     """Scalars about a batch and how old its policy is, over all ranks."""
-    residual, total = (
-        collectives.variance(evaluation.returns - evaluation.value),
-        collectives.variance(evaluation.returns),
-    )
-    truncated = evaluation.log_weight > jnp.log(hyper["importance_max"])
+    variance = collectives.variance(evaluation.returns)
+    residual = collectives.variance(evaluation.returns - evaluation.value)
+    truncated = evaluation.log_weight > jnp.log(given.hyper["importance_max"])
     return {
         "importance_max": collectives.max(jnp.max(evaluation.weight)),
-        "explained_variance": 1.0 - residual / (total + 1e-8),
+        "explained_variance": 1.0 - residual / (variance + 1e-8),
         "advantage_std": evaluation.advantage_std,
         **collectives.mean(
             {
                 "importance_mean": jnp.mean(evaluation.weight),
                 "importance_truncated": jnp.mean(truncated.astype(jnp.float32)),
                 "behaviour_kl": -jnp.mean(evaluation.log_weight),
-                "reward_mean": jnp.mean(batch["reward"]),
+                "reward_mean": jnp.mean(given.batch["reward"]),
                 "return_mean": jnp.mean(evaluation.returns),
                 "value_mean": jnp.mean(evaluation.value),
             }
@@ -321,9 +304,8 @@ def _epochs(
     failure: Array,
     keys: Array,
     samples: losses.Sample,
-    normalization: Affine,
     log_std_proximal: Array,
-    hyper: dict[str, Array],
+    given: _Given,
     collectives: Collectives,
     layout: Layout,
     minibatches: int,
@@ -333,7 +315,7 @@ def _epochs(
     The observations of `samples` are not normalised yet.
     """
     count = samples.advantage.shape[0]
-    size = count // minibatches
+    size, hyper = count // minibatches, given.hyper
     coefficients = losses.Coefficients(hyper["clip"], hyper["entropy"], hyper["value_coefficient"])
     gradient = jax.value_and_grad(losses.objective, has_aux=True)
     transform = _optimizer(0.0, 0.0)  # the hyperparameters are those of its state
@@ -341,7 +323,7 @@ def _epochs(
     def step(carry: tuple[Params, Any, Array], rows: Array):
         params, optimizer, failure = carry
         minibatch = jax.tree.map(lambda x: x[rows], samples)
-        minibatch = minibatch._replace(observation=normalizer.apply(normalization, minibatch.observation))
+        minibatch = minibatch._replace(observation=normalizer.apply(given.observations, minibatch.observation))
         (_, terms), gradients = gradient(params, layout, log_std_proximal, minibatch, coefficients)
         terms, gradients = collectives.mean((terms, gradients))
         norms = {name: optax.tree.norm(tree) for name, tree in gradients.items()}
