@@ -3,7 +3,7 @@
 A rollout gets its identity (actor, incarnation, sequence) when it is handed over, and is sent under that identity until
 the learner has answered it, across restarts of the learner (`actors.uploads`). Sending happens in the background, so
 that the next rollout is made meanwhile; at most `window` rollouts are on their way, further ones wait in `upload`. What
-another life of the learner has to be sent again goes before any new ticket is asked for.
+another session of the learner has to be sent again goes before any new ticket is asked for.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from actors.uploads import Outcome, Uploads, despair, pauses
+from actors.uploads import Outcome, Uploads, backoff, check_timeout
 from common.errors import CongraspError, TransportError
 from common.journal import Journal
 from common.transport.base import RefusedError, Transport
@@ -35,14 +35,16 @@ class RunFinished(CongraspError):
 
 
 class RunInfo(NamedTuple):
-    """What the learner says about its run."""
+    """What an actor must know of a run."""
 
     config: str
     """The run's configuration as JSON text."""
-    epoch: str
+    run_id: str
     """Identifies the training."""
     schema: str
     """Policy schema that rollouts must have."""
+    arrays: tuple[str, ...]
+    """Names of the arrays that rollouts must have (`common.wire.schema.RECORDED`)."""
 
 
 class Ticket(NamedTuple):
@@ -79,7 +81,7 @@ class ActorLink:
           max_refusals: rollouts refused in a row after which the link fails.
           request_timeout: seconds that one request may take; a rollout gets more, by its size.
           patience: seconds without any answer after which the link gives the learner up.
-          keep: keep accepted rollouts for a learner's next life; needless where actor and learner die together.
+          keep: keep accepted rollouts for a learner's next session; needless where actor and learner die together.
           journal: where every rollout and each answer to it is written down; it stays the caller's.
         """
         self.keys = Keys(run)
@@ -90,8 +92,8 @@ class ActorLink:
         self._timeout = request_timeout
         self._patience = patience
         self._info: RunInfo | None = None
-        self._learner = (-1, "")  # version and life that the learner showed last
-        self._held_life = ""
+        self._learner = (-1, "")  # version and session that the learner showed last
+        self._held_session = ""
         self._finished = False
         self._answered = time.monotonic()
         self._wanted = secrets.token_hex(8)  # the next ticket's id, kept until it is granted
@@ -116,13 +118,14 @@ class ActorLink:
         threading.Thread(target=self._follow, daemon=True, name="announcements").start()
 
     def config(self, timeout: float) -> RunInfo:
-        """Reads the run's configuration, and follows its epoch from now on.
+        """Reads the run's configuration, and follows this run from now on.
 
         Raises:
           TransportError: the learner did not answer within `timeout` seconds.
         """
         reply = self._ask(self.keys.config, {}, time.monotonic() + timeout)
-        self._info = RunInfo(str(reply.meta["config"]), str(reply.meta["epoch"]), str(reply.meta["schema"]))
+        config, run_id, schema = (str(reply.meta[name]) for name in ("config", "epoch", "schema"))
+        self._info = RunInfo(config, run_id, schema, tuple(reply.meta["arrays"]))
         self._note(reply.meta)
         self._uploads.start_over()
         return self._info
@@ -151,17 +154,17 @@ class ActorLink:
             except RefusedError:
                 raise
             except TransportError as error:
-                despair(self._answered, self._patience, error)
+                check_timeout(self._answered, self._patience, error)
                 return None
             self._note(reply.meta)
             self._check()
             if reply.meta["granted"]:
                 ticket, self._wanted = self._wanted, secrets.token_hex(8)
                 return Ticket(ticket, int(reply.meta["version"]))
-            pause = min(float(reply.meta["retry_after"]), deadline - time.monotonic())
-            if pause <= 0:
+            delay = min(float(reply.meta["retry_after"]), deadline - time.monotonic())
+            if delay <= 0:
                 return None
-            self._news.wait(pause)
+            self._news.wait(delay)
 
     def give_back(self, ticket: Ticket) -> None:
         """Returns a ticket that is not needed; if that fails, it expires."""
@@ -181,10 +184,10 @@ class ActorLink:
           RunRestarted: see there.
         """
         self._check()
-        if newer_than >= 0 and (newer_than, self._held_life) == self._learner:
+        if newer_than >= 0 and (newer_than, self._held_session) == self._learner:
             return None
-        life = self._learner[1]
-        request = Message(meta={"newer_than": newer_than, "life": self._held_life})
+        session = self._learner[1]
+        request = Message(meta={"newer_than": newer_than, "life": self._held_session})
         try:
             reply = self._transport.query(self.keys.weights, request, timeout=self._timeout)
         except TransportError:
@@ -193,10 +196,10 @@ class ActorLink:
             self._note(reply.meta)
             self._check()
             return None
-        if self._info and reply.meta.get("epoch") != self._info.epoch:
-            self._uploads.failure = _restarted(self._info.epoch, reply.meta.get("epoch"))
+        if self._info and reply.meta.get("epoch") != self._info.run_id:
+            self._uploads.failure = _restarted(self._info.run_id, reply.meta.get("epoch"))
         self._check()
-        self._held_life = life
+        self._held_session = session
         return reply
 
     def upload(self, rollout: Message, ticket: Ticket) -> "Future[Outcome]":
@@ -223,7 +226,7 @@ class ActorLink:
             **rollout.meta,
             **self._identity(ticket.id),
             "sequence": next(self._sequence),
-            "epoch": self._info.epoch,
+            "epoch": self._info.run_id,
         }
         arrays = rollout.arrays
         if self._keep:
@@ -260,14 +263,14 @@ class ActorLink:
             raise CongraspError("The link is closed.")
 
     def _note(self, meta: Any) -> None:
-        """Takes in what every answer and announcement of the learner says about itself."""
+        """Takes in the learner's state, which comes with every answer and announcement."""
         self._answered = time.monotonic()
-        life = self._learner[1]
+        session = self._learner[1]
         self._learner = int(meta["version"]), str(meta["life"])
         self._finished = bool(meta["finished"])
-        if self._info and meta["epoch"] != self._info.epoch:
-            self._uploads.failure = _restarted(self._info.epoch, meta["epoch"])
-        if life not in ("", meta["life"]):
+        if self._info and meta["epoch"] != self._info.run_id:
+            self._uploads.failure = _restarted(self._info.run_id, meta["epoch"])
+        if session not in ("", meta["life"]):
             self._uploads.send_again()
         elif meta["version"] >= 0:
             self._uploads.forget(meta["oldest"], meta["saved"])
@@ -285,7 +288,7 @@ class ActorLink:
 
     def _ask(self, key: str, meta: dict[str, Any], deadline: float) -> Message:
         """Asks until there is an answer; a refusal is one."""
-        waits = pauses()
+        delays = backoff()
         while True:
             rest = max(0.05, deadline - time.monotonic())
             try:
@@ -294,7 +297,7 @@ class ActorLink:
                 raise
             except TransportError:
                 rest = deadline - time.monotonic()
-                if rest <= 0 or self._closed.wait(min(next(waits), rest)):
+                if rest <= 0 or self._closed.wait(min(next(delays), rest)):
                     raise
 
     def _write(self, **entry: Any) -> None:
@@ -303,4 +306,4 @@ class ActorLink:
 
 
 def _restarted(before: str, now: Any) -> RunRestarted:
-    return RunRestarted(f"The learner began another training (epoch {now} after {before}).", "The actor starts over.")
+    return RunRestarted(f"The learner began another training (run id {now} after {before}).", "The actor starts over.")

@@ -16,17 +16,16 @@ from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes
 from common.config import PhysicsName, RunConfig, run_config_from_json
+from common.errors import CongraspError
 from common.hands import get_hand
 from common.journal import Journal
 from common.objects.pool import load_pool, sized
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
 from common.task.types import Array, Surface
 from common.transport.base import Transport
-from common.wire.codec import Message
-from services.record.channels import finite
+from common.wire.codec import Message, finite
+from common.wire.schema import RECORDED
 
-ROLLOUT_ARRAYS = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
-"""What a rollout holds of every step, and the observation after the last one."""
 _TICKET_SECONDS = 1.0
 _FLUSH_SECONDS = 2.0
 
@@ -54,7 +53,7 @@ def run_actor(
       physics: engine, where it is not to be the run's.
       threads: threads of the `native` engine.
       patience: seconds without a learner after which the actor gives up.
-      on_rollout: given the figures of every rollout, its version among them.
+      on_rollout: given the metrics of every rollout, its version among them.
       keep: see `ActorLink`.
       journal: see `ActorLink`.
 
@@ -64,8 +63,9 @@ def run_actor(
     while not stop.is_set():
         with ActorLink(transport, run, actor, patience=patience, keep=keep, journal=journal) as link:
             try:
-                config = run_config_from_json(link.config(patience).config)
-                _Actor(config, link, transport, physics or config.physics, threads, on_rollout).act(stop)
+                info = link.config(patience)
+                config = run_config_from_json(info.config)
+                _Actor(config, info.arrays, link, transport, physics or config.physics, threads, on_rollout).act(stop)
                 link.flush(_FLUSH_SECONDS)
                 return
             except RunFinished:
@@ -76,9 +76,9 @@ def run_actor(
 
 
 def first_worlds(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:
-    """The arrays of the first `count` worlds of a rollout, axes (T, B, ...) or, for the last observation, (B, D)."""
+    """The arrays of the first `count` worlds of a rollout."""
     return {
-        name: np.asarray(array[:count] if name == "last_observation" else array[:, :count])
+        name: np.asarray(array[(slice(None),) * RECORDED[name].worlds_axis + (slice(count),)])
         for name, array in arrays.items()
     }
 
@@ -89,13 +89,19 @@ class _Actor:
     def __init__(
         self,
         config: RunConfig,
+        arrays: tuple[str, ...],
         link: ActorLink,
         transport: Transport,
         physics: PhysicsName,
         threads: int,
         on_rollout: Callable[[dict[str, float]], None],
     ):
-        self._config, self._link, self._transport = config, link, transport
+        if unknown := set(arrays) - RECORDED.keys():
+            raise CongraspError(
+                f"The learner's algorithm needs arrays that actors do not record: {', '.join(sorted(unknown))}.",
+                "Start the actor with the version of congrasp that the learner has.",
+            )
+        self._config, self._arrays, self._link, self._transport = config, arrays, link, transport
         self._hand = get_hand(config.task.hand)
         number = zlib.crc32(link.actor.encode())
         self._objects = sized(self._hand, config.task, load_pool(config.objects, number))
@@ -172,7 +178,7 @@ class _Actor:
         started_fresh = before is not None and bool(np.asarray(before.time)[0] == 0)
         rollout = self._worker.collect(bundle.acting, config.rollout_steps)
         steps = config.rollout_steps * config.environments
-        taken = {name: getattr(rollout, name) for name in ROLLOUT_ARRAYS}
+        taken = {name: getattr(rollout, name) for name in self._arrays}
         episodes, left_out = countable(finished_episodes(rollout, config.task))
         arrays = taken | episodes
         if config.task.own_references:

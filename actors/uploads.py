@@ -1,8 +1,8 @@
-"""Rollouts on their way to the learner: each is sent until it has an outcome, and kept for the learner's next life.
+"""Rollouts on their way to the learner: each is sent until it has an outcome, and kept for its next session.
 
 A learner that is killed takes with it what it had accepted since its last checkpoint. So accepted rollouts are kept, a
-few in all: those that are fresh, and those that will be when the learner goes on from that checkpoint. Its next life is
-sent them again; what it has after all is a duplicate to it.
+few in all: those that are fresh, and those that will be when the learner resumes from that checkpoint. Its next session
+is sent them again; what it has after all is a duplicate to it.
 """
 
 import itertools
@@ -19,8 +19,8 @@ from common.transport.base import RefusedError, Transport
 from common.wire.codec import Message
 
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
-"""What became of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""
-_BACKOFF = (0.1, 0.5)  # first and longest pause between two attempts, s
+"""Outcome of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""
+_BACKOFF = (0.1, 0.5)  # first and longest delay between two attempts, s
 _SLOWEST = 100e3  # bytes a second of a link that is waited for
 
 
@@ -43,7 +43,7 @@ class Uploads:
         self,
         transport: Transport,
         key: str,
-        hear: Callable[[Mapping[str, Any]], None],
+        on_reply: Callable[[Mapping[str, Any]], None],
         *,
         window: int,
         max_refusals: int,
@@ -57,18 +57,18 @@ class Uploads:
         Args:
           transport: a connected transport.
           key: what rollouts are sent to.
-          hear: given what every answer says about the learner.
+          on_reply: given the state of the learner that comes with every answer.
           window: rollouts on their way at a time.
           max_refusals: rollouts refused in a row after which nothing more is sent.
           request_timeout: seconds that sending may take, and more by the rollout's size.
           patience: seconds without any answer after which the learner is given up.
-          keep: keep accepted rollouts for a learner's next life.
+          keep: keep accepted rollouts for a learner's next session.
           journal: where each answer is written down.
         """
         self.failure: CongraspError | None = None
         self.free = threading.Semaphore(window)
         self.closed = threading.Event()
-        self._transport, self._key, self._hear = transport, key, hear
+        self._transport, self._key, self._on_reply = transport, key, on_reply
         self._max_refusals, self._timeout, self._patience = max_refusals, request_timeout, patience
         self._keep, self._journal = keep, journal
         self._refusals = 0
@@ -94,7 +94,7 @@ class Uploads:
         return outcome
 
     def send_again(self) -> None:
-        """Sends what is kept to another life of the learner."""
+        """Sends what is kept to another session of the learner."""
         with self._lock:
             for message in self._kept.values():
                 self._owed += 1
@@ -102,7 +102,7 @@ class Uploads:
             self._kept.clear()
 
     def forget(self, oldest: int, saved: tuple[int, int]) -> None:
-        """Keeps no longer what no life of the learner can use: versions before `oldest`, but for those of `saved`."""
+        """Drops what no session of the learner can use: versions before `oldest`, but for those of `saved`."""
         first, last = saved
         with self._lock:
             self._kept = {
@@ -155,9 +155,9 @@ class Uploads:
         damaged = 0
         # To send again what is still on its way would only fill a slow link; a dead one ends the query by itself.
         timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience)
-        waits = pauses()
+        delays = backoff()
         while not self.closed.is_set():
-            pause = next(waits)
+            delay = next(delays)
             try:
                 reply = self._transport.query(self._key, message, timeout=timeout)
             except RefusedError as error:  # it arrived damaged, or the learner failed on it
@@ -166,10 +166,10 @@ class Uploads:
                 if damaged >= self._max_refusals:
                     return self._refused(str(error))
             except TransportError as error:
-                despair(answered, self._patience, error)
+                check_timeout(answered, self._patience, error)
             else:
                 answered = time.monotonic()
-                self._hear(reply.meta)
+                self._on_reply(reply.meta)
                 if self.failure:
                     raise self.failure
                 outcome = reply.meta["outcome"]
@@ -183,9 +183,9 @@ class Uploads:
                         with self._lock:
                             self._kept[message.meta["sequence"]] = Message(message.arrays, message.meta)
                     return outcome
-                waits = pauses()
-                pause = float(reply.meta["retry_after"])
-            self.closed.wait(pause)
+                delays = backoff()
+                delay = float(reply.meta["retry_after"])
+            self.closed.wait(delay)
         raise TransportError("The link was closed before the rollout was acknowledged.")
 
     def _refused(self, why: str) -> Outcome:
@@ -198,8 +198,8 @@ class Uploads:
         return "refused"
 
 
-def despair(answered: float, patience: float, error: TransportError) -> None:
-    """Gives the learner up if its last answer was too long ago.
+def check_timeout(answered: float, patience: float, error: TransportError) -> None:
+    """Raises `TransportError` if the learner's last answer was too long ago.
 
     Args:
       answered: when that was, on the monotonic clock.
@@ -212,7 +212,7 @@ def despair(answered: float, patience: float, error: TransportError) -> None:
         ) from None
 
 
-def pauses() -> "itertools.chain[float]":
+def backoff() -> "itertools.chain[float]":
     """Seconds to wait after the first, second, ... failed attempt."""
     first, longest = _BACKOFF
     growing: Callable[[int], float] = lambda index: min(longest, first * 2**index)  # noqa: E731

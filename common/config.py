@@ -168,7 +168,10 @@ class NetworkConfig:
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """Decoupled PPO (Hilton et al. 2021, arXiv 2110.00641) with adaptive-KL learning rate."""
+    """Decoupled PPO (Hilton et al. 2021, arXiv 2110.00641) with adaptive-KL learning rate.
+
+    The batch (`rollouts_per_update`) and `max_staleness` hold for every algorithm.
+    """
 
     rollouts_per_update: int = 2
     """Rollout messages that one update consumes (the batch)."""
@@ -269,8 +272,10 @@ class RunConfig:
     """The objects."""
     network: NetworkConfig = NetworkConfig()
     """The networks."""
+    algorithm: str = "ppo"
+    """Name of the learner's algorithm."""
     ppo: PPOConfig = PPOConfig()
-    """The learner's algorithm."""
+    """The algorithm's hyperparameters."""
 
 
 def to_json(config: Any) -> str:

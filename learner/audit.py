@@ -1,6 +1,6 @@
 """The learner's journal: which rollouts its updates used, which it dropped, and what a resume undid.
 
-Every life of the learner begins with a line that names the checkpoint's version. What was handed to updates of that
+Every session of the learner begins with a line that names the checkpoint's version. What was handed to updates of that
 version or later ones, before, died with the process: these rollouts are undone, and may come again.
 """
 
@@ -27,14 +27,14 @@ class Used(NamedTuple):
 class AuditLog:
     """Writes the journal of one learner."""
 
-    def __init__(self, run_dir: pathlib.Path, name: str, complain: Callable[[str], None] = lambda text: None):
+    def __init__(self, run_dir: pathlib.Path, name: str, log_error: Callable[[str], None] = lambda text: None):
         """Opens, or goes on with, the journal of the learner called `name`."""
         self._path = journal_path(run_dir, name)
-        self._journal = Journal(self._path, complain)
+        self._journal = Journal(self._path, log_error)
 
-    def begin(self, life: str, epoch: str, version: int, max_staleness: int) -> int:
-        """A life begins from a checkpoint of `version`, or 0; returns how many rollouts the run has lost by undoing."""
-        self._journal.write(life=life, epoch=epoch, version=version, max_staleness=max_staleness)
+    def begin(self, session_id: str, run_id: str, version: int, max_staleness: int) -> int:
+        """A session begins from a checkpoint of `version`, or 0; returns how many rollouts the run lost by undoing."""
+        self._journal.write(life=session_id, epoch=run_id, version=version, max_staleness=max_staleness)
         return len(replay(read_journal(self._path))[1])
 
     def used(self, version: int, lags: Sequence[int], messages: Sequence[Message]) -> None:
@@ -47,7 +47,7 @@ class AuditLog:
         self._journal.write(dropped=list(identities))
 
     def end(self, waiting: Iterable[tuple[str, str, int]]) -> None:
-        """The life ends in order, with these accepted rollouts unused."""
+        """The session ends in order, with these accepted rollouts unused."""
         self._journal.write(end=list(waiting))
         self._journal.close()
 

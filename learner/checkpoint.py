@@ -99,7 +99,7 @@ def flatten(tree: Any) -> dict[str, np.ndarray]:
 
 
 def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
-    """The inverse of `flatten`: a tree like `template`, whose leaves say what becomes of each array.
+    """The inverse of `flatten`: a tree like `template`, whose leaves decide where each array goes.
 
     A JAX array goes to the default device, a NumPy array stays on the host, an integer becomes one.
 
@@ -114,7 +114,7 @@ def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
         if array is None or array.shape != expected.shape or array.dtype != expected.dtype:
             raise CongraspError(
                 f"{source} does not fit this run: '{name}' is missing or of another shape.",
-                "Resume with the configuration that the run was started with.",
+                "Resume with the configuration, and the version of congrasp, that the run was started with.",
             )
         if isinstance(leaf, jax.Array):
             restored.append(jnp.array(array))  # not bound to a device, as after `init`: nothing compiles again

@@ -1,12 +1,12 @@
-"""The learner's end of the link: it takes rollouts in, hands out tickets and weights, and says how things stand.
+"""The learner's end of the link: it takes rollouts in, hands out tickets and weights, and reports the run's status.
 
 A rollout is identified by (actor, incarnation, sequence). It is acknowledged when it is in the queue, and an
 acknowledged one is never taken twice, however often its actor sends it.
 
 What a checkpoint keeps of the hub (`durable`) fits the weights beside it: when training resumes from it, what was
 decided after it is undone with the updates that used it. Actors send what they still have of that again; what does not
-come shows as gaps in their sequences, which the ledger counts as `missing`; so do rollouts that later ones have
-overtaken, until they arrive. All others are in the ledger once: as consumed, dropped, queued or stale.
+come shows as gaps in their sequences, which the counters name `missing`; so do rollouts that later ones have
+overtaken, until they arrive. All others are counted once: as consumed, dropped, queued or stale.
 """
 
 import collections
@@ -22,15 +22,15 @@ from common.transport.keys import Alive, Keys, check_name, parse_alive
 from common.wire.codec import Message, SharedMessage
 from common.wire.messages import TICKET, RolloutForm, RolloutHeader, validate, validate_bundle, validate_rollout
 from learner.audit import AuditLog
-from learner.limits import DAMAGED, Credit, certificate
-from learner.marks import Marks
+from learner.deduplication import Sequences
+from learner.rate_limit import DAMAGED, RateLimit, certificate
 from learner.staleness import Owner, StalenessManager
 
-_INCARNATIONS = 1024  # whose marks are kept
+_INCARNATIONS = 1024  # whose sequences are kept
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
 _EVENT_SECONDS = 1.0  # between two events of one kind
-_RETURN_SECONDS = 1.0  # that actors have after a resume to send again what the last life had accepted
+_RETURN_SECONDS = 1.0  # that actors have after a resume to send again what the last session had accepted
 
 
 class LearnerHub:
@@ -42,7 +42,7 @@ class LearnerHub:
         *,
         run: str,
         config_json: str,
-        epoch: str,
+        run_id: str,
         schema: str,
         form: RolloutForm,
         staleness: StalenessManager,
@@ -58,22 +58,22 @@ class LearnerHub:
           transport: a transport that listens.
           run: name of the run.
           config_json: the run's configuration, for actors that connect.
-          epoch: identifies this training; another one after a start from scratch, the same after a resume.
+          run_id: identifies this training; another one after a start from scratch, the same after a resume.
           schema: policy schema that rollouts must have.
-          form: sizes that all rollouts must have: an actor with others is refused alone.
+          form: arrays and sizes that all rollouts must have: an actor with others is refused alone.
           staleness: admission, at its start.
           queue_limit: rollouts that wait for an update.
           name: the learner's name, for logs.
           durable: what `durable` returned when the checkpoint was written, to go on from it.
           on_event: given level and text of every event, which it must not hold up.
-          audit: keeps what becomes of every rollout.
+          audit: keeps the outcome of every rollout.
 
         Raises:
-          CongraspError: the durable state is of another epoch.
+          CongraspError: the durable state is of another run.
         """
         self.keys = Keys(run)
-        self.epoch = epoch
-        self.life = secrets.token_hex(4)
+        self.run_id = run_id
+        self.session_id = secrets.token_hex(4)
         self._transport = transport
         self._config = config_json
         self._schema = schema
@@ -83,7 +83,7 @@ class LearnerHub:
         self._name, self._on_event = check_name("learner", name), on_event
         self._changed = threading.Condition()
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
-        self._marks: collections.OrderedDict[Owner, Marks] = collections.OrderedDict()
+        self._sequences: collections.OrderedDict[Owner, Sequences] = collections.OrderedDict()
         self._forgotten_missing = 0
         self._bundle: SharedMessage | None = None
         self._alive: set[Alive] = set()
@@ -93,14 +93,14 @@ class LearnerHub:
         self._audit = audit
         self._saved = 0 if durable is None else durable["version"]
         self._held_until = 0.0 if durable is None else float("inf")
-        self._credit = Credit()
+        self._rate_limit = RateLimit()
         if durable is not None:
             self._restore(durable)
         if audit is not None:
-            staleness.note_undone(audit.begin(self.life, epoch, staleness.version, staleness.max_staleness))
+            staleness.note_undone(audit.begin(self.session_id, run_id, staleness.version, staleness.max_staleness))
         transport.serve(self.keys.config, self._on_config)
-        charging, turnstile = self._credit.charging, self._turnstile
-        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, turnstile=turnstile)
+        charging = self._rate_limit.charging
+        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, turnstile=self._turn_away)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
         transport.serve(self.keys.weights, self._on_weights, workers=2, depth=16)
         transport.serve(
@@ -109,10 +109,10 @@ class LearnerHub:
             workers=2,
             depth=8,
             on_damage=self._on_damage,
-            turnstile=turnstile,
+            turnstile=self._turn_away,
         )
         transport.watch_alive(self.keys.everyone, self._on_alive)
-        transport.declare_alive(self.keys.alive("learner", name, self.life))
+        transport.declare_alive(self.keys.alive("learner", name, self.session_id))
 
     def has_batch(self, count: int, timeout: float) -> bool:
         """Whether `next_batch` would find a batch; waits for it for at most `timeout` seconds, and takes nothing."""
@@ -147,15 +147,15 @@ class LearnerHub:
         return self._staleness.lag(version)
 
     def publish_weights(self, bundle: Message, version: int) -> None:
-        """Makes a policy bundle the latest one, and says so to everyone.
+        """Makes a policy bundle the latest one, and announces it.
 
         Args:
-          bundle: a policy bundle of this epoch and schema.
+          bundle: a policy bundle of this run and schema.
           version: its version; one more than the last, except after a resume.
         """
         validate_bundle(bundle, schema=self._schema)
-        if (bundle.meta["version"], bundle.meta["epoch"]) != (version, self.epoch):
-            raise CongraspError(f"The bundle is not version {version} of epoch {self.epoch}.")
+        if (bundle.meta["version"], bundle.meta["epoch"]) != (version, self.run_id):
+            raise CongraspError(f"The bundle is not version {version} of run id {self.run_id}.")
         with self._changed:
             if self._bundle is None and self._held_until:
                 self._held_until = time.monotonic() + _RETURN_SECONDS
@@ -175,17 +175,17 @@ class LearnerHub:
                 self._audit.end((*header.owner, header.sequence) for header, _ in self._queue)
 
     def status(self) -> dict[str, Any]:
-        """How things stand, as JSON: roles, versions, rates and the ledger."""
+        """The run's status as JSON: roles, versions, rates and the counters."""
         with self._changed:
             now = time.monotonic()
             self._forget_arrivals(now)
             span = min(_RATE_SECONDS, max(1.0, now - self._arrivals[0][0])) if self._arrivals else _RATE_SECONDS
-            missing = self._forgotten_missing + sum(marks.missing for marks in self._marks.values())
+            missing = self._forgotten_missing + sum(each.missing for each in self._sequences.values())
             roles: list[dict[str, Any]] = []
             for alive in sorted(self._alive):
-                marks = self._marks.get((alive.id, alive.incarnation)) if alive.role == "actor" else None
-                entry = {"rollouts": marks.rollouts, "version": marks.version} if marks else {}
-                entry |= {"lag": self.lag(marks.version)} if marks and marks.rollouts else {}
+                known = self._sequences.get((alive.id, alive.incarnation)) if alive.role == "actor" else None
+                entry = {"rollouts": known.rollouts, "version": known.version} if known else {}
+                entry |= {"lag": self.lag(known.version)} if known and known.rollouts else {}
                 own = [steps for _, owner, steps in self._arrivals if owner == (alive.id, alive.incarnation)]
                 roles.append({**alive._asdict(), **entry, **(_rates(own, span) if alive.role == "actor" else {})})
             return {
@@ -196,25 +196,26 @@ class LearnerHub:
                 "roles": roles,
                 "rates": _rates([steps for *_, steps in self._arrivals], span),
                 "queue": {"length": len(self._queue), "limit": self._limit},
-                "ledger": self._staleness.ledger() | {"missing": missing, "turned_away": self._credit.turned_away},
+                "ledger": self._staleness.counters()
+                | {"missing": missing, "turned_away": self._rate_limit.turned_away},
             }
 
     def durable(self) -> dict[str, Any]:
         """What a checkpoint must keep of the hub, as JSON; call it between two updates, when no batch is in hand."""
         with self._changed:
             waiting = {(header.owner, header.sequence) for header, _ in self._queue}
-            marks = []
-            for owner, mark in self._marks.items():
+            sequences = []
+            for owner, known in self._sequences.items():
                 queued = {sequence for of, sequence in waiting if of == owner}
-                start = min(queued | {mark.next})
-                decided = set(range(start, mark.next)) | mark.ahead
-                marks.append([*owner, start, sorted(decided - queued), sorted(mark.refused), mark.skipped])
+                start = min(queued | {known.next})
+                decided = set(range(start, known.next)) | known.ahead
+                sequences.append([*owner, start, sorted(decided - queued), sorted(known.refused), known.skipped])
             return {
-                "epoch": self.epoch,
+                "run_id": self.run_id,
                 "version": self._staleness.version,
-                "ledger": self._staleness.durable(),
+                "counters": self._staleness.durable(),
                 "forgotten_missing": self._forgotten_missing,
-                "marks": marks,
+                "sequences": sequences,
             }
 
     def note_saved(self, durable: Mapping[str, Any]) -> None:
@@ -222,22 +223,23 @@ class LearnerHub:
         self._saved = durable["version"]
 
     def _restore(self, durable: Mapping[str, Any]) -> None:
-        if durable["epoch"] != self.epoch:
-            raise CongraspError(f"The checkpoint is of epoch {durable['epoch']}, not {self.epoch}.")
-        self._staleness.restore(durable["ledger"], durable["version"])
+        if durable["run_id"] != self.run_id:
+            raise CongraspError(f"The checkpoint is of run id {durable['run_id']}, not {self.run_id}.")
+        self._staleness.restore(durable["counters"], durable["version"])
         self._forgotten_missing = durable["forgotten_missing"]
-        for actor, incarnation, start, ahead, refused, skipped in durable["marks"]:
-            self._marks[actor, incarnation] = Marks(start, set(ahead), set(refused), skipped)
+        for actor, incarnation, start, ahead, refused, skipped in durable["sequences"]:
+            self._sequences[actor, incarnation] = Sequences(start, set(ahead), set(refused), skipped)
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1
         oldest = self._staleness.oldest
         saved = [self._saved - self._staleness.max_staleness, self._saved + self._staleness.max_staleness]
-        life = {"epoch": self.epoch, "life": self.life, "finished": self._finished}
-        return {"version": version, "oldest": oldest, "saved": saved, **life}
+        session = {"epoch": self.run_id, "life": self.session_id, "finished": self._finished}
+        return {"version": version, "oldest": oldest, "saved": saved, **session}
 
     def _on_config(self, key: str, request: Message) -> Message:
-        return Message(meta={**self._state(), "config": self._config, "schema": self._schema})
+        arrays = list(self._form.arrays)
+        return Message(meta={**self._state(), "config": self._config, "schema": self._schema, "arrays": arrays})
 
     def _on_ticket(self, key: str, request: Message) -> Message:
         validate(request, TICKET)
@@ -254,8 +256,8 @@ class LearnerHub:
 
     def _on_weights(self, key: str, request: Message) -> Message:
         bundle, state = self._bundle, self._state()
-        known = request.meta.get("newer_than"), request.meta.get("life", self.life)
-        if bundle is None or known == (bundle.meta["version"], self.life):
+        known = request.meta.get("newer_than"), request.meta.get("life", self.session_id)
+        if bundle is None or known == (bundle.meta["version"], self.session_id):
             return Message(meta=state)
         return bundle
 
@@ -269,33 +271,33 @@ class LearnerHub:
             self._staleness.refuse_damaged((_sender(key), str(meta.get("incarnation"))), ticket)
             self._event("warning", f"A rollout was refused: {error}", kind="refused")
             return self._answer("refused", why=str(error))
-        if header.epoch != self.epoch:
+        if header.run_id != self.run_id:
             self._staleness.refuse_stale(header.owner, ticket)
-            return self._answer("stale", why=f"It is of epoch {header.epoch}, not {self.epoch}.")
+            return self._answer("stale", why=f"It is of run id {header.run_id}, not {self.run_id}.")
         with self._changed:
             return self._admit(header, ticket, message)
 
     def _admit(self, header: RolloutHeader, ticket: str, message: Message) -> Message:
         if self._bundle is None:
             return self._answer("retry", why="The learner is starting.")
-        marks = self._marks_of(header.owner)
-        if header.sequence in marks.refused:
+        sequences = self._sequences_of(header.owner)
+        if header.sequence in sequences.refused:
             self._staleness.redeem(header.owner, ticket)
             return self._answer("stale", why="It was refused before.")
-        if header.sequence in marks:
+        if header.sequence in sequences:
             self._staleness.refuse_duplicate(header.owner, ticket)
             return self._answer("duplicate")
         if len(self._queue) >= self._limit:
             return self._answer("retry", why=f"{self._limit} rollouts wait already.")
         if self._finished:
             self._staleness.refuse_stale(header.owner, ticket)
-            marks.add(header, accepted=False)
+            sequences.add(header, accepted=False)
             return self._answer("stale", why="The run is finished.")
         returning = time.monotonic() < self._held_until
         verdict = self._staleness.arrive(header.owner, ticket, header.version, beyond_capacity=returning)
         if verdict == "full":
             return self._answer("retry", why="No more rollouts are needed at this version.")
-        marks.add(header, accepted=verdict == "accepted")
+        sequences.add(header, accepted=verdict == "accepted")
         if verdict == "stale":
             why = f"It was made by version {header.version}, and the learner is at {self._staleness.version}."
             self._event("info", f"A rollout of {header.actor} was refused. {why}", kind="stale")
@@ -310,14 +312,14 @@ class LearnerHub:
     def _answer(self, outcome: str, *, why: str = "") -> Message:
         return Message(meta={**self._state(), "outcome": outcome, "why": why, "retry_after": _RETRY_SECONDS})
 
-    def _marks_of(self, owner: Owner) -> Marks:
-        marks = self._marks.setdefault(owner, Marks())
-        self._marks.move_to_end(owner)
-        if len(self._marks) > _INCARNATIONS:
+    def _sequences_of(self, owner: Owner) -> Sequences:
+        sequences = self._sequences.setdefault(owner, Sequences())
+        self._sequences.move_to_end(owner)
+        if len(self._sequences) > _INCARNATIONS:
             # Whoever has many incarnations displaces his own, so that nobody makes the learner forget another's.
-            mine = (of for of in self._marks if of != owner and certificate(of[0]) == certificate(owner[0]))
-            self._forgotten_missing += self._marks.pop(next(mine, next(iter(self._marks)))).missing
-        return marks
+            mine = (of for of in self._sequences if of != owner and certificate(of[0]) == certificate(owner[0]))
+            self._forgotten_missing += self._sequences.pop(next(mine, next(iter(self._sequences)))).missing
+        return sequences
 
     def _forget_arrivals(self, now: float) -> None:
         while self._arrivals and self._arrivals[0][0] < now - _RATE_SECONDS:
@@ -337,15 +339,16 @@ class LearnerHub:
         actors = ", ".join(sorted({header.actor for header in stale}))
         self._event("warning", f"Dropped as too old at version {self._staleness.version}: {len(stale)} of {actors}.")
 
-    def _turnstile(self, key: str) -> Message | None:
-        if self._credit.admits(key):
+    def _turn_away(self, key: str) -> Message | None:
+        """The answer to an actor over its rate limit, before its request is decoded; None for all others."""
+        if self._rate_limit.admits(key):
             return None
         self._event("warning", f"Too many useless requests of {_sender(key)}: turned away.", kind="turned away")
         retry = self._answer("retry", why="Too many of your requests were of no use.")
         return Message(meta={**retry.meta, "granted": False})
 
     def _on_damage(self, key: str, error: CongraspError) -> None:
-        self._credit.charge(key, DAMAGED)
+        self._rate_limit.charge(key, DAMAGED)
         self._staleness.refuse_damaged()
         self._event("warning", f"A damaged message arrived at {key}: {error}", kind="damaged")
 

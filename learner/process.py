@@ -15,33 +15,32 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from common.config import RunConfig, to_json
 from common.errors import CongraspError, PhysicsError, TransportError
 from common.files import write_atomically
 from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle, PolicySpec
+from common.policy.bundle import PolicyBundle
 from common.transport.base import Transport
 from common.transport.keys import Keys
-from common.wire.codec import Message, encode
-from common.wire.messages import RolloutForm
-from learner import update as updates
+from common.wire.codec import Message, encode, finite
+from common.wire.schema import RolloutForm
+from learner.algorithms import make_algorithm
+from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
 from learner.audit import AuditLog
+from learner.batch import collate
 from learner.checkpoint import Checkpoints, checksum, flatten, restore
 from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
 from learner.ranks import Ranks, ended_by
 from learner.run_directory import CONFIG_FILE, INITIAL_FILE, POLICY_FILE, note_version, open_run, published_version
-from learner.staleness import Ledger, StalenessManager
+from learner.staleness import Counters, StalenessManager
 from learner.statistics import Pace, overall, summary
-from learner.update import NonFiniteUpdate, TrainState
-from services.record.channels import finite
 
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0
-_FAREWELL_SECONDS = 3.0
-_LEDGERS = "ledgers and marks of ranks that are gone are dropped, new ones begin with none"
+_SHUTDOWN_SECONDS = 3.0
+_COUNTERS = "counters and sequences of ranks that are gone are dropped, new ones begin with none"
 
 Notify = Callable[[str, str], None]
 """(level, text) of an event."""
@@ -78,7 +77,7 @@ def run_learner(
       ranks: the learner's processes, where there are several.
       audit: keep the journal in `audit/`; it needs rollouts on the host, so not where they stay on a device.
       recorder: entered while the learner runs, for example one that writes the run's logs.
-      on_update: given the figures of every update.
+      on_update: given the metrics of every update.
       on_event: given what is worth a line.
 
     Raises:
@@ -136,22 +135,24 @@ class _Learner:
         self._run_dir, self._config, self._transport, self._ranks = run_dir, config, transport, ranks
         self._keys = Keys(config.name)
 
-        def tell(level: str, text: str) -> None:
+        def notify(level: str, text: str) -> None:
             with contextlib.suppress(OSError):  # standard output may be on a disk that is full
                 on_event(level, text)
 
-        self._on_event = tell
-        self._spec: PolicySpec = bundles.policy_spec(config.task, config.network)
+        self._on_event = notify
+        self._spec = bundles.policy_spec(config.task, config.network)
+        self._algorithm = make_algorithm(self._spec, config)
+        self._form = RolloutForm(
+            config.rollout_steps,
+            config.environments,
+            sum(size for _, size in self._spec.layout),
+            self._spec.action_size,
+            config.half_observations,
+            self._algorithm.batch_schema,
+        )
         self._checkpoints = Checkpoints(run_dir / "checkpoints")
-        state = updates.init_state(config.seed, self._spec.layout, self._spec.action_size, config.network, config.ppo)
-        meta: dict[str, Any] = {"epoch": secrets.token_hex(8), "skipped": 0, "hubs": []}
-        if ranks.rank == 0:
-            state, meta = self._begin(state, meta, resume)
-        if ranks.count > 1:
-            message = ranks.exchange(meta, flatten(state) if ranks.rank == 0 else None)
-            state, meta = restore(message.arrays, state, "The state of rank 0"), message.meta["entries"][0]
-        self._state: TrainState = state
-        self._epoch, self._skipped, hubs = meta["epoch"], meta["skipped"], meta["hubs"]
+        self._state, meta = self._first_state(resume)
+        self._run_id, self._skipped, hubs = meta["run_id"], meta["skipped"], meta["hubs"]
         if ranks.count > 1:
             # Before there is a hub, and so before an actor in this process captures its engine's graphs.
             self._warm_up()
@@ -159,34 +160,36 @@ class _Learner:
             transport,
             run=config.name,
             config_json=to_json(config),
-            epoch=self._epoch,
+            run_id=self._run_id,
             schema=self._spec.schema,
-            form=RolloutForm(
-                config.rollout_steps,
-                config.environments,
-                sum(size for _, size in self._spec.layout),
-                self._spec.action_size,
-                config.half_observations,
-            ),
+            form=self._form,
             staleness=StalenessManager(config.ppo.max_staleness, config.ppo.rollouts_per_update),
             name=str(ranks.rank),
             durable=_durable(hubs, ranks.rank),
-            on_event=tell,
+            on_event=notify,
             audit=AuditLog(run_dir, str(ranks.rank), lambda text: self._event("error", text)) if audit else None,
         )
         if hubs and len(hubs) != ranks.count:
-            self._event("warning", f"The checkpoint is of {len(hubs)} rank(s), this run has {ranks.count}: {_LEDGERS}.")
+            self._event(
+                "warning", f"The checkpoint is of {len(hubs)} rank(s), this run has {ranks.count}: {_COUNTERS}."
+            )
 
-    def _begin(self, state: TrainState, meta: dict[str, Any], resume: bool) -> tuple[TrainState, dict[str, Any]]:
-        """The first state and what belongs to it: of a checkpoint, of a given policy, or as it is."""
-        if resume:
+    def _first_state(self, resume: bool) -> tuple[TrainState, dict[str, Any]]:
+        """The state to go on from and a checkpoint's meta data, rank 0's for all ranks."""
+        ranks, config = self._ranks, self._config
+        initial = None
+        if ranks.rank == 0 and not resume and (self._run_dir / INITIAL_FILE).exists():
+            given = bundles.load(self._run_dir / INITIAL_FILE)
+            initial = Policy(given.params, given.observation, given.value)
+        state = self._algorithm.init(config.seed, initial)
+        meta: dict[str, Any] = {"run_id": secrets.token_hex(8), "skipped": 0, "hubs": []}
+        if ranks.rank == 0 and resume:
             state, meta = self._checkpoints.load(state)
             meta = {**meta, "skipped": self._skip_lost_versions(state.version + meta["skipped"]) + meta["skipped"]}
-            write_atomically(self._run_dir / CONFIG_FILE, to_json(self._config).encode())
-        elif (self._run_dir / INITIAL_FILE).exists():
-            initial = bundles.load(self._run_dir / INITIAL_FILE)
-            params = jax.tree.map(jnp.asarray, initial.params)
-            state = state._replace(params=params, observation=initial.observation, value=initial.value)
+            write_atomically(self._run_dir / CONFIG_FILE, to_json(config).encode())
+        if ranks.count > 1:
+            message = ranks.exchange(meta, flatten(state) if ranks.rank == 0 else None)
+            state, meta = restore(message.arrays, state, "The state of rank 0"), message.meta["entries"][0]
         return state, meta
 
     def close(self) -> None:
@@ -200,17 +203,8 @@ class _Learner:
 
     def bundle(self) -> PolicyBundle:
         """The newest policy."""
-        state = self._state
-        return PolicyBundle(
-            self._spec,
-            self._config.task,
-            state.params,
-            state.observation,
-            state.value,
-            self.version,
-            self._epoch,
-            state.transitions,
-        )
+        policy = self._algorithm.policy(self._state)
+        return PolicyBundle(self._spec, self._config.task, *policy, self.version, self._run_id, self._state.transitions)
 
     def train(self, stop: threading.Event, deaths: list[str], on_update: Callable[[dict[str, float]], None]) -> None:
         """Updates until the end, a stop, or a thread's death; leaves a checkpoint behind in each case."""
@@ -248,7 +242,7 @@ class _Learner:
             self._save()
         if end is None:
             self._event("info", f"The run is complete after {self._state.version} updates.")
-            self._say_goodbye()
+            self._shut_actors_down()
         self._ranks.close()
         if deaths:
             raise CongraspError(f"The learner stopped: {deaths[0]}.", "A checkpoint was written; use --resume.")
@@ -279,16 +273,14 @@ class _Learner:
                 silent_since = time.monotonic()
 
     def _update(self) -> tuple[dict[str, float], int]:
-        """An update of all ranks together; its figures and its environment steps."""
+        """One update, which all ranks make; its metrics and its environment steps."""
         messages = self._hub.next_batch(self._config.ppo.rollouts_per_update, 0.0)
         assert messages is not None, "a batch that was there cannot go away"
         mine = summary(messages, self._hub.lag)
-        batch = updates.collate([message.arrays for message in messages])
+        batch = collate([message.arrays for message in messages], self._form.arrays)
         try:
-            with self._ranks.together():
-                self._state, metrics = updates.update(
-                    self._state, batch, self._spec.layout, self._config.ppo, self._ranks.mesh
-                )
+            with self._ranks.watchdog():
+                self._state, metrics = self._algorithm.update(self._state, batch, self._ranks.mesh)
         except NonFiniteUpdate as error:
             self._ranks.close()
             folder, number = self._run_dir / "failure", f"-{self._ranks.rank}" if self._ranks.count > 1 else ""
@@ -311,7 +303,7 @@ class _Learner:
         self._hub.publish_weights(self.bundle().to_message(), self.version)
         if self._ranks.rank:
             return
-        meta = {"version": self.version, "epoch": self._epoch, "schema": self._spec.schema}
+        meta = {"version": self.version, "epoch": self._run_id, "schema": self._spec.schema}
         self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
 
     def _skip_lost_versions(self, version: int) -> int:
@@ -324,21 +316,10 @@ class _Learner:
 
     def _warm_up(self) -> None:
         """Compiles the update while the actors make the first rollouts."""
-        config, spec = self._config, self._spec
-        steps, worlds = config.rollout_steps, config.environments * config.ppo.rollouts_per_update
-        size = sum(width for _, width in spec.layout)
-        dtype = np.float16 if config.half_observations else np.float32
-        batch = {
-            "observation": np.zeros((steps, worlds, size), dtype),
-            "last_observation": np.zeros((worlds, size), dtype),
-            "action": np.zeros((steps, worlds, spec.action_size), np.float32),
-            "log_probability": np.zeros((steps, worlds), np.float32),
-            "reward": np.zeros((steps, worlds), np.float32),
-            "terminal": np.zeros((steps, worlds), bool),
-        }
+        batch = self._form.zeros(self._config.ppo.rollouts_per_update)
         copy = self._state._replace(optimizer=jax.tree.map(jnp.copy, self._state.optimizer))
-        with self._ranks.together():
-            updates.update(copy, batch, spec.layout, config.ppo, self._ranks.mesh)
+        with self._ranks.watchdog():
+            self._algorithm.update(copy, batch, self._ranks.mesh)
 
     def _save(self) -> None:
         """A checkpoint, which rank 0 writes; all ranks call this, and their replicas are compared."""
@@ -352,7 +333,7 @@ class _Learner:
             )
         failure = ""
         if self._ranks.rank == 0:
-            meta = {"epoch": self._epoch, "skipped": self._skipped, "hubs": [entry["hub"] for entry in everyone]}
+            meta = {"run_id": self._run_id, "skipped": self._skipped, "hubs": [entry["hub"] for entry in everyone]}
             try:
                 self._checkpoints.save(self._state, meta, self._state.version)
                 bundles.save(self.bundle(), self._run_dir / POLICY_FILE)
@@ -373,10 +354,10 @@ class _Learner:
             return False
         return True
 
-    def _say_goodbye(self) -> None:
-        """Sends the actors home, and gives them a moment to hear it."""
+    def _shut_actors_down(self) -> None:
+        """Tells the actors that the run is finished, and waits some seconds for them to leave."""
         self._hub.finish()
-        deadline = time.monotonic() + _FAREWELL_SECONDS
+        deadline = time.monotonic() + _SHUTDOWN_SECONDS
         while time.monotonic() < deadline and any(who["role"] == "actor" for who in self._hub.status()["roles"]):
             time.sleep(_POLL_SECONDS / 4)
 
@@ -393,4 +374,4 @@ def _durable(hubs: list[dict[str, Any]], rank: int) -> dict[str, Any] | None:
     """What a checkpoint kept of this rank's hub; that of one that it does not know begins anew at its version."""
     if not hubs or rank < len(hubs):
         return hubs[rank] if hubs else None
-    return {**hubs[0], "ledger": dataclasses.asdict(Ledger()), "forgotten_missing": 0, "marks": []}
+    return {**hubs[0], "counters": dataclasses.asdict(Counters()), "forgotten_missing": 0, "sequences": []}

@@ -1,8 +1,8 @@
 """Several learner processes, the ranks of one run: who is there, what they agree on, and the devices they share.
 
-Arrays are reduced by XLA (`learner.across`) between one device of each rank. Beside that the ranks talk over plain TCP
-with rank 0 in the middle: an update begins when all of them have a batch, they end together, they see each other's
-figures, and a rank that dies or falls silent ends the others with one line, also those that sit in a collective.
+Arrays are reduced by XLA (`learner.collectives`) between one device of each rank. Beside that the ranks talk over plain
+TCP with rank 0 in the middle: an update begins when all of them have a batch, they end together, they see each other's
+metrics, and a rank that dies or falls silent ends the others with one line, also those that sit in a collective.
 The two ports of the coordinator have no authentication, as JAX's own has none: keep them inside the cluster.
 """
 
@@ -24,7 +24,7 @@ from jax.sharding import Mesh
 
 from common.errors import CongraspError, TransportError
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
-from learner.across import AXIS
+from learner.collectives import AXIS
 
 JOIN_SECONDS = 300.0
 """Seconds within which all ranks must have come."""
@@ -32,13 +32,13 @@ ROUND_SECONDS = 300.0
 """Seconds that an update, or an exchange between ranks that are alive, may take."""
 _SILENCE_SECONDS = 20.0
 _HEARTBEAT_SECONDS = 2.0
-_RELAY_SECONDS = 2.0  # that rank 0 lives on, so that JAX does not abort the others before they have said why
+_RELAY_SECONDS = 2.0  # that rank 0 lives on, so that JAX does not abort the others before they have printed why
 _LENGTH = struct.Struct("!Q")
 _META = "meta"
 
 
 def end_process(text: str, code: int = TransportError.exit_code) -> NoReturn:
-    """Says why in one line and ends the process at once.
+    """Prints the reason in one line and ends the process at once.
 
     Its main thread may wait for a rank that will never come, and so would JAX at an orderly exit, only to abort then.
     """
@@ -91,7 +91,7 @@ class Ranks:
     Attributes:
       rank: number of this process.
       count: number of ranks.
-      mesh: a device of every rank along `learner.across.AXIS`; None if this process is alone.
+      mesh: a device of every rank along `learner.collectives.AXIS`; None if this process is alone.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Ranks:
         self._round = self._deciding = 0
         self._entries: dict[int, Message] = {}
         self._decisions: collections.deque[Message] = collections.deque()
-        self._parting = threading.Event()
+        self._leaving = threading.Event()
         self._lost = threading.Event()
         for peer, link in self._links.items():
             threading.Thread(target=self._listen, args=(peer, link), daemon=True, name=f"rank-{peer}").start()
@@ -125,7 +125,7 @@ class Ranks:
           rank: number of this process.
           count: number of ranks.
           coordinator: `host:port` of rank 0, which listens there (JAX) and at the next port (the ranks).
-          on_lost: told in words when another rank is lost; it should not return.
+          on_lost: given the reason when another rank is lost; it should not return.
 
         Raises:
           CongraspError: the numbers or the address make no sense, or the port is in use.
@@ -189,8 +189,8 @@ class Ranks:
         return decision
 
     @contextlib.contextmanager
-    def together(self) -> Iterator[None]:
-        """Around what all ranks compute together: it may wait inside a collective, but not for ever."""
+    def watchdog(self) -> Iterator[None]:
+        """A deadline around code with collectives, which would wait for ever for a rank that does not come."""
         if self.count == 1:
             yield
             return
@@ -204,20 +204,20 @@ class Ranks:
             timer.cancel()
 
     def close(self) -> None:
-        """Parts in peace: all ranks call this, and from then on none misses another."""
-        if self.count == 1 or self._parting.is_set():
+        """Leaves the run cleanly: all ranks call this, and from then on the end of another rank is no failure."""
+        if self.count == 1 or self._leaving.is_set():
             return
         self.exchange({"bye": True})
-        self._parting.set()
+        self._leaving.set()
         jax.distributed.shutdown()
 
     def fail(self, error: BaseException) -> None:
-        """Tells the others why this rank ends, unless all part in peace or the cause is another rank's end."""
-        if self.count == 1 or self._parting.is_set():
+        """Tells the others why this rank ends, unless all leave cleanly or the cause is another rank's end."""
+        if self.count == 1 or self._leaving.is_set():
             return
         if not isinstance(error, CongraspError) and self._lost.wait(_RELAY_SECONDS):
-            time.sleep(_SILENCE_SECONDS)  # a collective broke because a peer is gone: that is being said right now
-        self._parting.set()
+            time.sleep(_SILENCE_SECONDS)  # a collective broke because a peer is gone, which is being reported right now
+        self._leaving.set()
         reason = str(error) or type(error).__name__
         for link in self._links.values():
             with contextlib.suppress(OSError):
@@ -244,7 +244,7 @@ class Ranks:
     def _decide(self, decision: Message) -> None:
         with self._changed:
             if all(entry and entry.get("bye") for entry in decision.meta["entries"]):
-                self._parting.set()
+                self._leaving.set()
             self._decisions.append(decision)
             self._changed.notify_all()
 
@@ -265,7 +265,7 @@ class Ranks:
             self._lose(f"Rank {peer} ended", peer)
 
     def _lose(self, what: str, peer: int) -> None:
-        if self._parting.is_set() or self._lost.is_set():
+        if self._leaving.is_set() or self._lost.is_set():
             return
         self._lost.set()
         others = [link for number, link in self._links.items() if number != peer]
@@ -277,7 +277,7 @@ class Ranks:
         self._on_lost(f"{what.rstrip('.')}. Rank {self.rank} cannot go on alone: start all ranks with --resume.")
 
     def _beat(self) -> None:
-        while not self._parting.wait(_HEARTBEAT_SECONDS):
+        while not self._leaving.wait(_HEARTBEAT_SECONDS):
             for link in self._links.values():
                 with contextlib.suppress(OSError):
                     link.send(Message())
@@ -330,5 +330,5 @@ def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Lin
 
 
 def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> tuple[int, str] | None:
-    """The first rank whose entry says that training is to end, and its reason."""
+    """The first rank whose entry ends training, and its reason."""
     return next(((rank, entry["end"]) for rank, entry in enumerate(entries) if entry and entry.get("end")), None)

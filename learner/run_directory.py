@@ -1,7 +1,7 @@
 """The directory of a run.
 
 It holds `config.json`, `initial.safetensors` where training does not begin with random weights, `checkpoints/`,
-`policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (what became of every rollout), `version` (the
+`policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `version` (the
 newest version that was ever published, so that versions rise over a crash, too) and, after an update that was not
 finite, `failure/`.
 """

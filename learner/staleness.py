@@ -39,8 +39,8 @@ class Ticket(NamedTuple):
 
 
 @dataclasses.dataclass
-class Ledger:
-    """What became of tickets and rollouts.
+class Counters:
+    """Outcomes of tickets and rollouts.
 
     Always `granted = running + redeemed + returned + expired` and `accepted = consumed + dropped + queued`.
     """
@@ -48,13 +48,13 @@ class Ledger:
     granted: int = 0
     """Tickets given out."""
     redeemed: int = 0
-    """Tickets whose rollout arrived, whatever was said to it."""
+    """Tickets whose rollout arrived, whatever its outcome."""
     returned: int = 0
     """Tickets given back, by their owner or by its death."""
     expired: int = 0
     """Tickets whose deadline passed."""
     accepted: int = 0
-    """Rollouts taken in; their actors were told so."""
+    """Rollouts taken in and acknowledged."""
     consumed: int = 0
     """Accepted rollouts that were handed to an update."""
     dropped: int = 0
@@ -70,7 +70,7 @@ class Ledger:
 
 
 class StalenessManager:
-    """Tickets and the ledger; knows neither messages nor a transport. Safe to call from several threads."""
+    """Tickets and the counters; knows neither messages nor a transport. Safe to call from several threads."""
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class StalenessManager:
         self._in_update = 0
         # Where the last resume began: the version of the checkpoint, and the one that its policy got instead.
         self._resumed: tuple[int, int | None] = 0, 0
-        self._ledger = Ledger()
+        self._counters = Counters()
 
     @property
     def version(self) -> int:
@@ -135,7 +135,7 @@ class StalenessManager:
     @property
     def queued(self) -> int:
         """Accepted rollouts that wait for an update."""
-        return self._ledger.accepted - self._ledger.consumed - self._ledger.dropped
+        return self._counters.accepted - self._counters.consumed - self._counters.dropped
 
     @property
     def capacity(self) -> int:
@@ -156,14 +156,14 @@ class StalenessManager:
                 return None
             ticket = Ticket(owner, ticket_id, self._version, self._clock() + self._seconds)
             self._tickets[owner, ticket_id] = ticket
-            self._ledger.granted += 1
+            self._counters.granted += 1
             return ticket
 
     def give_back(self, owner: Owner, ticket_id: str) -> None:
         """Ends a ticket that its owner does not need; an unknown one is ignored."""
         with self._lock:
             if self._tickets.pop((owner, ticket_id), None):
-                self._ledger.returned += 1
+                self._counters.returned += 1
 
     def forget(self, owner: Owner) -> int:
         """Ends all tickets of an owner that died; returns their number."""
@@ -171,7 +171,7 @@ class StalenessManager:
             mine = [key for key in self._tickets if key[0] == owner]
             for key in mine:
                 del self._tickets[key]
-            self._ledger.returned += len(mine)
+            self._counters.returned += len(mine)
             return len(mine)
 
     def arrive(self, owner: Owner, ticket_id: str, version: int, *, beyond_capacity: bool = False) -> Verdict:
@@ -194,33 +194,33 @@ class StalenessManager:
             if (owner, ticket_id) not in self._tickets and self.capacity <= 0 and not beyond_capacity:
                 return "full"
             self.redeem(owner, ticket_id)
-            self._ledger.accepted += 1
+            self._counters.accepted += 1
             return "accepted"
 
     def redeem(self, owner: Owner, ticket_id: str) -> None:
         """Ends the ticket of a rollout that was answered; an unknown one is ignored."""
         with self._lock:
             if self._tickets.pop((owner, ticket_id), None):
-                self._ledger.redeemed += 1
+                self._counters.redeemed += 1
 
     def refuse_stale(self, owner: Owner, ticket_id: str) -> None:
         """Notes a rollout that is too old, or that another training made."""
         with self._lock:
             self.redeem(owner, ticket_id)
-            self._ledger.stale += 1
+            self._counters.stale += 1
 
     def refuse_duplicate(self, owner: Owner, ticket_id: str) -> None:
         """Notes that an accepted rollout came again."""
         with self._lock:
             self.redeem(owner, ticket_id)
-            self._ledger.duplicate += 1
+            self._counters.duplicate += 1
 
     def refuse_damaged(self, owner: Owner | None = None, ticket_id: str = "") -> None:
         """Notes a message that is no valid rollout."""
         with self._lock:
             if owner is not None:
                 self.redeem(owner, ticket_id)
-            self._ledger.damaged += 1
+            self._counters.damaged += 1
 
     def lag(self, version: int) -> int:
         """Updates between the policy of a version and the current one."""
@@ -237,9 +237,9 @@ class StalenessManager:
         """Hands an accepted rollout to the coming update; False if it has grown too old, and is dropped."""
         with self._lock:
             if self.is_stale(version):
-                self._ledger.dropped += 1
+                self._counters.dropped += 1
                 return False
-            self._ledger.consumed += 1
+            self._counters.consumed += 1
             self._in_update += 1
             return True
 
@@ -251,27 +251,27 @@ class StalenessManager:
             self._version = version
             self._in_update = 0
 
-    def ledger(self) -> dict[str, int]:
+    def counters(self) -> dict[str, int]:
         """All counts, with the tickets that run, the rollouts that wait and the capacity now."""
         with self._lock:
             self._expire()
             gauges = {"running": len(self._tickets), "queued": self.queued, "capacity": self.capacity}
-            return dataclasses.asdict(self._ledger) | gauges
+            return dataclasses.asdict(self._counters) | gauges
 
     def durable(self) -> dict[str, int]:
         """What a checkpoint keeps: the counts without what is under way, which dies with the process."""
         with self._lock:
             self._expire()
-            counts = dataclasses.asdict(self._ledger)
+            counts = dataclasses.asdict(self._counters)
             return counts | {
-                "granted": self._ledger.granted - len(self._tickets),
+                "granted": self._counters.granted - len(self._tickets),
                 "accepted": counts["accepted"] - self.queued,
             }
 
     def restore(self, durable: Mapping[str, int], version: int) -> None:
         """Goes on from a checkpoint: its counts and its version, with nothing under way; `publish` renames it."""
         with self._lock:
-            self._ledger = Ledger(**durable)
+            self._counters = Counters(**durable)
             self._tickets.clear()
             self._version, self._in_update = version, 0
             self._resumed = version, None
@@ -279,11 +279,11 @@ class StalenessManager:
     def note_undone(self, count: int) -> None:
         """Notes how many rollouts the run has lost with updates that died with a killed learner."""
         with self._lock:
-            self._ledger.undone = count
+            self._counters.undone = count
 
     def _expire(self) -> None:
         now = self._clock()
         late = [key for key, ticket in self._tickets.items() if ticket.deadline <= now]
         for key in late:
             del self._tickets[key]
-        self._ledger.expired += len(late)
+        self._counters.expired += len(late)

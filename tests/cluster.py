@@ -26,7 +26,7 @@ from common.transport.keys import FLOWS, Keys
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
-from common.wire.messages import RolloutForm
+from common.wire.schema import RolloutForm
 from learner.audit import AuditLog
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
@@ -48,15 +48,11 @@ def bundle(version, epoch):
 
 
 def rollout(steps, value, version):
-    """All values are the same, so that a torn one shows."""
-    arrays = {
-        "observation": np.full((steps, B, D), value, np.float16),
-        "action": np.full((steps, B, A), value, np.float32),
-        "log_probability": np.full((steps, B), value, np.float32),
-        "reward": np.full((steps, B), value, np.float32),
-        "terminal": np.zeros((steps, B), bool),
-        "last_observation": np.full((B, D), value, np.float16),
-    }
+    """All values are the same, so that a corrupted one shows."""
+    arrays = RolloutForm(steps, B, D, A, half=True).zeros()
+    for name, array in arrays.items():
+        if name != "terminal":
+            array.fill(value)
     return Message(arrays, {"version": version, "schema": "s", "steps": steps * B})
 
 
@@ -75,7 +71,7 @@ def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0):
     signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
     with ZenohTransport(listen=[endpoint], max_message=LIMIT) as transport:
         hub = LearnerHub(
-            transport, run="chaos", config_json="{}", epoch=epoch, schema="s",
+            transport, run="chaos", config_json="{}", run_id=epoch, schema="s",
             form=RolloutForm(steps, B, D, A, half=True), staleness=StalenessManager(1, BATCH),
             durable=saved["durable"], audit=AuditLog(folder, "0"),
         )  # fmt: skip
@@ -126,7 +122,7 @@ def run_actor(folder, endpoint, *, name, steps=T, pause=0.0):
                 try:
                     work(link, steps, pause, made, log)
                 except RunRestarted:
-                    log.write(json.dumps({"restarted": link.config(20).epoch}) + "\n")
+                    log.write(json.dumps({"restarted": link.config(20).run_id}) + "\n")
         link.flush(5)
 
 

@@ -1,25 +1,26 @@
-"""Small valid rollouts for tests of the wire."""
+"""Small valid messages for tests of the wire."""
 
 import numpy as np
 
 from common.wire.codec import Message
+from common.wire.schema import RolloutForm
 
 OBSERVATION, ACTION, SCHEMA = 7, 3, "schema"
+FORM = RolloutForm(steps=4, worlds=2, observation=OBSERVATION, action=ACTION, half=True)
+
+
+def random_arrays(form: RolloutForm, seed: int = 0) -> dict[str, np.ndarray]:
+    """The arrays of a rollout with normal values; no episode ends."""
+    rng = np.random.default_rng(seed)
+    return {
+        name: zeros if zeros.dtype == bool else rng.normal(size=zeros.shape).astype(zeros.dtype)
+        for name, zeros in form.zeros().items()
+    }
 
 
 def rollout(actor: str = "a", incarnation: str = "1", sequence: int = 0, version: int = 0, epoch: str = "e") -> Message:
-    """Four steps of two worlds."""
-    rng = np.random.default_rng(sequence)
-    steps, worlds = 4, 2
-    arrays = {
-        "observation": rng.normal(size=(steps, worlds, OBSERVATION)).astype(np.float16),
-        "action": rng.normal(size=(steps, worlds, ACTION)).astype(np.float32),
-        "log_probability": rng.normal(size=(steps, worlds)).astype(np.float32),
-        "reward": rng.normal(size=(steps, worlds)).astype(np.float32),
-        "terminal": np.zeros((steps, worlds), bool),
-        "last_observation": rng.normal(size=(worlds, OBSERVATION)).astype(np.float16),
-        "episode/success": np.ones(1, np.float32),
-    }
+    """A rollout in which one episode ended."""
+    arrays = {**random_arrays(FORM, sequence), "episode/success": np.ones(1, np.float32)}
     meta = {
         "actor": actor,
         "incarnation": incarnation,
@@ -27,7 +28,7 @@ def rollout(actor: str = "a", incarnation: str = "1", sequence: int = 0, version
         "version": version,
         "epoch": epoch,
         "schema": SCHEMA,
-        "steps": steps * worlds,
+        "steps": FORM.steps * FORM.worlds,
     }
     return Message(arrays, meta)
 

@@ -130,6 +130,17 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
     return Message(_arrays(header, section), meta)
 
 
+def finite(value: Mapping[str, Any]) -> dict[str, Any]:
+    """A JSON object without its numbers that are NaN or infinite, at any depth: meta data cannot hold them."""
+    result: dict[str, Any] = {}
+    for name, item in value.items():
+        if isinstance(item, Mapping):
+            result[name] = finite(item)
+        elif not isinstance(item, float) or math.isfinite(item):
+            result[name] = item
+    return result
+
+
 def checksum(message: Message) -> str:
     """A checksum of a message's arrays with their names, dtypes and shapes; the same at both ends of a link."""
     crc = 0

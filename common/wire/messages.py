@@ -13,23 +13,12 @@ import numpy as np
 from common.errors import CongraspError
 from common.transport.keys import check_name
 from common.wire.codec import Message
+from common.wire.schema import F32, RECORDED, ArraySpec, RolloutForm
 
 REAL = ("float32", "float64")
 _INFINITE_HALF = 0x7C00  # exponent bits of a float16 that is infinite or not a number
 _BLOCK = 1 << 16
 _COUNTS = 1 << 53
-
-
-@dataclasses.dataclass(frozen=True)
-class ArraySpec:
-    """One array of a message."""
-
-    dtypes: tuple[str, ...]
-    """Names of the dtypes that it may have."""
-    shape: tuple[str | int, ...] | None
-    """Sizes and symbols; None admits any shape."""
-    optional: bool = False
-    """Whether the array may be absent."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,21 +33,13 @@ class MessageSpec:
     """Types of the entries of the meta data that must be there; others may be."""
 
 
-_F32 = ("float32",)
 _INDEX = ("int32", "int64")
+
+_EPISODES = {"episode/*": ArraySpec(F32, ("E",)), "term/*": ArraySpec(F32, ("E",))}
 
 ROLLOUT = MessageSpec(
     "rollout",
-    {
-        "observation": ArraySpec(("float16", "float32"), ("T", "B", "D")),
-        "action": ArraySpec(_F32, ("T", "B", "A")),
-        "log_probability": ArraySpec(_F32, ("T", "B")),
-        "reward": ArraySpec(_F32, ("T", "B")),
-        "terminal": ArraySpec(("bool",), ("T", "B")),
-        "last_observation": ArraySpec(("float16", "float32"), ("B", "D")),
-        "episode/*": ArraySpec(_F32, ("E",)),
-        "term/*": ArraySpec(_F32, ("E",)),
-    },
+    {**RECORDED, **_EPISODES},
     {
         "actor": str,
         "incarnation": str,
@@ -69,7 +50,8 @@ ROLLOUT = MessageSpec(
         "steps": int,
     },
 )
-"""Actor to learner: T control steps of B worlds, D observation and A action sizes, E episodes that ended."""
+"""Actor to learner: T control steps of B worlds, D observation and A action sizes, E episodes that ended. Of the arrays
+of the steps there are those that the run's algorithm learns from. `epoch` is the run's id."""
 
 BUNDLE = MessageSpec(
     "bundle",
@@ -123,7 +105,8 @@ METRICS = MessageSpec("metrics", meta={"time": (int, float), "values": dict})
 EVENT = MessageSpec("event", meta={"time": (int, float), "level": str, "text": str})
 TICKET = MessageSpec("ticket request", meta={"actor": str, "incarnation": str, "ticket": str})
 ANNOUNCEMENT = MessageSpec("announcement", meta={"version": int, "epoch": str, "life": str})
-"""Learner to everyone: there is a new version. `life` differs each time the learner's process starts."""
+"""Learner to everyone: there is a new version. `epoch` is the run's id, another one when training starts from scratch;
+`life` is the session's, another one each time the learner's process starts."""
 
 
 def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int]:
@@ -188,7 +171,7 @@ def _type_name(kind: type | tuple[type, ...]) -> str:
 
 
 class RolloutHeader(NamedTuple):
-    """Who made a rollout, and under which policy."""
+    """Who made a rollout, and under which policy: the meta entries of `ROLLOUT`, in their order."""
 
     actor: str
     incarnation: str
@@ -197,7 +180,8 @@ class RolloutHeader(NamedTuple):
     """Counts the rollouts of an incarnation from zero."""
     version: int
     """Version of the policy that acted."""
-    epoch: str
+    run_id: str
+    """Identifies the training; the meta entry `epoch`."""
     schema: str
     steps: int
     """T*B."""
@@ -208,38 +192,19 @@ class RolloutHeader(NamedTuple):
         return self.actor, self.incarnation
 
 
-class RolloutForm(NamedTuple):
-    """What the rollouts of one run have in common, so that any of them make a batch without another compilation."""
-
-    steps: int
-    """T."""
-    worlds: int
-    """B."""
-    observation: int
-    """D."""
-    action: int
-    """A."""
-    half: bool
-    """Observations are float16, or else float32."""
-
-
 def validate_rollout(message: Message, form: RolloutForm, *, schema: str | None = None) -> RolloutHeader:
     """Checks a rollout.
 
     Args:
       message: a rollout.
-      form: sizes and type that it must have.
+      form: arrays, sizes and types that it must have.
       schema: the policy schema that it must have been made with, if that matters.
 
     Raises:
       CongraspError: naming the array or the entry, and the rule that it breaks.
     """
-    validate(message, ROLLOUT, T=form.steps, B=form.worlds, D=form.observation, A=form.action)
-    dtype = "float16" if form.half else "float32"
-    for name in ("observation", "last_observation"):
-        if str(message.arrays[name].dtype) != dtype:
-            raise CongraspError(f"The rollout's array '{name}' has dtype {message.arrays[name].dtype}, not {dtype}.")
-    header = RolloutHeader(*(message.meta[name] for name in RolloutHeader._fields))
+    validate(message, dataclasses.replace(ROLLOUT, arrays={**form.specs, **_EPISODES}), **form.sizes)
+    header = RolloutHeader(*(message.meta[name] for name in ROLLOUT.meta))
     check_name("actor", header.actor)
     check_name("incarnation", header.incarnation)
     if not (0 <= header.sequence < _COUNTS and 0 <= header.version < _COUNTS):

@@ -16,7 +16,7 @@ from common.transport.ports import free_port
 from common.transport.security import Credentials
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
-from learner.limits import Credit
+from learner.rate_limit import RateLimit
 from services.ops.certificates import create_authority, issue
 
 _KEYS = Keys("bench")
@@ -40,35 +40,35 @@ def measure(repeats: int) -> dict[str, float]:
         for _ in range(repeats):
             for name, certs in (("plain", None), ("secure", pathlib.Path(folder))):
                 began = time.perf_counter()
-                with _learner(certs) as (endpoint, credit):
+                with _learner(certs) as (endpoint, limit):
                     note(f"{name}_open_ms", 1e3 * (time.perf_counter() - began))
                     with _connected(endpoint, certs, 0) as actor:
                         note(f"{name}_query_ms", 1e3 * _seconds(actor, _KEYS.ticket(_ACTOR), _SMALL, 300))
                         note(f"{name}_mb_per_s", _MEGABYTES / _seconds(actor, _KEYS.rollout(_ACTOR), _LARGE, 10))
                         if certs is not None:
-                            with _flood(endpoint, certs, credit):
-                                before = credit.turned_away
+                            with _flood(endpoint, certs, limit):
+                                before = limit.turned_away
                                 note("flood_mb_per_s", _MEGABYTES / _seconds(actor, _KEYS.rollout(_ACTOR), _LARGE, 10))
-                                note("flood_turned_away", credit.turned_away - before)
+                                note("flood_turned_away", limit.turned_away - before)
         return {name: statistics.median(values) for name, values in found.items()}
 
 
 @contextlib.contextmanager
-def _learner(certs: pathlib.Path | None) -> Iterator[tuple[str, Credit]]:
+def _learner(certs: pathlib.Path | None) -> Iterator[tuple[str, RateLimit]]:
     """What answers tickets and rollouts as a learner's hub does, without looking into them."""
     credentials = None if certs is None else Credentials(certs / "learner.0", "learner")
-    endpoint, credit = f"tcp/127.0.0.1:{free_port()}", Credit()
+    endpoint, limit = f"tcp/127.0.0.1:{free_port()}", RateLimit()
 
     def accept(key: str, request: Message) -> Message:
         return Message(meta={"outcome": "refused" if key.endswith(_EVIL) else "accepted"})
 
     def turnstile(key: str) -> Message | None:
-        return None if credit.admits(key) else Message(meta={"outcome": "retry"})
+        return None if limit.admits(key) else Message(meta={"outcome": "retry"})
 
     with ZenohTransport(listen=[endpoint], credentials=credentials) as transport:
         for keys in (_KEYS.tickets, _KEYS.rollouts):
-            transport.serve(keys, credit.charging(accept), workers=2, depth=8, turnstile=turnstile)
-        yield endpoint, credit
+            transport.serve(keys, limit.charging(accept), workers=2, depth=8, turnstile=turnstile)
+        yield endpoint, limit
 
 
 def _connected(endpoint: str, certs: pathlib.Path | None, number: int) -> ZenohTransport:
@@ -87,13 +87,13 @@ def _seconds(transport: ZenohTransport, key: str, message: Message, count: int) 
 
 
 @contextlib.contextmanager
-def _flood(endpoint: str, certs: pathlib.Path, credit: Credit) -> Iterator[None]:
+def _flood(endpoint: str, certs: pathlib.Path, limit: RateLimit) -> Iterator[None]:
     """Another process, with an actor's certificate of its own, sends rubbish while the block runs."""
     hostile = multiprocessing.get_context("spawn").Process(target=_send_rubbish, args=(endpoint, certs), daemon=True)
     hostile.start()
     try:
         deadline = time.monotonic() + 60.0
-        while not credit.turned_away and time.monotonic() < deadline:
+        while not limit.turned_away and time.monotonic() < deadline:
             time.sleep(0.1)
         yield
     finally:

@@ -11,10 +11,12 @@ from rich.table import Table
 
 from common.config import PPOConfig
 from common.policy import bundle as bundles
-from learner import update as updates
+from learner.algorithms.ppo import PPO
 from services.bench import toy
 
-PPO = dataclasses.replace(toy.PPO, epochs=16, learning_rate=5e-3, learning_rate_range=(1e-5, 1e-2), kl_target=0.02)
+SETTINGS = dataclasses.replace(
+    toy.SETTINGS, epochs=16, learning_rate=5e-3, learning_rate_range=(1e-5, 1e-2), kl_target=0.02
+)
 """Many epochs over few samples, so that the trust region matters."""
 
 
@@ -35,10 +37,10 @@ def settings(lag: int) -> list[Setting]:
     ]
 
 
-def returns(setting: Setting, seed: int, count: int, worlds: int, ppo: PPOConfig = PPO) -> np.ndarray:
+def returns(setting: Setting, seed: int, count: int, worlds: int, config: PPOConfig = SETTINGS) -> np.ndarray:
     """Mean returns (count,) after each update of a training whose rollouts are all `setting.lag` versions old."""
-    ppo = dataclasses.replace(ppo, decoupled=setting.decoupled)
-    state = updates.init_state(seed, toy.LAYOUT, 1, toy.SPEC.network, ppo)
+    algorithm = PPO(toy.SPEC, dataclasses.replace(config, decoupled=setting.decoupled))
+    state = algorithm.init(seed)
     past = collections.deque([toy.bundle_of(state)], maxlen=setting.lag + 1)
     rng, key = np.random.default_rng(seed), jax.random.PRNGKey(seed)
     curve = []
@@ -50,7 +52,7 @@ def returns(setting: Setting, seed: int, count: int, worlds: int, ppo: PPOConfig
             key, sample = jax.random.split(key)
             return bundles.sample_action(toy.LAYOUT, actor.acting, observation, sample)
 
-        state, _ = updates.update(state, toy.episode(act, worlds, rng), toy.LAYOUT, ppo)
+        state, _ = algorithm.update(state, toy.episode(act, worlds, rng))
         past.append(toy.bundle_of(state))
         curve.append(toy.mean_return(past[-1]))
     return np.array(curve)
@@ -58,15 +60,15 @@ def returns(setting: Setting, seed: int, count: int, worlds: int, ppo: PPOConfig
 
 def bench_staleness(lag: int, seeds: int, count: int, worlds: int) -> None:
     """Prints returns after a quarter, half and all of the updates, and their share of the on-policy gain."""
-    marks = [count // 4, count // 2, count]
+    updates = [count // 4, count // 2, count]
     table = Table(
-        "", *(f"after {mark} updates" for mark in marks),
+        "", *(f"after {number} updates" for number in updates),
         title=f"Return: mean of {seeds} seeds ± standard deviation, share of the on-policy gain",
     )  # fmt: skip
     reference = None
     for setting in settings(lag):
         curves = np.array([returns(setting, seed, count, worlds) for seed in range(seeds)])
-        found = curves[:, np.array(marks) - 1]
+        found = curves[:, np.array(updates) - 1]
         mean = found.mean(0)
         reference = mean if reference is None else reference
         share = (mean - toy.STANDING_STILL) / (reference - toy.STANDING_STILL)

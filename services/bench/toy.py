@@ -13,7 +13,7 @@ from common.config import NetworkConfig, PPOConfig, TaskConfig
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, PolicySpec
 from common.task.types import Array
-from learner.update import TrainState
+from learner.algorithms.protocol import TrainState
 
 STANDING_STILL = -5.0
 HALVING = -0.5
@@ -28,7 +28,7 @@ LAYOUT = (
     ("mask", 4),
 )
 SPEC = PolicySpec("toy", LAYOUT, 1, NetworkConfig(hidden=(32, 32), encoder=2, initial_std=0.6))
-PPO = PPOConfig(epochs=4, minibatches=4, gamma=0.9, reward_scale=1.0, learning_rate=1e-3)
+SETTINGS = PPOConfig(epochs=4, minibatches=4, gamma=0.9, reward_scale=1.0, learning_rate=1e-3)
 
 
 def observe(position: np.ndarray, goal: np.ndarray) -> np.ndarray:
@@ -55,10 +55,10 @@ def episode(
     return {**batch, "last_observation": observe(position, goal)}
 
 
-def bundle_of(state: TrainState, epoch: str = "toy") -> PolicyBundle:
+def bundle_of(state: TrainState) -> PolicyBundle:
     """The policy of a training state."""
     return PolicyBundle(
-        SPEC, TaskConfig(), state.params, state.observation, state.value, state.version, epoch, state.transitions
+        SPEC, TaskConfig(), state.params, state.observation, state.value, state.version, "toy", state.transitions
     )
 
 

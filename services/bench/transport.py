@@ -26,14 +26,14 @@ from common.journal import AUDIT, Journal
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message, encode
-from common.wire.messages import RolloutForm
+from common.wire.schema import RolloutForm
 from learner.audit import AuditLog
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 
 _FORM = RolloutForm(steps=20, worlds=340, observation=534, action=26, half=True)
 """Of the human hand's rollouts; these have 8.0 MB."""
-_RUN, _EPOCH, _SCHEMA = "bench", "epoch", "schema"
+_RUN, _RUN_ID, _SCHEMA = "bench", "id", "schema"
 _BATCH = 4
 _WARM_UP = 1.0  # seconds that are not counted
 _START = 30.0  # seconds that processes may take to start
@@ -88,7 +88,7 @@ def _learner(folder: pathlib.Path) -> Iterator[tuple[LearnerHub, str]]:
             transport,
             run=_RUN,
             config_json="{}",
-            epoch=_EPOCH,
+            run_id=_RUN_ID,
             schema=_SCHEMA,
             form=_FORM,
             staleness=StalenessManager(1, _BATCH),
@@ -102,21 +102,14 @@ def _bundle(version: int, parameters: np.ndarray) -> Message:
     sizes = {"observation": (_FORM.observation,), "value": ()}
     arrays: dict[str, Any] = {f"{kind}/{m}": np.zeros(size) for kind, size in sizes.items() for m in ("mean", "m2")}
     arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": parameters}
-    meta = {"version": version, "epoch": _EPOCH, "schema": _SCHEMA, "hand": "human", "layout": [], "format": 1}
+    meta = {"version": version, "epoch": _RUN_ID, "schema": _SCHEMA, "hand": "human", "layout": [], "format": 1}
     return Message(arrays, {**meta, "action_size": _FORM.action})
 
 
 def _rollout() -> Message:
-    rng, (steps, worlds, observation, action, _) = np.random.default_rng(0), _FORM
-    arrays = {
-        "observation": rng.normal(size=(steps, worlds, observation)).astype(np.float16),
-        "action": rng.normal(size=(steps, worlds, action)).astype(np.float32),
-        "log_probability": rng.normal(size=(steps, worlds)).astype(np.float32),
-        "reward": rng.normal(size=(steps, worlds)).astype(np.float32),
-        "terminal": np.zeros((steps, worlds), bool),
-        "last_observation": rng.normal(size=(worlds, observation)).astype(np.float16),
-    }
-    return Message(arrays, {"version": 0, "schema": _SCHEMA, "steps": steps * worlds})
+    rng = np.random.default_rng(0)
+    arrays = {name: rng.normal(size=zeros.shape).astype(zeros.dtype) for name, zeros in _FORM.zeros().items()}
+    return Message(arrays, {"version": 0, "schema": _SCHEMA, "steps": _FORM.steps * _FORM.worlds})
 
 
 def _through_the_hub(senders: int, seconds: float) -> float:

@@ -7,12 +7,13 @@ Protobuf messages, which Rerun reads too; rollouts and raw episodes are the byte
 import dataclasses
 import functools
 import json
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from google.protobuf.message import Message as Protobuf
 from mcap_protobuf.schema import build_file_descriptor_set
+
+from common.wire.codec import finite
 
 OPAQUE = "x-safetensors"
 """Encoding of messages that are the bytes of `common.wire.codec`."""
@@ -109,17 +110,6 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[path] = value
     return flat
-
-
-def finite(value: Mapping[str, Any]) -> dict[str, Any]:
-    """A JSON object without its numbers that are NaN or infinite, at any depth."""
-    result: dict[str, Any] = {}
-    for name, item in value.items():
-        if isinstance(item, Mapping):
-            result[name] = finite(item)
-        elif not isinstance(item, float) or math.isfinite(item):
-            result[name] = item
-    return result
 
 
 def _merge(fields: dict[str, Any], value: Mapping[str, Any]) -> bool:

@@ -9,8 +9,8 @@ from typing import Any
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from common.wire.codec import Message, encode
-from services.record.channels import ROLLOUT_SCHEMA, Entry, JsonChannels, finite, nest, opaque_channel, protobuf_channel
+from common.wire.codec import Message, encode, finite
+from services.record.channels import ROLLOUT_SCHEMA, Entry, JsonChannels, nest, opaque_channel, protobuf_channel
 from services.record.scene import duration, episode_entries
 
 _LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}

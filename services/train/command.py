@@ -20,7 +20,7 @@ from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.pretrained import shipped
 from common.transport.zenoh_transport import DEFAULT_ENDPOINT
-from learner import update as updates
+from learner.algorithms import make_algorithm
 from learner.run_directory import LOGS, POLICY_FILE, continue_run, create_run
 from services.evaluate.evaluator import Evaluator
 from services.evaluate.scores import Row
@@ -148,7 +148,7 @@ def run_training(
 
 def _check(config: RunConfig) -> None:
     """Raises `CongraspError` for what would end the run's processes as soon as they have started."""
-    policy_spec(config.task, config.network)
+    make_algorithm(policy_spec(config.task, config.network), config)
     load_pool(dataclasses.replace(config.objects, count=min(1, config.objects.count)))
     if config.environments < 1 or config.rollout_steps < 1:
         raise CongraspError(f"A rollout of {config.rollout_steps} steps of {config.environments} hands is empty.")
@@ -171,8 +171,8 @@ def _full_disk_said(run_dir: pathlib.Path) -> Iterator[None]:
 def untrained(config: RunConfig) -> PolicyBundle:
     """The policy that the run starts from."""
     spec = policy_spec(config.task, config.network)
-    state = updates.init_state(config.seed, spec.layout, spec.action_size, config.network, config.ppo)
-    return PolicyBundle(spec, config.task, state.params, state.observation, state.value, 0, "untrained", 0)
+    algorithm = make_algorithm(spec, config)
+    return PolicyBundle(spec, config.task, *algorithm.policy(algorithm.init(config.seed)), 0, "untrained", 0)
 
 
 class _Progress:

@@ -28,7 +28,7 @@ class Learner:
         self.received = []
         self.tickets = []
         self.pulls = 0
-        self.transport.serve(KEYS.config, lambda key, m: self.reply(config="{}", schema="s"))
+        self.transport.serve(KEYS.config, lambda key, m: self.reply(config="{}", schema="s", arrays=["reward"]))
         self.transport.serve(KEYS.tickets, self.on_ticket)
         self.transport.serve(KEYS.weights, self.on_weights)
         self.transport.serve(KEYS.rollouts, self.on_rollout, workers=4)
@@ -97,7 +97,7 @@ def test_config_waits_for_a_learner(ends):
     with pytest.raises(TransportError):
         link.config(0.2)
     threading.Timer(0.2, Learner, [hub]).start()
-    assert link.config(10) == ("{}", "e", "s")
+    assert link.config(10) == ("{}", "e", "s", ("reward",))
 
 
 def test_identity_is_added_and_counts(ends):
@@ -201,12 +201,12 @@ def test_another_training_is_told_to_the_caller_who_starts_over(ends):
     link.config(5)
     learner.state["epoch"] = "f"
     outcome = link.upload(rollout(), TICKET)
-    with pytest.raises(RunRestarted, match="epoch f after e"):
+    with pytest.raises(RunRestarted, match="run id f after e"):
         outcome.result(5)
     for use in (lambda: link.upload(rollout(), TICKET), lambda: link.acquire_ticket(1), lambda: link.weights(0)):
         with pytest.raises(RunRestarted):
             use()
-    assert link.config(5).epoch == "f"
+    assert link.config(5).run_id == "f"
     assert link.upload(rollout(), TICKET).result(5) == "accepted"
     assert [message.meta["sequence"] for message in learner.received] == [0, 1]
 

@@ -11,6 +11,7 @@ from actors.environment import EPISODE_FIELDS
 from actors import process
 from actors.rollout import Rollout, Trace
 from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
+from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
 from common.policy.bundle import PolicyBundle, policy_spec
@@ -19,10 +20,11 @@ from common.task.types import Goal, Surface
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import encode
-from common.wire.messages import EPISODE, RolloutForm, validate
+from common.wire.messages import EPISODE, validate
+from common.wire.schema import RolloutForm
+from learner.algorithms import make_algorithm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
-from learner.update import init_state
 
 T, B = 5, 3
 CONFIG = RunConfig(
@@ -36,7 +38,7 @@ CONFIG = RunConfig(
 )
 HAND = get_hand("human")
 SPEC = policy_spec(CONFIG.task, CONFIG.network)
-SIZE = sum(size for _, size in SPEC.layout)
+FORM = RolloutForm(T, B, sum(size for _, size in SPEC.layout), SPEC.action_size, half=True)
 
 
 def invented(episodes: np.ndarray) -> Rollout:
@@ -52,10 +54,7 @@ def invented(episodes: np.ndarray) -> Rollout:
     }
     flags = dict.fromkeys(("table", "terminal"), np.zeros(T, bool))
     given = {
-        "observation": np.zeros((T, B, SIZE), np.float16),
-        "action": np.zeros((T, B, SPEC.action_size), np.float32),
-        "terminal": np.zeros((T, B), bool),
-        "last_observation": np.zeros((B, SIZE), np.float16),
+        **FORM.zeros(),
         "episodes": episodes,
         "usage": np.zeros((T, 2), np.float32),
         "has_episode": np.ones(B, bool),
@@ -101,14 +100,13 @@ def heard(monkeypatch):
         broker, stop = MemoryHub(), threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
             logs = server.subscribe(Keys("t").logs, depth=100)
-            form = RolloutForm(T, B, SIZE, SPEC.action_size, half=True)
             hub = LearnerHub(
-                server, run="t", config_json=to_json(CONFIG), epoch="e", schema=SPEC.schema, form=form,
+                server, run="t", config_json=to_json(CONFIG), run_id="e", schema=SPEC.schema, form=FORM,
                 staleness=StalenessManager(0, 1),
             )  # fmt: skip
-            state = jax.device_get(init_state(0, SPEC.layout, SPEC.action_size, CONFIG.network, CONFIG.ppo))
-            weights = state.params, state.observation, state.value
-            hub.publish_weights(PolicyBundle(SPEC, CONFIG.task, *weights, 0, "e", 0).to_message(), 0)
+            algorithm = make_algorithm(SPEC, CONFIG)
+            policy = jax.device_get(algorithm.policy(algorithm.init(0)))
+            hub.publish_weights(PolicyBundle(SPEC, CONFIG.task, *policy, 0, "e", 0).to_message(), 0)
             actor = threading.Thread(
                 target=process.run_actor,
                 args=(peer,),
@@ -122,6 +120,11 @@ def heard(monkeypatch):
         return batch, {key.split("/")[3]: message for key, message in received if "/actor/" in key}
 
     return run
+
+
+def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
+    with pytest.raises(CongraspError, match=r"do not record: torque\. Start the actor with the version"):
+        process._Actor(CONFIG, ("reward", "torque"), None, None, "native", 1, lambda values: None)
 
 
 def test_steps_in_which_the_physics_left_contacts_out_are_counted():

@@ -1,5 +1,7 @@
 """What messages must hold."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,25 +12,21 @@ from common.wire.messages import (
     EPISODE,
     EVENT,
     MessageSpec,
-    RolloutForm,
     is_finite,
     validate,
     validate_bundle,
     validate_rollout,
 )
+from common.wire.schema import RECORDED, RolloutForm
 
 T, B, D, A, E = 3, 2, 5, 4, 1
+FORM = RolloutForm(T, B, D, A, half=True)
 
 
 def rollout(arrays=None, **meta):
     """A valid rollout with changes; an array that is None is left out."""
     all_arrays = {
-        "observation": np.zeros((T, B, D), np.float16),
-        "action": np.zeros((T, B, A), np.float32),
-        "log_probability": np.zeros((T, B), np.float32),
-        "reward": np.zeros((T, B), np.float32),
-        "terminal": np.zeros((T, B), bool),
-        "last_observation": np.zeros((B, D), np.float16),
+        **FORM.zeros(),
         "episode/success": np.zeros(E, np.float32),
         "term/distance": np.zeros(E, np.float32),
     } | (arrays or {})
@@ -38,8 +36,8 @@ def rollout(arrays=None, **meta):
     )
 
 
-def check(message, **options):
-    return validate_rollout(message, RolloutForm(T, B, D, A, half=True), **options)
+def check(message, form=FORM, **options):
+    return validate_rollout(message, form, **options)
 
 
 def test_valid_rollout_gives_its_header():
@@ -107,11 +105,30 @@ def test_bad_meta_is_named(meta, match):
 
 
 def test_empty_rollout_is_refused():
-    nothing = {
-        name: array[:0] for name, array in rollout().arrays.items() if "/" not in name and name != "last_observation"
-    }
+    nothing = RolloutForm(0, B, D, A, half=True).zeros()
     with pytest.raises(CongraspError, match=r"has shape \(0, 2, 5\), not \(T=3, B=2, D=5\)"):
         check(rollout(nothing, steps=0))
+
+
+def test_zeros_have_the_forms_sizes_and_dtypes():
+    whole = RolloutForm(T, B, D, A, half=False).zeros(rollouts=3)
+    assert {name: (array.shape, str(array.dtype)) for name, array in whole.items()} == {
+        "observation": ((T, 3 * B, D), "float32"),
+        "action": ((T, 3 * B, A), "float32"),
+        "log_probability": ((T, 3 * B), "float32"),
+        "reward": ((T, 3 * B), "float32"),
+        "terminal": ((T, 3 * B), "bool"),
+        "last_observation": ((3 * B, D), "float32"),
+    }
+
+
+def test_an_algorithm_that_learns_from_less_is_sent_less():
+    form = dataclasses.replace(FORM, arrays={name: RECORDED[name] for name in ("observation", "reward")})
+    check(Message(form.zeros(), rollout().meta), form)
+    with pytest.raises(CongraspError, match="unknown array 'action'"):
+        check(rollout(), form)
+    with pytest.raises(CongraspError, match="lacks the array 'reward'"):
+        check(Message({"observation": form.zeros()["observation"]}, rollout().meta), form)
 
 
 def test_device_arrays_pass_unread():

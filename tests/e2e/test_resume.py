@@ -65,7 +65,7 @@ def feed(hub):
 
 
 def train(run_dir, resume, killed_after):
-    """A learner's life; with `killed_after`, it ends by SIGKILL right after that update."""
+    """A session of the learner; with `killed_after`, it ends by SIGKILL right after that update."""
     hub = MemoryHub()
     threading.Thread(target=feed, args=(hub,), daemon=True).start()
     with MemoryTransport(hub) as transport:
@@ -103,13 +103,14 @@ def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
         ends.append((json.loads(arrays.pop("meta").tobytes()), arrays))
     (straight_meta, straight_arrays), (meta, arrays) = ends
     # Parameters, the optimiser's moments, rate, random key, normalisers, and counters.
-    assert {name.split("/")[0] for name in arrays} >= {"params", "optimizer", "learning_rate", "key", "observation"}
+    assert {name.split("/")[0] for name in arrays} >= {"params", "optimizer", "key", "observation", "value"}
+    assert "optimizer/hyperparams/learning_rate" in arrays
     assert arrays.keys() == straight_arrays.keys() and len(arrays) > 20
     for name, array in arrays.items():
         assert array.dtype == straight_arrays[name].dtype
         assert array.tobytes() == straight_arrays[name].tobytes(), name
     assert (arrays["version"], arrays["transitions"]) == (UPDATES, UPDATES * BATCH * STEPS * WORLDS)
-    books, straight_books = meta["hubs"][0]["ledger"], straight_meta["hubs"][0]["ledger"]
+    books, straight_books = meta["hubs"][0]["counters"], straight_meta["hubs"][0]["counters"]
     lost = (KILLED_AFTER - EVERY) * BATCH
     assert (books["undone"], straight_books["undone"]) == (lost, 0)
     assert {**books, "undone": 0} == straight_books  # all else as if nothing had happened

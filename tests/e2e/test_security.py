@@ -22,7 +22,7 @@ from common.transport.ports import free_port
 from common.transport.security import RIGHTS, Credentials
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message, encode
-from common.wire.messages import RolloutForm
+from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from services.ops.certificates import create_authority, issue, read
@@ -81,7 +81,7 @@ def run(certs):
         learner, server = (Credentials(certs / f"{role}.0", role) for role in ("learner", "server"))
         transport = stack.enter_context(ZenohTransport(listen=[endpoint], credentials=learner))
         hub = LearnerHub(
-            transport, run="safe", config_json="{}", epoch="e", schema="s",
+            transport, run="safe", config_json="{}", run_id="e", schema="s",
             form=RolloutForm(T, B, D, A, half=True), staleness=StalenessManager(1, 2),
         )  # fmt: skip
         hub.publish_weights(bundle(0, "e"), 0)
@@ -243,7 +243,7 @@ def test_actors_do_not_speak_for_or_listen_to_one_another(run):
         actor.declare_alive(KEYS.alive(role, name, "66"))
     roles = wait_for(lambda: (roles := run.hub.status()["roles"]) and len(roles) >= 3 and roles)
     assert {(role["role"], role["id"], role["incarnation"]) for role in roles} == {
-        ("learner", "0", run.hub.life),
+        ("learner", "0", run.hub.session_id),
         ("actor", OTHER, "01"),
         ("actor", ME, "66"),
     }

@@ -31,12 +31,11 @@ class MadeUpActor(threading.Thread):
     def run(self) -> None:
         with ActorLink(self._transport, "t", self._actor, patience=_PATIENCE, journal=self._journal) as link:
             try:
-                link.config(_PATIENCE)
-                self._act(link)
+                self._act(link, link.config(_PATIENCE).arrays)
             except (RunFinished, TransportError) as error:
                 self.ended = str(error)
 
-    def _act(self, link: ActorLink) -> None:
+    def _act(self, link: ActorLink, names: tuple[str, ...]) -> None:
         rng, bundle = np.random.default_rng(self._seed), None
         while not self.stop.is_set():
             ticket = link.acquire_ticket(0.5)
@@ -48,13 +47,15 @@ class MadeUpActor(threading.Thread):
             action, log_probability = bundles.sample_action(
                 bundle.spec.layout, bundle.acting, observation[:-1], jax.random.PRNGKey(len(self.versions))
             )
-            arrays = {
+            recorded = {
                 "observation": observation[:-1],
                 "last_observation": observation[-1],
                 "action": np.asarray(action),
                 "log_probability": np.asarray(log_probability),
                 "reward": self._reward * rng.normal(size=(4, 2)).astype(np.float32),
                 "terminal": rng.random((4, 2)) < 0.3,
+            }
+            arrays = {name: recorded[name] for name in names} | {
                 "episode/success": np.array([0.0, 1.0, 1.0, 1.0], np.float32),
                 "episode/links_at_removal": np.full(4, self._links, np.float32),
             }

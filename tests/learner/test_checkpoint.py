@@ -10,23 +10,24 @@ import numpy as np
 import pytest
 
 from common.errors import CongraspError
-from learner import update as updates
+from learner.algorithms.ppo import PPO
 from learner.checkpoint import Checkpoints
 from services.bench import toy
-from tests.learner.test_update import rollout
+from tests.learner.test_ppo import rollout
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 
 def run_stream(directory: pathlib.Path, first: int, last: int) -> None:
     """Runs updates `first` to `last` - 1 of a fixed stream, from the checkpoint that is there, and leaves one."""
-    state = updates.init_state(3, toy.LAYOUT, 1, toy.SPEC.network, toy.PPO)
+    algorithm = PPO(toy.SPEC, toy.SETTINGS)
+    state = algorithm.init(3)
     checkpoints = Checkpoints(directory)
     if first:
         state, meta = checkpoints.load(state)
         assert meta == {"next": first}
     for seed in range(first, last):
-        state, _ = updates.update(state, rollout(toy.bundle_of(state), seed), toy.LAYOUT, toy.PPO)
+        state, _ = algorithm.update(state, rollout(toy.bundle_of(state), seed))
     checkpoints.save(state, {"next": last}, state.version)
 
 
@@ -106,7 +107,19 @@ checkpoint.Checkpoints(pathlib.Path(sys.argv[1])).save(tree(2.0), {}, 2)
     assert checkpoints.load(tree(0.0))[0]["host"][0] == 1.0
 
 
-def test_no_checkpoint_a_torn_one_and_one_of_another_shape(tmp_path):
+def test_a_checkpoint_of_a_version_with_another_optimiser_is_one_line(tmp_path):
+    """Adam's moments at the top, and the learning rate beside them."""
+    state = PPO(toy.SPEC, toy.SETTINGS).init(0)
+    _, adam = state.optimizer.inner_state
+    before = {**state._asdict(), "optimizer": adam[0], "learning_rate": jnp.float32(1e-3)}
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(before, {}, 1)
+    with pytest.raises(CongraspError, match=r"'optimizer/.*' is missing .*and the version of congrasp, that") as caught:
+        checkpoints.load(state)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_checkpoint_a_damaged_one_and_one_of_another_shape(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     with pytest.raises(CongraspError, match="no checkpoint"):
         checkpoints.load(tree(0.0))

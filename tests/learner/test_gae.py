@@ -3,7 +3,7 @@ import hypothesis.strategies as st
 import jax.numpy as jnp
 import numpy as np
 
-from learner import gae
+from learner.algorithms import gae
 
 
 def test_three_steps_by_hand():

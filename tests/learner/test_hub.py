@@ -14,26 +14,20 @@ from common.transport.base import RefusedError
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
-from common.wire.messages import RolloutForm
+from common.wire.schema import RolloutForm
+from learner.batch import collate
+from learner.deduplication import Sequences
 from learner.hub import LearnerHub
-from learner.marks import Marks
 from learner.staleness import StalenessManager
-from learner.update import collate
 
 pytestmark = pytest.mark.timeout(30)
 KEYS = Keys("test")
 T, B, D, A = 3, 2, 5, 4
+FORM = RolloutForm(T, B, D, A, half=True)
 
 
 def rollout(sequence=0, version=0, **meta):
-    arrays = {
-        "observation": np.zeros((T, B, D), np.float16),
-        "action": np.zeros((T, B, A), np.float32),
-        "log_probability": np.zeros((T, B), np.float32),
-        "reward": np.full((T, B), sequence, np.float32),
-        "terminal": np.zeros((T, B), bool),
-        "last_observation": np.zeros((B, D), np.float16),
-    }
+    arrays = {**FORM.zeros(), "reward": np.full((T, B), sequence, np.float32)}
     header = {"actor": "a", "incarnation": "01", "sequence": sequence, "version": version, "epoch": "e", "schema": "s"}
     return Message(arrays, {**header, "steps": T * B, **meta})
 
@@ -53,9 +47,8 @@ class Bench:
         shared = MemoryHub()
         self.server, self.peer = MemoryTransport(shared), MemoryTransport(shared)
         self.staleness = StalenessManager(max_staleness, batch)
-        defaults = {"run": "test", "config_json": "{}", "epoch": "e", "schema": "s"}
-        sizes = {"form": RolloutForm(T, B, D, A, half=True)}
-        self.hub = LearnerHub(self.server, **{**defaults, **sizes, **options}, staleness=self.staleness)
+        defaults = {"run": "test", "config_json": "{}", "run_id": "e", "schema": "s", "form": FORM}
+        self.hub = LearnerHub(self.server, **{**defaults, **options}, staleness=self.staleness)
 
     def ask(self, key, meta=None, arrays=None):
         return self.peer.query(key, Message(arrays or {}, meta or {}), timeout=5).meta
@@ -92,6 +85,7 @@ def sequences(batch):
 def test_config(bench):
     reply = bench(config_json='{"name": "x"}').ask(KEYS.config)
     assert (reply["config"], reply["epoch"], reply["schema"], reply["version"]) == ('{"name": "x"}', "e", "s", -1)
+    assert reply["arrays"] == list(FORM.arrays)
 
 
 def test_nothing_is_granted_or_taken_before_the_first_weights(bench):
@@ -270,10 +264,7 @@ def test_floods_are_turned_away_and_cost_the_others_nothing(bench):
 
 def _sized(steps, worlds):
     """A rollout that agrees with itself, of so many control steps of so many worlds."""
-    good = rollout()
-    arrays = {name: np.resize(array, (steps, worlds, *array.shape[2:])) for name, array in good.arrays.items()}
-    arrays["last_observation"] = np.zeros((worlds, D), np.float16)
-    return Message(arrays, {**good.meta, "steps": steps * worlds})
+    return Message(RolloutForm(steps, worlds, D, A, half=True).zeros(), {**rollout().meta, "steps": steps * worlds})
 
 
 @pytest.mark.parametrize(
@@ -288,7 +279,7 @@ def test_an_actor_of_another_configuration_is_refused_alone(bench, steps, worlds
     assert reply["outcome"] == "refused" and re.search(rule, reply["why"])
     assert b.send(0)["outcome"] == b.send(1)["outcome"] == "accepted"
     batch = b.hub.next_batch(2, 1)
-    assert collate([message.arrays for message in batch])["reward"].shape == (T, 2 * B)
+    assert collate([message.arrays for message in batch], FORM.arrays)["reward"].shape == (T, 2 * B)
 
 
 def test_refusal_ends_the_ticket(bench):
@@ -304,7 +295,7 @@ def test_weights_are_pulled_by_version(bench):
     notices = b.peer.subscribe(KEYS.announcement, depth=4)
     b.hub.publish_weights(bundle(0), 0)
     assert notices.receive(5)[1].meta == {
-        "version": 0, "oldest": -1, "saved": [-1, 1], "epoch": "e", "life": b.hub.life, "finished": False,
+        "version": 0, "oldest": -1, "saved": [-1, 1], "epoch": "e", "life": b.hub.session_id, "finished": False,
     }  # fmt: skip
     pulled = b.peer.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5)
     assert pulled.meta == bundle(0).meta and pulled.arrays["actor/w"][0] == 0
@@ -319,9 +310,9 @@ def test_weights_are_pulled_by_version(bench):
 
 def test_only_weights_of_this_run_are_published(bench):
     b = bench()
-    with pytest.raises(CongraspError, match="not version 1 of epoch e"):
+    with pytest.raises(CongraspError, match="not version 1 of run id e"):
         b.hub.publish_weights(bundle(0), 1)
-    with pytest.raises(CongraspError, match="epoch"):
+    with pytest.raises(CongraspError, match="run id"):
         b.hub.publish_weights(bundle(0, epoch="other"), 0)
     bad = bundle(0)
     with pytest.raises(CongraspError, match="not finite"):
@@ -368,7 +359,7 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
     resumed = bench(batch=3, durable=durable)
     assert resumed.send(2, version=4)["outcome"] == "retry"  # its weights are not there yet
     resumed.hub.publish_weights(bundle(4), 4)
-    assert resumed.hub.life != b.hub.life
+    assert resumed.hub.session_id != b.hub.session_id
     assert resumed.ledger()["accepted"] == resumed.ledger()["consumed"] == 3
     assert resumed.send(2, version=3)["outcome"] == "duplicate"
     # The actor goes on where it was: 3, 4 and 5 were acknowledged, and are gone with the killed learner.
@@ -381,31 +372,31 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
     again.hub.publish_weights(bundle(5), 5)
     assert again.send(8, version=5)["outcome"] == "accepted"
     assert again.ledger()["missing"] == 5 and again.ledger()["accepted"] == 4  # 6 and 7 were waiting as well
-    with pytest.raises(CongraspError, match="epoch e, not f"):
-        bench(epoch="f", durable=durable)
+    with pytest.raises(CongraspError, match="run id e, not f"):
+        bench(run_id="f", durable=durable)
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 40), st.booleans()), max_size=120))
-def test_marks_are_exact_within_their_window(arrivals):
-    marks, decided = Marks(), {}
+def test_deduplication_is_exact_within_its_window(arrivals):
+    known, decided = Sequences(), {}
     for sequence, accepted in arrivals:
-        assert (sequence in marks) == (sequence in decided)
-        assert (sequence in marks.refused) == (decided.get(sequence) is False)
+        assert (sequence in known) == (sequence in decided)
+        assert (sequence in known.refused) == (decided.get(sequence) is False)
         if sequence not in decided:
-            marks.add(_header(sequence), accepted)
+            known.add(_header(sequence), accepted)
             decided[sequence] = accepted
-        assert marks.missing == max(decided) + 1 - len(decided)
-    assert marks.rollouts == sum(decided.values())
+        assert known.missing == max(decided) + 1 - len(decided)
+    assert known.rollouts == sum(decided.values())
 
 
-def test_marks_stay_small_whatever_is_missing():
-    marks = Marks()
+def test_deduplication_stays_small_whatever_is_missing():
+    known = Sequences()
     for sequence in range(1, 20_000, 2):
-        marks.add(_header(sequence), sequence % 3 > 0)
-        assert len(marks.ahead) <= 64 and len(marks.refused) <= 64
-    assert 19_999 in marks and 20_001 not in marks
-    assert marks.missing == 10_000
+        known.add(_header(sequence), sequence % 3 > 0)
+        assert len(known.ahead) <= 64 and len(known.refused) <= 64
+    assert 19_999 in known and 20_001 not in known
+    assert known.missing == 10_000
 
 
 def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
@@ -437,7 +428,7 @@ def test_a_resumed_learner_waits_for_what_was_accepted_before_and_uses_the_oldes
     b = bench(batch=2)
     b.hub.publish_weights(bundle(3), 3)
     resumed = bench(batch=2, durable=b.hub.durable())
-    resumed.hub.publish_weights(bundle(5), 5)  # 4 died with the first life, and 5 is 3 under another number
+    resumed.hub.publish_weights(bundle(5), 5)  # 4 died with the first session, and 5 is 3 under another number
     assert not resumed.ticket()["granted"]
     versions = [4, 4, 3, 3, 2, 2]  # more than there are tickets for, none of which they have any more
     assert {resumed.send(i, version=version)["outcome"] for i, version in enumerate(versions)} == {"accepted"}

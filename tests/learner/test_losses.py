@@ -5,7 +5,7 @@ import pytest
 
 from common.config import NetworkConfig
 from common.policy import network
-from learner import losses
+from learner.algorithms import losses
 
 LAYOUT = (
     ("state", 3),
@@ -56,13 +56,13 @@ def case():
     action = np.asarray(mean) + rng.normal(size=(64, 2)).astype(np.float32) * 0.6
     log_proximal = network.log_probability(mean, log_std, action)
     sample = losses.Sample(
-        observation,
-        action,
-        log_proximal,
-        mean,
-        losses.importance_weight(log_proximal, log_proximal, 4.0),
-        rng.normal(size=64).astype(np.float32),
-        rng.normal(size=64).astype(np.float32),
+        observation=observation,
+        action=action,
+        log_proximal=log_proximal,
+        mean_proximal=mean,
+        weight=losses.importance_weight(log_proximal, log_proximal, 4.0),
+        advantage=rng.normal(size=64).astype(np.float32),
+        target=rng.normal(size=64).astype(np.float32),
     )
     return params, log_std, sample
 

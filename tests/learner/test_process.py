@@ -22,7 +22,7 @@ from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
-from learner import update as updates
+from learner.algorithms import ppo
 from learner.process import run_learner
 from learner.run_directory import create_run, open_run
 from tests.learner.made_up_actor import MadeUpActor
@@ -95,9 +95,9 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
     first = learn(tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 3 and stop.set())
     assert first.version == 3
     assert actor.is_alive()
-    compiled = updates._optimise._cache_size()
+    compiled = ppo._optimise._cache_size()
     last = learn(tmp_path, hub, dataclasses.replace(CONFIG, updates=6), resume=True)
-    assert updates._optimise._cache_size() == compiled
+    assert ppo._optimise._cache_size() == compiled
     actor.join(10.0)
     assert actor.ended == "The run is finished."
     assert (last.version, last.transitions, last.epoch) == (6, 6 * 2 * 8, first.epoch)
@@ -123,7 +123,7 @@ with ZenohTransport(listen=[endpoint]) as transport:
 
 @pytest.mark.timeout(150)
 def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path):
-    """Killed between two checkpoints; its second life redoes the lost updates under versions of their own."""
+    """Killed between two checkpoints; its second session redoes the lost updates under versions of their own."""
     create_run(tmp_path, dataclasses.replace(CONFIG, checkpoint_every=4))
     endpoint = f"tcp/127.0.0.1:{free_port()}"
 
@@ -141,24 +141,24 @@ def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path):
     def figures(lines: list[str]) -> list[tuple[int, ...]]:
         return [tuple(map(int, line.split())) for line in lines]
 
-    lives = [start(10**6, "fresh")]
+    sessions = [start(10**6, "fresh")]
     try:
         with ZenohTransport(connect=[endpoint], wait=60.0) as transport:
             actor = MadeUpActor(transport)
-            lines = [lives[0].stdout.readline() for _ in range(5)]
-            lives[0].send_signal(signal.SIGKILL)
-            first = figures([*lines, *lives[0].stdout.readlines()])
+            lines = [sessions[0].stdout.readline() for _ in range(5)]
+            sessions[0].send_signal(signal.SIGKILL)
+            first = figures([*lines, *sessions[0].stdout.readlines()])
             kept = int((tmp_path / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
-            lives.append(start(kept + 4, "resume"))
-            text, _ = lives[1].communicate(timeout=90.0)
+            sessions.append(start(kept + 4, "resume"))
+            text, _ = sessions[1].communicate(timeout=90.0)
             actor.join(10.0)
             assert actor.ended == "The run is finished."
     finally:
-        for life in lives:
-            life.kill()
-            life.wait(10.0)
-            life.stdout.close()
-    assert lives[1].returncode == 0
+        for session in sessions:
+            session.kill()
+            session.wait(10.0)
+            session.stdout.close()
+    assert sessions[1].returncode == 0
     second = figures(text.splitlines())
     assert kept >= 4 and kept % 4 == 0
     assert [update for update, _ in second] == [kept + 1, kept + 2, kept + 3, kept + 4]

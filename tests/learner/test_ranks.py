@@ -56,7 +56,7 @@ class Party:
 
     def end(self, rank: int) -> None:
         """Its process is no more: nothing in it runs on, and the kernel ends its connections."""
-        self.ranks[rank]._parting.set()
+        self.ranks[rank]._leaving.set()
         for link in self.links[rank].values():
             link.close()
 
@@ -126,7 +126,7 @@ def test_a_silent_rank_ends_the_others(monkeypatch):
     assert any("silent" in text for text in party.said.values())
 
 
-def test_ranks_that_part_in_peace_miss_nobody(party, monkeypatch):
+def test_ranks_that_leave_cleanly_miss_nobody(party, monkeypatch):
     monkeypatch.setattr(jax.distributed, "shutdown", lambda: None)
     party.everywhere(lambda rank: party.ranks[rank].close())
     for rank in (1, 0, 2):

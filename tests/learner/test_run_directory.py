@@ -24,7 +24,7 @@ def test_what_the_learner_alone_uses_may_change_and_is_kept(run):
     assert open_run(folder) == changed
 
 
-@pytest.mark.parametrize("change", [{"environments": 4}, {"rollout_steps": 5}, {"name": "other"}])
+@pytest.mark.parametrize("change", [{"environments": 4}, {"rollout_steps": 5}, {"name": "other"}, {"algorithm": "a2c"}])
 def test_what_actors_use_may_not(run, change):
     folder, config = run
     with pytest.raises(CongraspError, match=rf"'{next(iter(change))}' that it began with. Begin .*--initial"):

@@ -29,7 +29,7 @@ def test_tickets_worked_out_by_hand():
     assert staleness.capacity == 0  # and what is being learnt from
     staleness.publish(1)
     assert staleness.capacity == 2
-    assert staleness.ledger() == {
+    assert staleness.counters() == {
         "granted": 4, "redeemed": 2, "returned": 0, "expired": 0, "accepted": 2, "consumed": 2, "dropped": 0,
         "stale": 0, "duplicate": 0, "damaged": 0, "undone": 0, "running": 2, "queued": 0, "capacity": 2,
     }  # fmt: skip
@@ -89,8 +89,8 @@ def test_tickets_return():
     assert staleness.capacity == 3
     now[0] = 10.0
     assert staleness.capacity == 4 and staleness.running == 0
-    ledger = staleness.ledger()
-    assert (ledger["granted"], ledger["returned"], ledger["expired"]) == (4, 3, 1)
+    counters = staleness.counters()
+    assert (counters["granted"], counters["returned"], counters["expired"]) == (4, 3, 1)
 
 
 def test_rollout_without_a_ticket_comes_in_only_where_there_is_room():
@@ -116,9 +116,9 @@ def test_old_rollouts_are_refused_or_dropped_and_counted():
     assert staleness.arrive(A, "z", 3) == "stale"  # made by a version that this learner never had
     assert not staleness.take(0)
     assert staleness.take(1)
-    ledger = staleness.ledger()
-    assert (ledger["accepted"], ledger["dropped"], ledger["consumed"], ledger["stale"]) == (2, 1, 1, 2)
-    assert ledger["running"] == 0
+    counters = staleness.counters()
+    assert (counters["accepted"], counters["dropped"], counters["consumed"], counters["stale"]) == (2, 1, 1, 2)
+    assert counters["running"] == 0
 
 
 def test_checkpoint_keeps_what_is_settled():
@@ -136,9 +136,9 @@ def test_checkpoint_keeps_what_is_settled():
     resumed = manager()
     resumed.restore(durable, 7)
     assert resumed.version == 7 and resumed.capacity == 4  # (1 + 7 + 1) * 2 - 7 * 2
-    ledger = resumed.ledger()
-    assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["running"]) == (1, 1, 0, 0)
-    assert (ledger["granted"], ledger["redeemed"], ledger["duplicate"], ledger["damaged"]) == (2, 2, 1, 2)
+    counters = resumed.counters()
+    assert (counters["accepted"], counters["consumed"], counters["queued"], counters["running"]) == (1, 1, 0, 0)
+    assert (counters["granted"], counters["redeemed"], counters["duplicate"], counters["damaged"]) == (2, 2, 1, 2)
 
 
 class Admission(RuleBasedStateMachine):
@@ -231,16 +231,16 @@ class Admission(RuleBasedStateMachine):
 
     @invariant()
     def bound_and_books(self):
-        ledger = self.staleness.ledger()
+        counts = self.staleness.counters()
         version = self.staleness.version
         assert (
             version * self.batch + self.in_update + len(self.queue) + len(self.tickets)
             <= (self.eta + version + 1) * self.batch
         )
-        assert ledger["running"] == len(self.tickets) and ledger["queued"] == len(self.queue)
-        assert ledger["capacity"] == (self.eta + 1) * self.batch - self.in_update - len(self.queue) - len(self.tickets)
-        assert ledger["granted"] == ledger["running"] + ledger["redeemed"] + ledger["returned"] + ledger["expired"]
-        assert {name: ledger[name] for name in self.fates} == self.fates
+        assert counts["running"] == len(self.tickets) and counts["queued"] == len(self.queue)
+        assert counts["capacity"] == (self.eta + 1) * self.batch - self.in_update - len(self.queue) - len(self.tickets)
+        assert counts["granted"] == counts["running"] + counts["redeemed"] + counts["returned"] + counts["expired"]
+        assert {name: counts[name] for name in self.fates} == self.fates
 
 
 TestAdmission = Admission.TestCase

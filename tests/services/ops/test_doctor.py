@@ -15,7 +15,7 @@ import pytest
 
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
-from common.wire.messages import RolloutForm
+from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from services.cli.doctor import doctor as command
@@ -135,7 +135,7 @@ def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as server:
         form, staleness = RolloutForm(4, 2, 7, 3, half=True), StalenessManager(1, 2)
-        hub = LearnerHub(server, run="r", config_json="{}", epoch="e", schema="s", form=form, staleness=staleness)
+        hub = LearnerHub(server, run="r", config_json="{}", run_id="e", schema="s", form=form, staleness=staleness)
         assert [finding.fine for finding in doctor._learner(endpoint, "r")] == [True, True]
         real = hub.status
         monkeypatch.setattr(hub, "status", lambda: real() | {"time": real()["time"] + 7.0})

@@ -13,7 +13,7 @@ from common.errors import TransportError
 from common.transport.keys import Keys
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
-from common.wire.messages import RolloutForm
+from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from services.cli.status import status
@@ -30,7 +30,7 @@ def endpoint():
             server,
             run="r",
             config_json="{}",
-            epoch="e",
+            run_id="e",
             schema=SCHEMA,
             form=RolloutForm(4, 2, OBSERVATION, ACTION, half=True),
             staleness=StalenessManager(1, 2),

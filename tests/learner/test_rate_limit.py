@@ -1,11 +1,11 @@
-"""Credit: what helps is free, what does not costs by its size, and time brings it back."""
+"""What helps is free, what does not costs tokens by its size, and time brings them back."""
 
 import numpy as np
 import pytest
 
 from common.errors import CongraspError
 from common.wire.codec import Message
-from learner.limits import Credit
+from learner.rate_limit import RateLimit
 
 A, B = "congrasp/r/rollout/0.a", "congrasp/r/rollout/1.b"
 
@@ -17,23 +17,23 @@ class Clock:
         return self.now
 
 
-def test_useless_requests_use_credit_up_by_certificate_and_time_returns_it():
+def test_useless_requests_empty_a_certificates_bucket_and_time_fills_it():
     clock = Clock()
-    credit = Credit(per_second=2.0, most=5.0, unit=100, clock=clock)
+    limit = RateLimit(per_second=2.0, most=5.0, unit=100, clock=clock)
     for name in ("0.a", "0.b", "0.c"):
-        assert credit.admits(f"congrasp/r/rollout/{name}")
-        credit.charge(f"congrasp/r/rollout/{name}", 100)  # two each: one for itself, one for its size
-    assert not credit.admits(A) and not credit.admits("congrasp/r/ticket/0.z") and credit.admits(B)
-    assert credit.turned_away == 2
+        assert limit.admits(f"congrasp/r/rollout/{name}")
+        limit.charge(f"congrasp/r/rollout/{name}", 100)  # two each: one for itself, one for its size
+    assert not limit.admits(A) and not limit.admits("congrasp/r/ticket/0.z") and limit.admits(B)
+    assert limit.turned_away == 2
     clock.now = 0.5  # -1 + 1: still nothing
-    assert not credit.admits(A)
+    assert not limit.admits(A)
     clock.now = 0.6
-    assert credit.admits(A)
+    assert limit.admits(A)
     clock.now = 1e6
     for _ in range(5):
-        assert credit.admits(A)
-        credit.charge(A, 0)
-    assert not credit.admits(A)  # no more than `most` is saved up
+        assert limit.admits(A)
+        limit.charge(A, 0)
+    assert not limit.admits(A)  # no more than `most` is saved up
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_useless_requests_use_credit_up_by_certificate_and_time_returns_it():
     ],
 )
 def test_only_what_is_granted_or_accepted_is_free(meta, cost):
-    credit = Credit(per_second=0.0, most=100.0, unit=10, clock=Clock())
+    limit = RateLimit(per_second=0.0, most=100.0, unit=10, clock=Clock())
 
     def handler(key, request):
         if meta is None:
@@ -60,8 +60,8 @@ def test_only_what_is_granted_or_accepted_is_free(meta, cost):
     for _ in range(25):
         if meta is None:
             with pytest.raises(CongraspError, match="bad"):
-                credit.charging(handler)(A, request)
+                limit.charging(handler)(A, request)
         else:
-            assert credit.charging(handler)(A, request).meta == meta
-    assert credit.admits(A) == (cost == 0)
-    assert credit.admits(B)
+            assert limit.charging(handler)(A, request).meta == meta
+    assert limit.admits(A) == (cost == 0)
+    assert limit.admits(B)

@@ -12,13 +12,14 @@ TWO_DEVICES = """
 import dataclasses, functools
 import jax, numpy as np
 from jax.sharding import Mesh
-from learner import update as updates
-from learner.across import AXIS
+from learner.algorithms.ppo import PPO
+from learner.algorithms.protocol import NonFiniteUpdate
+from learner.collectives import AXIS, shard
 from services.bench import toy
-from tests.learner.test_update import fresh, rollout
+from tests.learner.test_ppo import fresh, rollout
 
 # One minibatch: then both have the same samples in it, whatever order they draw.
-ppo = dataclasses.replace(toy.PPO, minibatches=1, entropy=0.01, importance_max=1.02)
+ppo = PPO(toy.SPEC, dataclasses.replace(toy.SETTINGS, minibatches=1, entropy=0.01, importance_max=1.02))
 mesh = Mesh(np.array(jax.devices()), (AXIS,))
 assert mesh.size == 2
 one, two = fresh(), fresh()
@@ -27,8 +28,8 @@ for seed in range(4):
     # The halves are unlike, so that a mean of each instead of all would show; and stale, so that weights are truncated.
     batch["reward"][:, :32] *= 3.0
     batch["log_probability"] += np.random.default_rng(seed).normal(0.0, 0.05, batch["reward"].shape).astype(np.float32)
-    one, expected = updates.update(one, batch, toy.LAYOUT, ppo)
-    two, metrics = updates.update(two, batch, toy.LAYOUT, ppo, mesh)
+    one, expected = ppo.update(one, batch)
+    two, metrics = ppo.update(two, batch, mesh)
     assert (two.version, two.transitions) == (one.version, one.transitions)
     assert metrics.keys() == expected.keys()
     for name, value in expected.items():
@@ -36,13 +37,13 @@ for seed in range(4):
     for a, b in zip(one.observation + one.value, two.observation + two.value, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=2e-3, atol=2e-4), two.params, one.params)
-copies = jax.tree.leaves(updates.spread(two.params, mesh))
+copies = jax.tree.leaves(shard(two.params, mesh))
 assert all(len(leaf.addressable_shards) == 2 for leaf in copies)
 
 batch["reward"][3, 40] = np.nan  # on the second device alone
 try:
-    updates.update(two, batch, toy.LAYOUT, ppo, mesh)
-except updates.NonFiniteUpdate as error:
+    ppo.update(two, batch, mesh)
+except NonFiniteUpdate as error:
     assert "reward" in str(error)
     print("agreed")
 """

@@ -1,5 +1,4 @@
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +8,21 @@ import pytest
 from common.errors import CongraspError, PhysicsError
 from common.policy import bundle as bundles
 from common.policy import network, normalizer
-from learner import update as updates
+from learner.algorithms import ppo
+from learner.algorithms.ppo import PPO
+from learner.algorithms.protocol import NonFiniteUpdate, TrainState
 from services.bench import toy
 
+ALGORITHM = PPO(toy.SPEC, toy.SETTINGS)
+step = ALGORITHM.update
 
-def fresh(seed: int = 0) -> updates.TrainState:
-    return updates.init_state(seed, toy.LAYOUT, 1, toy.SPEC.network, toy.PPO)
+
+def fresh(seed: int = 0) -> TrainState:
+    return ALGORITHM.init(seed)
+
+
+def changed(**settings) -> PPO:
+    return PPO(toy.SPEC, dataclasses.replace(toy.SETTINGS, **settings))
 
 
 def rollout(bundle: bundles.PolicyBundle, seed: int, worlds: int = 64, reach: float = 1.0) -> dict[str, np.ndarray]:
@@ -26,10 +34,7 @@ def rollout(bundle: bundles.PolicyBundle, seed: int, worlds: int = 64, reach: fl
     return toy.episode(act, worlds, np.random.default_rng(seed), reach)
 
 
-step = functools.partial(updates.update, layout=toy.LAYOUT, ppo=toy.PPO)
-
-
-def leaves(state: updates.TrainState) -> list[np.ndarray]:
+def leaves(state: TrainState) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
 
 
@@ -75,8 +80,8 @@ def test_the_normaliser_moves_after_the_epochs():
 
 def test_moving_the_value_statistics_does_not_move_the_values():
     """In rewards' units the critic says the same before and after its normaliser took the batch in."""
-    frozen = dataclasses.replace(toy.PPO, learning_rate=0.0, learning_rate_range=(0.0, 0.0))
-    state = updates.init_state(0, toy.LAYOUT, 1, toy.SPEC.network, frozen)
+    frozen = changed(learning_rate=0.0, learning_rate_range=(0.0, 0.0))
+    state = frozen.init(0)
     batch = rollout(toy.bundle_of(state), 0)
     probe = normalizer.apply(
         normalizer.observation_affine(normalizer.empty((11,)), toy.LAYOUT), batch["last_observation"]
@@ -87,7 +92,7 @@ def test_moving_the_value_statistics_does_not_move_the_values():
         return np.asarray(network.value(state.params, toy.LAYOUT, probe)) / affine.scale + affine.shift
 
     before = values(state)
-    after, _ = updates.update(state, batch, toy.LAYOUT, frozen)
+    after, _ = frozen.update(state, batch)
     assert after.value.count > 0
     np.testing.assert_allclose(values(after), before, rtol=1e-4, atol=1e-4)
 
@@ -98,13 +103,13 @@ def test_moving_the_value_statistics_does_not_move_the_values():
 )
 def test_learning_rate_follows_the_divergence(kl, rate):
     hyper = {"kl_target": 0.012, "learning_rate_range": (1e-5, 1.0)}
-    np.testing.assert_allclose(updates._adapt_rate(jnp.float32(2e-3), jnp.float32(kl), hyper), rate, rtol=1e-6)
+    np.testing.assert_allclose(ppo._adapt_rate(jnp.float32(2e-3), jnp.float32(kl), hyper), rate, rtol=1e-6)
 
 
 def test_learning_rate_stays_in_its_range():
     hyper = {"kl_target": 0.012, "learning_rate_range": (1e-4, 3e-4)}
-    assert updates._adapt_rate(jnp.float32(2.5e-4), jnp.float32(0.0), hyper) == jnp.float32(3e-4)
-    assert updates._adapt_rate(jnp.float32(1.2e-4), jnp.float32(1.0), hyper) == jnp.float32(1e-4)
+    assert ppo._adapt_rate(jnp.float32(2.5e-4), jnp.float32(0.0), hyper) == jnp.float32(3e-4)
+    assert ppo._adapt_rate(jnp.float32(1.2e-4), jnp.float32(1.0), hyper) == jnp.float32(1e-4)
 
 
 @pytest.mark.parametrize("field", ["observation", "last_observation", "action", "log_probability", "reward"])
@@ -122,24 +127,24 @@ def test_a_value_that_is_not_finite_is_named_and_changes_nothing(field):
 def test_an_optimisation_that_breaks_is_named_and_keeps_the_last_finite_weights():
     state = fresh()
     batch = rollout(toy.bundle_of(state), 0)
-    with pytest.raises(updates.NonFiniteUpdate, match="optimisation of update 1: value loss") as caught:
-        updates.update(state, batch, toy.LAYOUT, dataclasses.replace(toy.PPO, reward_scale=1e25))
+    with pytest.raises(NonFiniteUpdate, match="optimisation of update 1: value loss") as caught:
+        changed(reward_scale=1e25).update(state, batch)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(caught.value.state.params))
 
 
 def test_more_minibatches_than_transitions_are_refused():
     batch = rollout(toy.bundle_of(fresh()), 0, worlds=1)
     with pytest.raises(CongraspError, match="10 transitions does not make 16 minibatches"):
-        updates.update(fresh(), batch, toy.LAYOUT, dataclasses.replace(toy.PPO, minibatches=16))
+        changed(minibatches=16).update(fresh(), batch)
 
 
 def test_other_hyperparameters_do_not_compile_again():
     state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 0))
-    compiled = updates._optimise._cache_size()
+    compiled = ppo._optimise._cache_size()
     for seed, clip in enumerate((0.1, 0.3)):
-        ppo = dataclasses.replace(toy.PPO, clip=clip, entropy=0.01, gamma=0.5)
-        state, _ = updates.update(state, rollout(toy.bundle_of(state), seed), toy.LAYOUT, ppo)
-    assert updates._optimise._cache_size() == compiled
+        other = changed(clip=clip, entropy=0.01, gamma=0.5, max_grad_norm=0.1)
+        state, _ = other.update(state, rollout(toy.bundle_of(state), seed))
+    assert ppo._optimise._cache_size() == compiled
 
 
 def test_same_seed_and_data_give_the_same_bits():

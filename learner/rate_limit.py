@@ -1,8 +1,8 @@
-"""How much useless work an actor may cause: credit for each certificate.
+"""Rate limit of useless work, a token bucket for each actor's certificate.
 
 A request that helps training costs nothing: a ticket that is granted, a rollout that is accepted. All others (asked for
-in vain, refused, too old, sent twice) cost by their size. Whoever has no credit left is told to come again later before
-anything is decoded, so a flood costs the learner little, and the other actors nothing.
+in vain, refused, too old, sent twice) cost tokens by their size. Whoever has none left is told to come again later
+before anything is decoded, so a flood costs the learner little, and the other actors nothing.
 """
 
 import collections
@@ -18,8 +18,8 @@ DAMAGED = 1 << 20
 _NAMES = 1024
 
 
-class Credit:
-    """Credit by who asks; safe to call from several threads."""
+class RateLimit:
+    """Token buckets by certificate; safe to call from several threads."""
 
     def __init__(
         self,
@@ -29,11 +29,11 @@ class Credit:
         unit: int = 256 << 10,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Starts with all credit for everyone.
+        """Starts with full buckets.
 
         Args:
-          per_second: credit that returns each second.
-          most: credit that can be saved up.
+          per_second: tokens that return each second.
+          most: a bucket's size, tokens.
           unit: bytes that cost as much as a request without any.
           clock: seconds, monotonic.
         """
@@ -44,7 +44,7 @@ class Credit:
         self._lock = threading.Lock()
         self._levels: collections.OrderedDict[str, tuple[float, float]] = collections.OrderedDict()
         self.turned_away = 0
-        """Requests that found no credit."""
+        """Requests that found their bucket empty."""
 
     def admits(self, key: str) -> bool:
         """Whether a request under an actor's key may be looked at; counts it if not."""

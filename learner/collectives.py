@@ -20,8 +20,10 @@ AXIS = "rank"
 REPLICATED = PartitionSpec()
 
 
-def spread(tree: Any, mesh: Mesh, specs: Any = REPLICATED) -> Any:
+def shard(tree: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
     """Arrays over all of the mesh from this process's part of them; `specs` are those of `jax.shard_map`."""
+    if mesh is None:
+        return tree
     devices = [device for device in mesh.devices.flat if device.process_index == jax.process_index()]
 
     def place(spec: PartitionSpec, array: Array) -> Array:
@@ -34,20 +36,20 @@ def spread(tree: Any, mesh: Mesh, specs: Any = REPLICATED) -> Any:
     return jax.tree.map(lambda spec, part: jax.tree.map(lambda x: place(spec, x), part), specs, tree)
 
 
-def over(mesh: Mesh | None, program: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
+def shard_map(mesh: Mesh | None, program: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
     """The program run by every process on its own part, for `jax.jit`; what it returns is the same for all of them."""
     if mesh is None:
         return program
     return jax.shard_map(program, mesh=mesh, in_specs=in_specs, out_specs=REPLICATED, check_vma=False)
 
 
-def local(tree: Any, mesh: Mesh | None) -> Any:
+def unreplicate(tree: Any, mesh: Mesh | None) -> Any:
     """Replicated arrays on this process's first device alone."""
     return tree if mesh is None else jax.tree.map(lambda x: x.addressable_data(0), tree)
 
 
-class Across:
-    """Reductions over the mesh, for code inside `jax.shard_map`; without a mesh they leave everything as it is."""
+class Collectives:
+    """Reductions over the mesh, for code inside `shard_map`; without a mesh they leave everything as it is."""
 
     def __init__(self, mesh: Mesh | None):
         """Over the mesh that the code runs on."""
@@ -65,7 +67,7 @@ class Across:
         return x if self._alone else jax.lax.pmax(x, AXIS)
 
     def variance(self, x: Array) -> Array:
-        """Of all entries together."""
+        """Of all entries of all ranks."""
         centred = x - self.mean(jnp.mean(x))
         return self.mean(jnp.mean(centred * centred))
 

@@ -1,4 +1,4 @@
-"""Which rollouts of an actor's incarnation were decided on, so that none is taken twice."""
+"""Sequence deduplication: which rollouts of an actor's incarnation were decided on, so that none is taken twice."""
 
 import dataclasses
 
@@ -8,8 +8,8 @@ _WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one a
 
 
 @dataclasses.dataclass
-class Marks:
-    """Which rollouts of an incarnation were decided on: all below `next` but those skipped, and those in `ahead`."""
+class Sequences:
+    """An incarnation's sequence numbers that were decided on: all below `next` but those skipped, and `ahead`."""
 
     next: int = 0
     ahead: set[int] = dataclasses.field(default_factory=set)

@@ -1,0 +1,25 @@
+"""The learner's algorithms, by the names that a run's configuration chooses them by."""
+
+from collections.abc import Callable
+
+from common.config import RunConfig
+from common.errors import CongraspError
+from common.policy.bundle import PolicySpec
+from learner.algorithms.ppo import PPO
+from learner.algorithms.protocol import Algorithm
+
+ALGORITHMS: dict[str, Callable[[PolicySpec, RunConfig], Algorithm]] = {
+    "ppo": lambda spec, config: PPO(spec, config.ppo),
+}
+"""Factories by name: of the policy's spec and the run's configuration."""
+
+
+def make_algorithm(spec: PolicySpec, config: RunConfig) -> Algorithm:
+    """The algorithm that the run's configuration names.
+
+    Raises:
+      CongraspError: there is none of that name.
+    """
+    if config.algorithm not in ALGORITHMS:
+        raise CongraspError(f"There is no algorithm '{config.algorithm}'.", f"Choose among {', '.join(ALGORITHMS)}.")
+    return ALGORITHMS[config.algorithm](spec, config)

@@ -1,0 +1,377 @@
+"""Decoupled PPO (`learner.algorithms.losses`) with generalised advantages and a learning rate that follows the KL.
+
+The batch keeps its axis of worlds: arrays are (T, B, ...) with the worlds of all rollouts side by side, on whatever
+device they were made. Everything between the batch and the new weights is one compiled program; hyperparameters are
+traced, so that other settings need no other compilation. The optimiser's moments are donated to it, the weights are
+not: the bundle that was published with them may still be in use in this process. The host keeps the running statistics
+(`common.policy.normalizer`) and the counters, and sees scalars alone.
+
+Several processes, each with a batch of its own, make one update over a mesh of their devices: gradients, advantages'
+statistics and metrics are averaged inside the program, once in each minibatch, and moments are gathered in rank order,
+so that all of them come to the same weights and statistics, bit for bit.
+"""
+
+import functools
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.sharding import Mesh
+
+from common.config import PPOConfig
+from common.errors import CongraspError
+from common.policy import network, normalizer
+from common.policy.bundle import PolicySpec
+from common.policy.network import Layout, Params
+from common.policy.normalizer import Affine, Statistics
+from common.task.types import Array
+from common.wire.schema import RECORDED, Schema
+from learner.algorithms import gae, losses
+from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from learner.batch import partition_specs
+from learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+
+_SPECS = partition_specs(RECORDED)
+_CHECKED_INPUTS = tuple(name for name, spec in RECORDED.items() if spec.dtypes != ("bool",))
+_CHECKED = (
+    *_CHECKED_INPUTS,
+    "value",
+    "policy loss",
+    "value loss",
+    "KL divergence",
+    "actor gradient",
+    "critic gradient",
+)
+_FINE = -1  # no term was non-finite; otherwise an index into _CHECKED
+_RATE_FACTOR = 1.5
+
+Learnt = tuple[Params, Any, Array]
+"""Parameters, the optimiser's state and the random key: the entries of a `TrainState` that live on the device."""
+_ON_DEVICE = 3  # entries of a TrainState
+
+
+class _Given(NamedTuple):
+    """What an update learns from, beside the state."""
+
+    batch: dict[str, Array]
+    observations: Affine
+    """Normalisation of observations, frozen."""
+    returns: Affine
+    """Normalisation of returns, frozen."""
+    hyper: dict[str, Any]
+    """The hyperparameters that are arguments of the compiled program; the others are part of it."""
+
+
+class PPO:
+    """Decoupled PPO, an `Algorithm`."""
+
+    batch_schema: Schema = RECORDED
+
+    def __init__(self, spec: PolicySpec, config: PPOConfig):
+        """For a policy's networks, with these hyperparameters."""
+        self._spec, self._config = spec, config
+
+    def init(self, seed: int, initial: Policy | None = None) -> TrainState:
+        """The state before the first update."""
+        initial = initial or random_policy(seed, self._spec)
+        params = jax.tree.map(jnp.asarray, initial.params)
+        return TrainState(
+            params,
+            _optimizer(self._config.learning_rate, self._config.max_grad_norm).init(params),
+            jax.random.PRNGKey(seed),
+            initial.observation,
+            initial.value,
+            version=0,
+            transitions=0,
+        )
+
+    def policy(self, state: TrainState) -> Policy:
+        """Parameters and normalisers."""
+        return Policy(state.params, state.observation, state.value)
+
+    def update(
+        self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None
+    ) -> tuple[TrainState, dict[str, float]]:
+        """Epochs of minibatches over a batch; see `Algorithm.update`.
+
+        The normalisers are frozen during the update and take the batch in afterwards; only the first batch is also what
+        the first update normalises by. The critic's output layer is adapted to the moved value statistics so that its
+        estimates do not change with them (van Hasselt et al. 2016, arXiv 1602.07714). Rewards are not scaled yet.
+
+        Raises:
+          NonFiniteUpdate: naming the first term that was not finite.
+          CongraspError: if there are more minibatches than transitions.
+        """
+        layout, config = self._spec.layout, self._config
+        if batch["reward"].size < config.minibatches:
+            raise CongraspError(
+                f"A batch of {batch['reward'].size} transitions does not make {config.minibatches} minibatches.",
+                "Use fewer minibatches, more environments or longer rollouts.",
+            )
+        arrays = shard({name: batch[name] for name in RECORDED}, mesh, _SPECS)
+        moments = _observed(arrays["observation"], mesh=mesh)
+        frozen = state.observation if state.observation.count else normalizer.merge(*_ranks(unreplicate(moments, mesh)))
+        given = _Given(
+            arrays,
+            normalizer.observation_affine(frozen, layout),
+            normalizer.value_affine(state.value),
+            {name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)},
+        )
+        learnt, returns, failure, scalars = _optimise(
+            *shard(state[:_ON_DEVICE], mesh),
+            given,
+            layout=layout,
+            epochs=config.epochs,
+            minibatches=config.minibatches,
+            mesh=mesh,
+        )
+        learnt, moments, returns, failure, scalars = unreplicate((learnt, moments, returns, failure, scalars), mesh)
+        moments, returns, failure, scalars = jax.device_get((moments, returns, failure, scalars))
+        state = TrainState(*learnt, *state[_ON_DEVICE:])
+        if failure != _FINE:
+            source = "rollouts" if _CHECKED[failure] in _CHECKED_INPUTS else "optimisation"
+            raise NonFiniteUpdate(_CHECKED[failure], source, state)
+        value = normalizer.merge(state.value, *_ranks(returns))
+        state = state._replace(
+            params=_preserve_values(state.params, normalizer.value_affine(state.value), normalizer.value_affine(value)),
+            observation=normalizer.merge(state.observation, *_ranks(moments)),
+            value=value,
+            version=state.version + 1,
+            transitions=state.transitions + arrays["reward"].size,
+        )
+        return state, {name: float(scalar) for name, scalar in scalars.items()}
+
+
+@optax.inject_hyperparams
+def _optimizer(learning_rate: Array | float, max_grad_norm: Array | float) -> optax.GradientTransformation:
+    """Adam on clipped gradients; the networks share no weight, so one's large gradient must not shrink the other's."""
+    clip = optax.clip_by_global_norm(max_grad_norm)
+    clips = optax.partition({"actor": clip, "critic": clip}, {"actor": "actor", "critic": "critic"})
+    return optax.chain(clips, optax.adam(learning_rate, eps=1e-5))
+
+
+def _with(optimizer: Any, **hyperparams: Array) -> Any:
+    """The optimiser's state with other hyperparameters."""
+    return optimizer._replace(hyperparams={**optimizer.hyperparams, **hyperparams})
+
+
+def _ranks(gathered: Statistics) -> list[Statistics]:
+    """The statistics of each rank from those that `Collectives.gather` stacked."""
+    return [Statistics(*(entry[i] for entry in gathered)) for i in range(len(gathered.count))]
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def _observed(observation: Array, *, mesh: Mesh | None) -> Statistics:
+    """Moments of each rank's observations, stacked."""
+
+    def program(observation: Array) -> Statistics:
+        return Collectives(mesh).gather(normalizer.moments(observation, event_axes=1))
+
+    return shard_map(mesh, program, _SPECS["observation"])(observation)
+
+
+@functools.partial(jax.jit, static_argnames=("layout", "epochs", "minibatches", "mesh"), donate_argnames="optimizer")
+def _optimise(
+    params: Params,
+    optimizer: Any,
+    key: Array,
+    given: _Given,
+    *,
+    layout: Layout,
+    epochs: int,
+    minibatches: int,
+    mesh: Mesh | None,
+) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
+    """Epochs over the batch; returns what was learnt, moments of the returns, the failed term, and metrics."""
+    program = functools.partial(
+        _program, collectives=Collectives(mesh), layout=layout, epochs=epochs, minibatches=minibatches
+    )
+    specs = REPLICATED, _Given._make([_SPECS, *[REPLICATED] * 3])
+    return shard_map(mesh, program, specs)((params, optimizer, key), given)
+
+
+class _Evaluation(NamedTuple):
+    """A batch as the proximal policy and the critic see it; leading axes (T, B)."""
+
+    samples: losses.Sample
+    """Observations are not normalised yet: gathering a minibatch's rows in half precision is cheaper."""
+    log_weight: Array
+    """Log of proximal over behaviour probability."""
+    weight: Array
+    """The same, truncated."""
+    value: Array
+    """In the unit of the scaled rewards, as are the `returns`."""
+    returns: Array
+    advantage_std: Array
+    """() over all ranks."""
+
+
+def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: Layout) -> _Evaluation:
+    """Advantages, targets and importance weights, which stay fixed during the update."""
+    batch, hyper = given.batch, given.hyper
+    action, behaviour = batch["action"], batch["log_probability"]
+    log_std = params["actor"]["log_std"]
+    observation = normalizer.apply(given.observations, batch["observation"])
+    exact, _ = network.policy(params, layout, observation)
+    log_exact = network.log_probability(exact, log_std, action)
+    weight = losses.importance_weight(log_exact, behaviour, hyper["importance_max"])
+    mean, _ = network.policy(params, layout, observation, exact=False)
+
+    def values(normalised: Array) -> Array:
+        return network.value(params, layout, normalised) / given.returns.scale + given.returns.shift
+
+    value = values(observation)
+    last_value = values(normalizer.apply(given.observations, batch["last_observation"]))
+    reward = batch["reward"] * hyper["reward_scale"]
+    advantage, returns = gae.advantages(
+        reward, value, last_value, batch["terminal"], hyper["gamma"], hyper["gae_lambda"]
+    )
+    advantage_std = jnp.sqrt(collectives.variance(advantage))
+    samples = losses.Sample(
+        observation=batch["observation"],
+        action=action,
+        log_proximal=jnp.where(hyper["decoupled"], network.log_probability(mean, log_std, action), behaviour),
+        mean_proximal=mean,
+        weight=jnp.where(hyper["decoupled"], weight, 1.0),
+        advantage=(advantage - collectives.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
+        target=(returns - given.returns.shift) * given.returns.scale,
+    )
+    return _Evaluation(samples, log_exact - behaviour, weight, value, returns, advantage_std)
+
+
+def _program(
+    learnt: Learnt, given: _Given, *, collectives: Collectives, layout: Layout, epochs: int, minibatches: int
+) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
+    """What `_optimise` compiles, for one rank."""
+    (params, optimizer, key), hyper = learnt, given.hyper
+    evaluation = _evaluate(params, given, collectives, layout)
+    inputs = [given.batch[name] for name in _CHECKED_INPUTS]
+    failure = collectives.max(_first_failure(jnp.int32(_FINE), 0, *inputs, evaluation.value))
+    key, epochs_key = jax.random.split(key)
+    learning_rate = optimizer.hyperparams["learning_rate"]
+    params, optimizer, failure, (terms, norms) = _epochs(
+        params,
+        _with(optimizer, max_grad_norm=jnp.float32(hyper["max_grad_norm"])),
+        failure,
+        jax.random.split(collectives.own_key(epochs_key), epochs),
+        jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), evaluation.samples),
+        params["actor"]["log_std"],
+        given,
+        collectives,
+        layout,
+        minibatches,
+    )
+    kl = jnp.mean(terms.kl[-1])
+    metrics = {name: jnp.mean(term) for name, term in terms._asdict().items()}
+    metrics |= {f"{name}_grad_norm": jnp.mean(norm) for name, norm in norms.items()}
+    metrics |= {
+        "kl": kl,
+        "learning_rate": learning_rate,
+        "action_std": jnp.mean(jnp.exp(params["actor"]["log_std"])),
+    }
+    metrics |= _batch_metrics(given, evaluation, collectives)
+    optimizer = _with(optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
+    return (params, optimizer, key), collectives.gather(normalizer.moments(evaluation.returns)), failure, metrics
+
+
+def _batch_metrics(given: _Given, evaluation: _Evaluation, collectives: Collectives) -> dict[str, Array]:
+    """Scalars about a batch and how old its policy is, over all ranks."""
+    variance = collectives.variance(evaluation.returns)
+    residual = collectives.variance(evaluation.returns - evaluation.value)
+    truncated = evaluation.log_weight > jnp.log(given.hyper["importance_max"])
+    return {
+        "importance_max": collectives.max(jnp.max(evaluation.weight)),
+        "explained_variance": 1.0 - residual / (variance + 1e-8),
+        "advantage_std": evaluation.advantage_std,
+        **collectives.mean(
+            {
+                "importance_mean": jnp.mean(evaluation.weight),
+                "importance_truncated": jnp.mean(truncated.astype(jnp.float32)),
+                "behaviour_kl": -jnp.mean(evaluation.log_weight),
+                "reward_mean": jnp.mean(given.batch["reward"]),
+                "return_mean": jnp.mean(evaluation.returns),
+                "value_mean": jnp.mean(evaluation.value),
+            }
+        ),
+    }
+
+
+def _epochs(
+    params: Params,
+    optimizer: Any,
+    failure: Array,
+    keys: Array,
+    samples: losses.Sample,
+    log_std_proximal: Array,
+    given: _Given,
+    collectives: Collectives,
+    layout: Layout,
+    minibatches: int,
+) -> tuple[Params, Any, Array, tuple[losses.Terms, dict[str, Array]]]:
+    """Shuffled minibatches, each sample at most once an epoch; the remainder of the division sits an epoch out.
+
+    The observations of `samples` are not normalised yet.
+    """
+    count = samples.advantage.shape[0]
+    size, hyper = count // minibatches, given.hyper
+    coefficients = losses.Coefficients(hyper["clip"], hyper["entropy"], hyper["value_coefficient"])
+    gradient = jax.value_and_grad(losses.objective, has_aux=True)
+    transform = _optimizer(0.0, 0.0)  # the hyperparameters are those of its state
+
+    def step(carry: tuple[Params, Any, Array], rows: Array):
+        params, optimizer, failure = carry
+        minibatch = jax.tree.map(lambda x: x[rows], samples)
+        minibatch = minibatch._replace(observation=normalizer.apply(given.observations, minibatch.observation))
+        (_, terms), gradients = gradient(params, layout, log_std_proximal, minibatch, coefficients)
+        terms, gradients = collectives.mean((terms, gradients))
+        norms = {name: optax.tree.norm(tree) for name, tree in gradients.items()}
+        failure = _first_failure(
+            failure,
+            len(_CHECKED_INPUTS) + 1,
+            terms.policy_loss,
+            terms.value_loss,
+            terms.kl,
+            norms["actor"],
+            norms["critic"],
+        )
+        steps, moved_optimizer = transform.update(gradients, optimizer, params)
+        moved = optax.apply_updates(params, steps)
+        params, optimizer = jax.tree.map(
+            lambda new, old: jnp.where(failure == _FINE, new, old), (moved, moved_optimizer), (params, optimizer)
+        )
+        return (params, optimizer, failure), (terms, norms)
+
+    def epoch(carry: tuple[Params, Any, Array], key: Array):
+        order = jax.random.permutation(key, count)[: size * minibatches]
+        return jax.lax.scan(step, carry, order.reshape(minibatches, size))
+
+    (params, optimizer, failure), metrics = jax.lax.scan(epoch, (params, optimizer, failure), keys)
+    return params, optimizer, failure, metrics
+
+
+def _first_failure(failure: Array, offset: int, *terms: Array) -> Array:
+    """`failure` if it names a term already, else `offset` plus the index of the first term that is not finite."""
+    bad = jnp.stack([~jnp.all(jnp.isfinite(term)) for term in terms])
+    found = jnp.where(jnp.any(bad), offset + jnp.argmax(bad).astype(jnp.int32), _FINE)
+    return jnp.where(failure == _FINE, found, failure)
+
+
+def _adapt_rate(rate: Array, kl: Array, hyper: dict[str, Array]) -> Array:
+    """The next update's learning rate from the mean KL to the proximal policy over the last epoch."""
+    target = hyper["kl_target"]
+    factor = jnp.where(kl > 2.0 * target, 1.0 / _RATE_FACTOR, jnp.where(kl < target / 2.0, _RATE_FACTOR, 1.0))
+    return jnp.clip(rate * factor, *hyper["learning_rate_range"])
+
+
+@jax.jit
+def _preserve_values(params: Params, before: Affine, after: Affine) -> Params:
+    """The critic with its output layer changed such that its estimates stay the same under another normalisation."""
+    output = params["critic"]["output"]
+    ratio = after.scale / before.scale
+    moved = {
+        "kernel": output["kernel"] * ratio,
+        "bias": output["bias"] * ratio + (before.shift - after.shift) * after.scale,
+    }
+    return {**params, "critic": {**params["critic"], "output": moved}}

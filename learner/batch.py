@@ -1,0 +1,32 @@
+"""A batch: rollouts side by side along their axis of worlds, which is also the one that ranks divide it along."""
+
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec
+
+from common.task.types import Array
+from common.wire.schema import WORLDS, Schema
+from learner.collectives import AXIS
+
+
+def collate(rollouts: Sequence[Mapping[str, Array]], schema: Schema) -> dict[str, Array]:
+    """The schema's arrays of several rollouts of equal length, joined where the rollouts are: on host or device."""
+    if len(rollouts) == 1:
+        return {name: rollouts[0][name] for name in schema}
+    joined = {}
+    for name, spec in schema.items():
+        parts = [rollout[name] for rollout in rollouts]
+        concatenate = jnp.concatenate if isinstance(parts[0], jax.Array) else np.concatenate
+        joined[name] = concatenate(parts, axis=spec.worlds_axis)
+    return joined
+
+
+def partition_specs(schema: Schema) -> dict[str, PartitionSpec]:
+    """How each array of a batch lies on a mesh of ranks: every rank has worlds of its own."""
+    return {
+        name: PartitionSpec(*(AXIS if size == WORLDS else None for size in spec.shape or ()))
+        for name, spec in schema.items()
+    }

@@ -1,0 +1,166 @@
+"""An algorithm from outside: registered by name, it trains in the real learner, and nothing else knows of it."""
+
+import os
+import pathlib
+import subprocess
+import sys
+import threading
+
+import jax
+import numpy as np
+import pytest
+
+from actors.link import ActorLink, RunFinished
+from common.config import PPOConfig, RunConfig, run_config_from_json, to_json
+from common.errors import CongraspError
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle
+from common.transport.memory import MemoryHub, MemoryTransport
+from common.wire.codec import Message
+from learner.algorithms import ALGORITHMS, make_algorithm
+from learner.batch import collate, partition_specs
+from learner.process import run_learner
+from learner.run_directory import create_run
+from services.bench import toy
+from tests.learner.a2c import A2C, SCHEMA
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+WORLDS, UPDATES = 64, 150
+CONFIG = RunConfig(
+    name="t",
+    environments=WORLDS,
+    rollout_steps=toy.STEPS,
+    updates=UPDATES,
+    half_observations=False,
+    network=toy.SPEC.network,
+    algorithm="a2c",
+    ppo=PPOConfig(rollouts_per_update=1, max_staleness=0, gamma=0.9),
+)
+
+
+class ToyActor(threading.Thread):
+    """Sends rollouts of the toy task with the arrays that the learner asks for, until the run is finished."""
+
+    def __init__(self, transport):
+        super().__init__(daemon=True)
+        self.names, self.outcomes, self._transport = (), [], transport
+        self.start()
+
+    def run(self):
+        with ActorLink(self._transport, "t", "a", patience=60.0) as link:
+            self.names = link.config(60.0).arrays
+            try:
+                self._act(link, np.random.default_rng(0))
+            except RunFinished:
+                link.flush(5.0)
+
+    def _act(self, link, rng):
+        bundle, keys = None, jax.random.PRNGKey(0)
+        while True:
+            ticket = link.acquire_ticket(0.5)
+            newer = link.weights(-1 if bundle is None else bundle.version)
+            bundle = bundle if newer is None else PolicyBundle.from_message(newer)
+            if ticket is None or bundle is None:
+                continue
+
+            def act(observation, bundle=bundle):
+                nonlocal keys
+                keys, key = jax.random.split(keys)
+                return bundles.sample_action(toy.LAYOUT, bundle.acting, observation, key)
+
+            recorded = toy.episode(act, WORLDS, rng)
+            arrays = recorded if not self.outcomes else {name: recorded[name] for name in self.names}
+            meta = {"version": bundle.version, "schema": bundle.spec.schema, "steps": WORLDS * toy.STEPS}
+            self.outcomes.append(link.upload(Message(arrays, meta), ticket))
+
+
+@pytest.mark.timeout(120)
+def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypatch):
+    """Wire check, warm-up, updates, checkpoint, resume and publication follow from its four members alone."""
+    monkeypatch.setitem(ALGORITHMS, "a2c", A2C)
+    monkeypatch.setattr(bundles, "policy_spec", lambda task, sizes: toy.SPEC)
+    create_run(tmp_path, CONFIG)
+    hub, events, stop = MemoryHub(), [], threading.Event()
+    actor = ToyActor(MemoryTransport(hub))
+
+    def learn(resume):
+        with MemoryTransport(hub) as transport:
+            return run_learner(
+                tmp_path, CONFIG, transport, stop_event=stop, resume=resume,
+                on_update=lambda values: values["update"] == UPDATES // 2 and not resume and stop.set(),
+                on_event=lambda level, text: events.append(text),
+            )  # fmt: skip
+
+    half = learn(resume=False)
+    stop.clear()
+    last = learn(resume=True)
+    actor.join(10.0)
+    assert actor.names == tuple(SCHEMA)
+    assert [outcome.result(0) for outcome in actor.outcomes[:3]] == ["refused", "accepted", "accepted"]
+    assert any("unknown array 'log_probability'" in text for text in events)
+    assert half.version == UPDATES // 2 and last.transitions == UPDATES * WORLDS * toy.STEPS
+    assert toy.mean_return(last) > toy.mean_return(half) > toy.STANDING_STILL / 2
+    assert toy.mean_return(last) > toy.HALVING
+    shipped = bundles.load(tmp_path / "policy.safetensors")
+    jax.tree.map(np.testing.assert_array_equal, shipped.params, jax.device_get(last.params))
+
+
+TWO_DEVICES = """
+import jax, numpy as np
+from jax.sharding import Mesh
+from common.config import RunConfig
+from learner.batch import collate
+from learner.collectives import AXIS
+from services.bench import toy
+from tests.learner.a2c import A2C, SCHEMA
+from tests.learner.test_ppo import rollout
+
+mesh = Mesh(np.array(jax.devices()), (AXIS,))
+assert mesh.size == 2
+a2c = A2C(toy.SPEC, RunConfig())
+one, two = a2c.init(0), a2c.init(0)
+for seed in range(3):
+    batch = collate([rollout(toy.bundle_of(one), seed)], SCHEMA)
+    batch["reward"][:, :32] *= 3.0  # the halves are unlike
+    one, expected = a2c.update(one, batch)
+    two, metrics = a2c.update(two, batch, mesh)
+    assert two.transitions == one.transitions
+    for name, value in expected.items():
+        np.testing.assert_allclose(metrics[name], value, rtol=2e-3, atol=2e-5, err_msg=name)
+jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4), two.params, one.params)
+"""
+
+
+@pytest.mark.timeout(120)
+def test_its_batch_is_divided_between_two_devices():
+    environment = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": str(ROOT),
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", TWO_DEVICES], env=environment, capture_output=True, text=True, timeout=100.0
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_batch_is_joined_and_divided_along_the_axis_of_worlds():
+    def still(observation):
+        return np.zeros((len(observation), 1)), np.zeros(len(observation))
+
+    rollouts = [toy.episode(still, 3, np.random.default_rng(seed)) for seed in (0, 1)]
+    batch = collate(rollouts, SCHEMA)
+    assert batch.keys() == SCHEMA.keys()
+    assert batch["reward"].shape == (toy.STEPS, 6) and batch["last_observation"].shape == (6, 11)
+    np.testing.assert_array_equal(batch["observation"][:, 3:], rollouts[1]["observation"])
+    specs = {name: tuple(spec) for name, spec in partition_specs(SCHEMA).items()}
+    assert specs["action"] == (None, "rank", None) and specs["last_observation"] == ("rank", None)
+
+
+def test_an_unknown_algorithm_is_one_line_and_an_old_configuration_means_ppo():
+    with pytest.raises(CongraspError, match=r"There is no algorithm 'a2c'\. Choose among ppo\.") as caught:
+        make_algorithm(toy.SPEC, CONFIG)
+    assert "\n" not in str(caught.value)
+    old = to_json(RunConfig()).replace('  "algorithm": "ppo",\n', "")
+    assert "algorithm" not in old and run_config_from_json(old) == RunConfig()
