@@ -42,8 +42,8 @@ class WarpPhysics:
 
     The compiled calls see objects only as row numbers. So any number of objects, primitives and meshes mixed, costs
     the same in a step, and `replace_objects` compiles nothing: neither the number of objects nor the size of their
-    meshes is part of a program. Limits: no object may have more pieces of a kind than there are slots
-    (`PRIMITIVE_SLOTS`, `mesh_slots`), and one state at a time may be used after `replace_objects`.
+    meshes is part of a program. No object may have more pieces of a kind than there are slots (`PRIMITIVE_SLOTS`,
+    `mesh_slots`).
     """
 
     name = "warp"
@@ -120,7 +120,8 @@ class WarpPhysics:
     def replace_objects(self, state: WarpState, objects: Sequence[GraspObject]) -> WarpState:
         """Other objects, primitives or meshes, for the worlds that start anew from now on; not to be traced.
 
-        The objects of worlds that go on are kept behind the new ones until the next call.
+        The objects of worlds that go on are kept behind the new ones until the next call. Waits for the step that
+        `state` comes from; no other may be under way, and no other state is valid afterwards.
 
         Args:
           state: of the worlds that go on.
@@ -150,6 +151,7 @@ class WarpPhysics:
         rows, meshes = self._catalogue.rows(objects)
         self._objects = objects
         self._loaded = objects_on(self._device, rows), meshes_on(self._device, meshes)
+        wp.synchronize_device(self._device)  # JAX's stream does not wait for Warp's
         for _, worlds in self._worlds.values():
             worlds.fill(*self._loaded)
 

@@ -65,6 +65,7 @@ class WarpWorlds:
             for name in DATA_LEAVES:
                 setattr(leaves, name, getattr(self._data, name))
             leaves.geoms = wp.array(geoms, dtype=int)
+        wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
         leaves.object_body, leaves.object_dof = where.object_body, where.object_qvel[0]
         leaves.base_body, leaves.table, leaves.anchor = where.base_body, where.table_mocap, where.anchor_mocap
         leaves.weld, leaves.table_away = where.weld, TABLE_AWAY[2]
@@ -99,7 +100,8 @@ class WarpWorlds:
         if not self._device.is_cuda:
             self._substep_all()
         else:
-            self._graph = self._graph or self._capture()
+            if self._graph is None:
+                self._graph = self._capture()
             wp.capture_launch(self._graph)
         for mine, given in (*state, (data.sensordata, sensordata), (self._occupancy, occupancy)):
             wp.copy(given, mine)
