@@ -42,6 +42,10 @@ def make_physics(
         from actors.physics.native import NativePhysics
 
         return NativePhysics(hand, task, objects, threads)
+    if chosen == "warp":
+        from actors.physics.warp import WarpPhysics
+
+        return WarpPhysics(hand, task, objects)
     from actors.physics.mjx import MjxPhysics
 
-    return MjxPhysics(hand, task, objects, "warp" if chosen == "warp" else "jax")
+    return MjxPhysics(hand, task, objects)

@@ -1,11 +1,11 @@
-"""MJX, in its two implementations: `warp` (NVIDIA kernels, also runs on a CPU for tests) and `jax` (XLA, any device).
+"""MJX in its own implementation, which XLA compiles for any device.
 
 The state is a pytree and every call can be traced, so that a whole rollout compiles into one program.
 """
 
 import functools
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import numpy as np
 from mujoco import mjx
 
 from actors.physics.engine import Readout, World, where_worlds
-from actors.physics.readout import diverged, readout
+from actors.physics.readout import diverged, initial_qpos, readout
 from actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, addresses
 from actors.physics.slots import Pool
 from common.config import TaskConfig
@@ -22,11 +22,6 @@ from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.task.types import CONTACTS_PER_LINK, Array
-
-CONTACTS_PER_WORLD = 40
-"""Contacts that warp's shared list holds for each world on average."""
-CONSTRAINTS_PER_WORLD = 320
-"""Constraint rows that warp holds for each world."""
 
 
 class MjxState(NamedTuple):
@@ -45,52 +40,37 @@ class MjxState(NamedTuple):
 class MjxPhysics:
     """A batch of worlds in MJX."""
 
+    name = "jax"
     compiled = True
 
-    def __init__(
-        self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], implementation: Literal["warp", "jax"]
-    ):
+    def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]):
         """Puts the pool's model on the device.
 
         Args:
           hand: the hand.
           task: timing and collision settings.
           objects: the pool that `World.object_index` points into.
-          implementation: `warp` or `jax`.
 
         Raises:
-          CongraspError: MJX-JAX is to simulate collisions between the hand's links.
+          CongraspError: collisions between the hand's links are to be simulated.
         """
-        if implementation == "jax" and task.hand_self_collision:
+        if task.hand_self_collision:
             raise CongraspError(
                 "The engine 'jax' has no contacts between the links of a hand (--task.hand-self-collision).",
                 "Take --physics native or warp.",
             )
-        self.name: str = implementation
         self._task = task
         self._pool = pool = Pool(hand, task, objects)
         self._where = addresses(pool.model, hand)
         self._links = np.array([pool.model.body(link.name).id for link in hand.links])
         self._nq, self._nv, self._nu = pool.model.nq, pool.model.nv, pool.model.nu
-        if implementation == "jax":
-            # MJX-JAX has no contact sensor between bodies; its contacts are read from the contact list instead.
-            pool.model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
-            pool.model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN
-        else:
-            # Measured: more iterations of either kind hold no more grasps there. Dense Jacobians cost elliptic cones
-            # twice the whole solver's time.
-            pool.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-            pool.model.opt.iterations, pool.model.opt.ls_iterations, pool.model.opt.tolerance = 4, 10, 1e-5
+        # MJX has no contact sensor between bodies; its contacts are read from the contact list instead.
+        pool.model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
+        pool.model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN
         self._host_model = pool.model
         self._body_of_geom = np.array(pool.model.geom_bodyid)
         self._device = jax.local_devices()[0]  # MJX takes the first one of all ranks unless it is told
-        self._model = self._blind = mjx.put_model(pool.model, device=self._device, impl=implementation)
-        if implementation == "warp":
-            # Warp's kernels print every overflow and iteration limit; thousands of worlds would flood the log.
-            quiet = self._model.opt._impl.replace(warn_overflow=0)
-            self._model = self._model.replace(opt=self._model.opt.replace(_impl=quiet))
-            blind = self._model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
-            self._blind = self._model.replace(opt=self._model.opt.replace(disableflags=blind))
+        self._model = mjx.put_model(pool.model, device=self._device, impl="jax")
         self._objects = self._leaves(objects)
         self._geoms = np.flatnonzero(pool.model.geom_bodyid == self._where.object_body)
         self._shared = {
@@ -104,9 +84,7 @@ class MjxPhysics:
     def start(self, world: World) -> MjxState:
         """Fresh worlds; see `Physics.start`."""
         batch = world.object_index.shape[0]
-        warp = {"naconmax": CONTACTS_PER_WORLD * batch, "njmax": CONSTRAINTS_PER_WORLD}
-        sizes = warp if self.name == "warp" else {}
-        data = mjx.make_data(self._host_model, device=self._device, impl=self.name, **sizes)
+        data = mjx.make_data(self._host_model, device=self._device, impl="jax")
         data = jax.vmap(lambda q: data.replace(qpos=q))(jnp.zeros((batch, self._nq)))
         return self._place(data, self._objects, world)
 
@@ -131,18 +109,12 @@ class MjxPhysics:
         height = jnp.where(table, 0.0, TABLE_AWAY[2])
         data = state.data.replace(ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height))
 
-        def substep(model: Any, data: Any) -> tuple[Any, Array]:
-            axes = self._axes.replace(opt=jax.tree.map(lambda _: None, model.opt))
-            data = jax.vmap(mjx.step, in_axes=(axes, 0))(model.replace(**state.leaves), data)
-            return data, self._usage(data)
+        model = self._model.replace(**state.leaves)
 
-        # Warp senses contacts in the last substep alone; MJX-JAX has no such sensors, and compiles one step only.
-        sensing = int(self._blind is not self._model)
-        length = self._task.substeps - sensing
-        data, usage = jax.lax.scan(lambda data, _: substep(self._blind, data), data, None, length=length)
-        if sensing:
-            data, last = substep(self._model, data)
-            usage = jnp.concatenate([usage, last[None]])
+        def substep(data: Any, _: None) -> tuple[Any, None]:
+            return jax.vmap(mjx.step, in_axes=(self._axes, 0))(model, data), None
+
+        data, _ = jax.lax.scan(substep, data, None, length=self._task.substeps)
         bad = diverged(jnp, data.qpos, data.qvel)[:, None]
         data = data.replace(
             qpos=jnp.where(bad, state.qpos_start, data.qpos),
@@ -151,7 +123,7 @@ class MjxPhysics:
         )
         sensors = jnp.where(bad, 0.0, self._contacts(data))
         state = state._replace(data=data)
-        return state, readout(jnp, where, data.qpos, data.qvel, sensors, bad[:, 0], jnp.max(usage, 0))
+        return state, readout(jnp, where, data.qpos, data.qvel, sensors, bad[:, 0], jnp.zeros(2))
 
     def read(self, state: MjxState) -> Readout:
         """The worlds as they are, without contacts; see `Physics.read`."""
@@ -180,9 +152,7 @@ class MjxPhysics:
         leaves["body_pos"] = tiled["body_pos"].at[:, where.base_body].set(world.base_position)
         leaves["body_quat"] = tiled["body_quat"].at[:, where.base_body].set(world.base_quaternion)
         leaves["geom_friction"] = tiled["geom_friction"].at[:, self._geoms, 0].set(world.friction[:, None])
-        qpos = jnp.zeros((batch, self._nq))
-        qpos = qpos.at[:, where.finger_qpos].set(world.q)
-        qpos = qpos.at[:, where.object_qpos].set(jnp.concatenate([world.object_position, world.object_quaternion], -1))
+        qpos = initial_qpos(where, self._nq, world)
         data = data.replace(
             qpos=qpos,
             qvel=jnp.zeros((batch, self._nv)),
@@ -197,21 +167,10 @@ class MjxPhysics:
         )
         return MjxState(data, leaves, qpos, pool)
 
-    def _usage(self, data: Any) -> Array:
-        """(2,) of `Readout.usage`: warp counts what it finds beyond its buffers, too; MJX-JAX has room for all."""
-        if self.name == "jax":
-            return jnp.zeros(2)
-        found = data._impl
-        contacts = jnp.maximum(found.ncollision, found.nacon).max() / found.naconmax
-        return jnp.stack([contacts, found.nefc.max() / found.njmax])
-
     def _contacts(self, data: Any) -> Array:
         """(B, L * C * 13) in the layout of the contact sensors."""
-        if self.name == "warp":
-            return data.sensordata
-        return jax.vmap(functools.partial(_strongest_contacts, self._body_of_geom, self._links, self._object_body))(
-            data
-        )
+        strongest = functools.partial(_strongest_contacts, self._body_of_geom, self._links, self._object_body)
+        return jax.vmap(strongest)(data)
 
 
 def _strongest_contacts(body_of_geom: np.ndarray, links: np.ndarray, object_body: int, data: Any) -> Array:

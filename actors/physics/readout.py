@@ -1,11 +1,20 @@
-"""From raw `qpos`, `qvel` and contact sensors to a `Readout`; NumPy or JAX arrays alike."""
+"""From a `World` to raw `qpos`, and from `qpos`, `qvel` and contact sensors to a `Readout`; NumPy or JAX arrays."""
 
 import types
 from typing import Any
 
-from actors.physics.engine import MAX_DISTANCE, MAX_SPEED, Readout
+import jax.numpy as jnp
+
+from actors.physics.engine import MAX_DISTANCE, MAX_SPEED, Readout, World
 from actors.physics.scene import SENSOR_WIDTH, Addresses
 from common.task.types import CONTACTS_PER_LINK, Array
+
+
+def initial_qpos(where: Addresses, nq: int, world: World) -> Array:
+    """(B, nq) of worlds that start, as a JAX array: the wrist's joints are zero there."""
+    qpos = jnp.zeros((len(world.q), nq))
+    qpos = qpos.at[:, where.finger_qpos].set(world.q)
+    return qpos.at[:, where.object_qpos].set(jnp.concatenate([world.object_position, world.object_quaternion], -1))
 
 
 def diverged(xp: types.ModuleType, qpos: Array, qvel: Array) -> Array:

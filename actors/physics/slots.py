@@ -1,8 +1,8 @@
 """One model for a whole pool of objects: what differs between objects becomes arrays that are batched over worlds.
 
 Primitive pieces of every object share a fixed number of geom slots, whose sizes and poses are swapped; a slot that an
-object does not use shrinks to 0.4 mm inside it. Mesh pieces cannot be swapped: each mesh object owns its geoms, and
-those of the other objects get a margin that no contact is deep enough for.
+object does not use shrinks to 0.4 mm inside it. Mesh pieces cannot be swapped in a `Pool`: each mesh object owns its
+geoms, and those of the other objects get a margin that no contact is deep enough for.
 """
 
 import dataclasses
@@ -51,7 +51,7 @@ class Pool:
           objects: at most `PRIMITIVE_SLOTS` primitive pieces each; meshes add geoms to the model.
         """
         spec = scene_spec(hand, task)
-        pieces = [Piece(kind, _shrunk(kind)) for kind, count in PRIMITIVE_SLOTS.items() for _ in range(count)]  # type: ignore[arg-type]
+        pieces = empty_slots()
         slots = len(pieces)
         self._owners: list[int] = []
         for n, obj in enumerate(objects):
@@ -76,12 +76,15 @@ class Pool:
           CongraspError: a mesh object that is not of the pool, or more pieces than slots.
         """
         base = {name: getattr(self.model, name).copy() for name in LEAVES}
-        rows = [self._leaves(base, obj, n) for n, obj in enumerate(objects)]
+        data = mujoco.MjData(self.model)
+        rows = [self._leaves(base, data, obj, n) for n, obj in enumerate(objects)]
         for name, value in base.items():
             getattr(self.model, name)[:] = value
         return {name: np.stack([row[name] for row in rows]) for name in LEAVES}
 
-    def _leaves(self, base: dict[str, np.ndarray], obj: GraspObject, index: int) -> dict[str, np.ndarray]:
+    def _leaves(
+        self, base: dict[str, np.ndarray], data: mujoco.MjData, obj: GraspObject, index: int
+    ) -> dict[str, np.ndarray]:
         """Leaves of one object: written into the model, completed by MuJoCo, and copied out."""
         model = self.model
         for name, value in base.items():
@@ -94,28 +97,58 @@ class Pool:
         for geom, owner in zip(self._meshes, self._owners, strict=True):
             if owner != index:
                 model.geom_margin[geom] = _NO_CONTACT
-        free = {kind: [g for g in self._slots if model.geom_type[g] == GEOM_TYPES[kind]] for kind in PRIMITIVE_SLOTS}
-        for piece in obj.pieces:
-            if piece.kind == "mesh":
-                continue
-            if not free[piece.kind]:
-                raise CongraspError(
-                    f"The object '{obj.name}' has more than {PRIMITIVE_SLOTS[piece.kind]} {piece.kind} pieces.",
-                    "Make it of fewer pieces, or import it as a mesh.",
-                )
-            geom = free[piece.kind].pop(0)
-            model.geom_size[geom] = piece.size
-            model.geom_pos[geom] = piece.pos
-            model.geom_quat[geom] = piece.quat
-            model.geom_aabb[geom] = [0, 0, 0, *_half_extent(piece)]
-            model.geom_rbound[geom] = _bounding_radius(piece)
-        body = model.body("object").id
-        principal, axes = np.linalg.eigh(obj.inertia)
-        axes[:, 2] *= np.sign(np.linalg.det(axes))
-        model.body_mass[body], model.body_inertia[body] = obj.mass, principal
-        mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        fill_primitives(model, self._slots, obj)
+        fill_body(model, data, obj)
         return {name: getattr(model, name).copy() for name in LEAVES}
+
+
+def empty_slots() -> list[Piece]:
+    """The primitive slots of a world that has no object in them."""
+    return [Piece(kind, _shrunk(kind)) for kind, count in PRIMITIVE_SLOTS.items() for _ in range(count)]  # type: ignore[arg-type]
+
+
+def fill_primitives(model: mujoco.MjModel, slots: np.ndarray, obj: GraspObject) -> None:
+    """Writes an object's primitive pieces into empty slots.
+
+    Args:
+      model: the model, changed in place.
+      slots: the geoms of `empty_slots`.
+      obj: the object; its mesh pieces are left out.
+
+    Raises:
+      CongraspError: more pieces of a kind than slots.
+    """
+    free = {kind: [g for g in slots if model.geom_type[g] == GEOM_TYPES[kind]] for kind in PRIMITIVE_SLOTS}
+    for piece in obj.pieces:
+        if piece.kind == "mesh":
+            continue
+        if not free[piece.kind]:
+            raise CongraspError(
+                f"The object '{obj.name}' has more than {PRIMITIVE_SLOTS[piece.kind]} {piece.kind} pieces.",
+                "Make it of fewer pieces, or import it as a mesh.",
+            )
+        geom = free[piece.kind].pop(0)
+        model.geom_size[geom] = piece.size
+        model.geom_pos[geom] = piece.pos
+        model.geom_quat[geom] = piece.quat
+        model.geom_aabb[geom] = [0, 0, 0, *_half_extent(piece)]
+        model.geom_rbound[geom] = _bounding_radius(piece)
+
+
+def fill_body(model: mujoco.MjModel, data: mujoco.MjData, obj: GraspObject) -> None:
+    """Writes mass and inertia into the body `object`, and what MuJoCo derives from them.
+
+    Args:
+      model: the model, changed in place.
+      data: scratch memory of that model.
+      obj: the object.
+    """
+    body = model.body("object").id
+    principal, axes = np.linalg.eigh(obj.inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    model.body_mass[body], model.body_inertia[body] = obj.mass, principal
+    mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
+    mujoco.mj_setConst(model, data)
 
 
 def _shrunk(kind: str) -> tuple[float, float, float]:

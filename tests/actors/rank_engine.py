@@ -1,4 +1,4 @@
-"""One of two ranks that starts a world of an engine; says on whose devices it lies. Arguments: rank, port, engine."""
+"""One of two ranks that steps a world of the engine warp; says on whose devices it lies. Arguments: rank, port."""
 
 import sys
 
@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from actors.physics.engine import World
-from actors.physics.mjx import MjxPhysics
+from actors.physics.warp import WarpPhysics
 from common.config import TaskConfig
 from common.hands import get_hand
 from common.objects import procedural
@@ -14,15 +14,16 @@ from learner.ranks import Ranks
 
 
 def main() -> None:
-    rank, port, engine = sys.argv[1:]
+    rank, port = sys.argv[1:]
     ranks = Ranks.join(int(rank), 2, f"127.0.0.1:{port}")
     hand = get_hand("human")
-    physics = MjxPhysics(hand, TaskConfig(), [procedural.generate(0, "box")], engine)
+    physics = WarpPhysics(hand, TaskConfig(), [procedural.generate(0, "box")])
     one, zero, level = jnp.ones(1), jnp.zeros((1, 3)), jnp.array([[1.0, 0.0, 0.0, 0.0]])
     fingers = jnp.zeros((1, len(hand.joints)))
     index = jnp.zeros(1, int)
     state = physics.start(World(index, one, one, zero, level, fingers, zero, level, index > 0))
-    leaves = [leaf for leaf in jax.tree.leaves(state) if isinstance(leaf, jax.Array)]
+    state, seen = physics.step(state, jnp.zeros((1, 6 + len(hand.joints))), index == 0)
+    leaves = [leaf for leaf in jax.tree.leaves((state, seen)) if isinstance(leaf, jax.Array)]
     print(sorted({device.process_index for leaf in leaves for device in leaf.devices()}), len(leaves) > 20)
     ranks.exchange({})
     ranks.close()

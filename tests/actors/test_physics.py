@@ -1,18 +1,16 @@
 """Engines: contacts, resets, guards, holding a weight, and agreement with each other."""
 
 import dataclasses
-import os
-import pathlib
-import subprocess
-import sys
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from actors.environment import start
 
+from actors import initial
 from actors.bank import build_bank
+from actors.initial import InitialConditions
 from actors.physics import resolve_physics
 from actors.physics.engine import World
 from actors.physics.mjx import MjxPhysics
@@ -23,37 +21,40 @@ from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
-from common.transport.ports import free_port
+from common.objects.spec import GraspObject
 
-ROOT = pathlib.Path(__file__).parents[2]
 HAND = get_hand("human")
 TASK = TaskConfig(p_pose=0.0, p_trajectory=0.0, p_affordance=0.0)
 OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "cylinder", "mug"])]
 WORLDS = 3
 
 
-@pytest.fixture(scope="module")
-def env():
-    bank = build_bank(HAND, TASK, OBJECTS, 0)
-    fresh = start(HAND, TASK, bank, jax.random.key(1), WORLDS)
-    # One world for each object.
-    index = jnp.arange(WORLDS)
+def one_each(objects: Sequence[GraspObject]) -> InitialConditions:
+    """Fresh episodes, one for each object."""
+    bank = build_bank(HAND, TASK, objects, 0)
+    fresh = initial.sample(HAND, TASK, bank, jax.random.key(1), len(objects))
+    index = jnp.arange(len(objects))
     rest = bank.rest[index, 0]
     return fresh._replace(
         world=fresh.world._replace(object_index=index, object_position=rest[:, :3], object_quaternion=rest[:, 3:])
     )
 
 
-def _above(world: World, height: float) -> World:
+@pytest.fixture(scope="module")
+def env():
+    return one_each(OBJECTS)
+
+
+def above(world: World, height: float) -> World:
     """The hand far above its object, palm down."""
-    down = np.tile([1.0, 0.0, 0.0, 0.0], (WORLDS, 1)).astype(np.float32)
+    down = np.tile([1.0, 0.0, 0.0, 0.0], (len(world.q), 1)).astype(np.float32)
     position = np.asarray(world.object_position) + np.array([0.0, 0.09, height], np.float32)
     return world._replace(base_position=position, base_quaternion=down)
 
 
-def _grasp(world: World, step: int) -> np.ndarray:
+def grasp(world: World, step: int) -> np.ndarray:
     """A scripted approach: down on the object within 15 steps, then closing."""
-    target = np.zeros((WORLDS, 6 + len(HAND.joints)))
+    target = np.zeros((len(world.q), 6 + len(HAND.joints)))
     target[:, 2] = -0.13 * min(1.0, step / 15)
     closing = np.clip((step - 15) / 20, 0.0, 1.0)
     target[:, 6:] = HAND.q_open + closing * (HAND.q_closed - HAND.q_open)
@@ -62,7 +63,7 @@ def _grasp(world: World, step: int) -> np.ndarray:
 
 def test_objects_rest_and_the_hand_stays_without_commands(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(_above(env.world, 0.3))
+    state = physics.start(above(env.world, 0.3))
     still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(env.world.q)], 1)
     for _ in range(50):
         state, seen = physics.step(state, still, np.ones(WORLDS, bool))
@@ -74,7 +75,7 @@ def test_objects_rest_and_the_hand_stays_without_commands(env):
 
 def test_a_removed_table_lets_objects_fall_freely(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(_above(env.world, 0.3))
+    state = physics.start(above(env.world, 0.3))
     still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(env.world.q)], 1)
     table = np.array([True, False, False])
     for _ in range(20):
@@ -87,11 +88,11 @@ def test_a_removed_table_lets_objects_fall_freely(env):
 
 def test_a_stationary_object_stays_when_pushed(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    world = _above(env.world, 0.19)._replace(stationary=np.ones(WORLDS, bool))
+    world = above(env.world, 0.19)._replace(stationary=np.ones(WORLDS, bool))
     state = physics.start(world)
     touched = np.zeros(WORLDS, bool)
     for step in range(40):
-        state, seen = physics.step(state, _grasp(world, step), np.ones(WORLDS, bool))
+        state, seen = physics.step(state, grasp(world, step), np.ones(WORLDS, bool))
         touched |= seen.contact_found.any((1, 2))
     assert touched.any()
     np.testing.assert_allclose(seen.object_position, env.world.object_position, atol=4e-3)
@@ -166,7 +167,7 @@ def test_gains_hold_half_a_kilogram_without_shaking():
 def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     physics = NativePhysics(HAND, TASK, OBJECTS, 2)
-    world = _above(env.world, 0.3)
+    world = above(env.world, 0.3)
     state = physics.start(world)
     still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(env.world.q)], 1)
     state, _ = physics.step(state, still, np.ones(WORLDS, bool))
@@ -184,16 +185,16 @@ def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp
 def test_a_world_that_was_used_before_is_as_good_as_new(env):
     """Worlds are recycled: neither state nor mass of an earlier episode may be left in them."""
     physics, fresh = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, OBJECTS, 1)
-    world = _above(env.world, 0.19)
+    world = above(env.world, 0.19)
     everywhere = np.ones(WORLDS, bool)
     state = physics.start(world._replace(mass_scale=np.full(WORLDS, 3.0), stationary=everywhere))
     for step in range(30):
-        physics.step(state, _grasp(world, step), ~everywhere)
+        physics.step(state, grasp(world, step), ~everywhere)
     swapped = world._replace(object_index=np.array([2, 0, 0]))
     state, new = physics.reset(state, everywhere, swapped), fresh.start(swapped)
     for step in range(30):
-        state, seen = physics.step(state, _grasp(world, step), everywhere)
-        new, expected = fresh.step(new, _grasp(world, step), everywhere)
+        state, seen = physics.step(state, grasp(world, step), everywhere)
+        new, expected = fresh.step(new, grasp(world, step), everywhere)
     assert seen.contact_found.any()
     for a, b in zip(seen, expected, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -203,7 +204,7 @@ def test_a_world_that_was_used_before_is_as_good_as_new(env):
 
 def test_reset_changes_only_the_masked_worlds(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    world = _above(env.world, 0.3)
+    world = above(env.world, 0.3)
     state = physics.start(world)
     moving = np.concatenate([np.full((WORLDS, 6), 0.05), np.asarray(world.q)], 1)
     for _ in range(10):
@@ -234,30 +235,23 @@ def test_a_pool_may_begin_with_an_object_whose_inertia_is_diagonal():
 
 
 @pytest.mark.timeout(400)
-@pytest.mark.parametrize("implementation", ["warp", "jax"])
-def test_engines_agree(env, implementation, monkeypatch):
+def test_jax_agrees_with_native(env):
     """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
-    from actors.physics import mjx
-
-    world = _above(env.world, 0.19)
+    world = above(env.world, 0.19)
     native = NativePhysics(HAND, TASK, OBJECTS, 1)
-    other = MjxPhysics(HAND, TASK, OBJECTS, implementation)
+    other = MjxPhysics(HAND, TASK, OBJECTS)
     step = jax.jit(other.step)
     a, b = native.start(world), other.start(jax.tree.map(jnp.asarray, world))
     table = np.ones(WORLDS, bool)
     force = np.zeros((2, WORLDS))
     for i in range(40):
-        target = _grasp(world, i)
+        target = grasp(world, i)
         a, x = native.step(a, target, table)
         b, y = step(b, jnp.asarray(target, jnp.float32), jnp.asarray(table))
         if not x.contact_found.any() and i < 10:
             for name in ("q", "u", "object_position", "q_velocity", "u_velocity"):
                 np.testing.assert_allclose(getattr(x, name), getattr(y, name), atol=2e-4, err_msg=f"{name} at {i}")
-            if implementation == "warp":  # what fills its buffers is what MuJoCo C finds
-                found = [sum(cell.data.ncon for cell in native.cells), max(cell.data.nefc for cell in native.cells)]
-                room = [WORLDS * mjx.CONTACTS_PER_WORLD, mjx.CONSTRAINTS_PER_WORLD]
-                np.testing.assert_allclose(y.usage, np.divide(found, room), rtol=1e-5)
-        assert not x.usage.any() and np.all(y.usage <= 1)
+        assert not x.usage.any() and not y.usage.any()
         force += [np.linalg.norm(seen.contact_force, axis=-1).sum((1, 2)) for seen in (x, y)]
     assert force[0].max() > 0, "the script must make contact"
     assert not np.asarray(y.bad).any()
@@ -269,19 +263,13 @@ def test_engines_agree(env, implementation, monkeypatch):
     again = other.read(other.reset(b, mask, jax.tree.map(jnp.asarray, world)))
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(again.u[1:], y.u[1:], atol=1e-6)
-    if implementation == "warp":
-        monkeypatch.setattr(mjx, "CONTACTS_PER_WORLD", 2)
-        _, crowded = step(other.start(jax.tree.map(jnp.asarray, world)), jnp.asarray(target, jnp.float32), table)
-        assert crowded.usage[0] > 1 > crowded.usage[1]
-    else:
-        assert not np.any(y.usage)
     native.close()
 
 
 def test_contacts_between_links_are_refused_where_there_are_none():
     task = dataclasses.replace(TASK, hand_self_collision=True)
     with pytest.raises(CongraspError, match=r"'jax' has no contacts between the links .* native or warp"):
-        MjxPhysics(HAND, task, OBJECTS, "jax")
+        MjxPhysics(HAND, task, OBJECTS)
 
 
 def test_a_demanded_gpu_that_is_missing_is_one_clear_line():
@@ -292,7 +280,7 @@ def test_a_demanded_gpu_that_is_missing_is_one_clear_line():
 
 def test_object_velocity_is_in_the_world_frame(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(_above(env.world, 0.3))
+    state = physics.start(above(env.world, 0.3))
     cell = physics.cells[0]
     spin = np.array([0.0, 0.0, 3.0])  # about the world's vertical
     quaternion = jnp.asarray(cell.data.qpos[physics._where.object_qpos[3:]], jnp.float32)
@@ -301,19 +289,3 @@ def test_object_velocity_is_in_the_world_frame(env):
     physics._qpos[0], physics._qvel[0] = cell.data.qpos, cell.data.qvel
     np.testing.assert_allclose(physics.read(state).object_angular_velocity[0], spin, atol=1e-5)
     physics.close()
-
-
-def test_an_engine_uses_its_own_ranks_device():
-    """Two processes of one job: JAX counts the devices of both, and MJX would take the first."""
-    port, environment = free_port(), {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "tests.actors.rank_engine"]
-    ranks = [
-        subprocess.Popen([*command, str(rank), str(port), "warp"], env=environment, stdout=subprocess.PIPE, text=True)
-        for rank in range(2)
-    ]
-    try:
-        for rank, process in enumerate(ranks):
-            assert process.communicate(timeout=120.0)[0].splitlines()[-1:] == [f"[{rank}] True"]
-    finally:
-        for process in ranks:
-            process.kill()

@@ -1,0 +1,184 @@
+"""Worlds in memory of Warp: what every world shares, what its object fills, and one control step of all of them.
+
+`control_step` is what JAX sees: a pure function of small arrays. Model and data stay in buffers that are allocated once
+for a batch, so that their addresses never change and one CUDA graph of a control step serves every program that calls
+it, wherever JAX puts its own arrays.
+"""
+
+import dataclasses
+import itertools
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from mujoco.mjx.third_party import mujoco_warp
+from warp import JaxCallableGraphMode, jax_callable
+
+from actors.physics.scene import TABLE_AWAY, Addresses
+from actors.physics.warp_kernels import DATA_LEAVES, MODEL_LEAVES, OBJECT_FIELDS, Leaves, Objects, count, place
+
+CONTACTS_PER_WORLD = 40
+"""Contacts that the shared list holds for each world on average."""
+CONSTRAINTS_PER_WORLD = 320
+"""Constraint rows of each world."""
+
+
+class WarpWorlds:
+    """The buffers of a batch of worlds on one device."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        where: Addresses,
+        geoms: np.ndarray,
+        substeps: int,
+        batch: int,
+        device: wp.Device,
+    ):
+        """Allocates them.
+
+        Args:
+          model: what the worlds share.
+          where: indices of the model.
+          geoms: (S,) geoms of the object's slots.
+          substeps: physics steps of a control step.
+          batch: B, number of worlds.
+          device: where the buffers are.
+        """
+        self._substeps, self._device = substeps, device
+        self._graph: wp.Graph | None = None
+        self.limits = np.array([CONTACTS_PER_WORLD * batch, CONSTRAINTS_PER_WORLD], np.float32)
+        """(2,) contacts and constraint rows that there is room for."""
+        with wp.ScopedDevice(device):
+            # A single row would mean that the field is shared, and meshes are then never absent.
+            self._model = mujoco_warp.put_model(model, dict.fromkeys(MODEL_LEAVES, max(batch, 2)))
+            self._data = mujoco_warp.make_data(
+                model, batch, naconmax=CONTACTS_PER_WORLD * batch, njmax=CONSTRAINTS_PER_WORLD
+            )
+            self._occupancy = wp.zeros(2, dtype=int)
+            self._leaves = leaves = Leaves()
+            for name in MODEL_LEAVES:
+                setattr(leaves, name, getattr(self._model, name))
+            for name in DATA_LEAVES:
+                setattr(leaves, name, getattr(self._data, name))
+            leaves.geoms = wp.array(geoms, dtype=int)
+        wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
+        leaves.object_body, leaves.object_dof = where.object_body, where.object_qvel[0]
+        leaves.base_body, leaves.table, leaves.anchor = where.base_body, where.table_mocap, where.anchor_mocap
+        leaves.weld, leaves.table_away = where.weld, TABLE_AWAY[2]
+        # The kernels print every overflow; thousands of worlds would flood the log.
+        self._model.opt.warn_overflow = 0
+        self._sensing = self._model.opt.disableflags
+        self._blind = self._sensing | mujoco_warp.DisableBit.SENSOR
+
+    def fill(self, objects: Objects, meshes: dict[str, Any]) -> None:
+        """Takes what worlds are filled from: rows, and the fields of the model that hold their meshes."""
+        self._objects, self._graph = objects, None
+        for name, value in meshes.items():
+            setattr(self._model, name, value)
+
+    def control_step(
+        self,
+        qpos: Any,
+        qvel: Any,
+        qacc_warmstart: Any,
+        ctrl: Any,
+        placed: Sequence[Any],
+        sensordata: Any,
+        occupancy: Any,
+    ) -> None:
+        """Steps all worlds on the current stream; the first three arrays are changed, the last two written."""
+        data = self._data
+        state = (data.qpos, qpos), (data.qvel, qvel), (data.qacc_warmstart, qacc_warmstart)
+        for mine, given in (*state, (data.ctrl, ctrl)):
+            wp.copy(mine, given)
+        inputs = [*placed, self._objects, self._leaves, self._occupancy]
+        wp.launch(place, (data.nworld, self._leaves.geoms.size), inputs, device=self._device)
+        if not self._device.is_cuda:
+            self._substep_all()
+        else:
+            if self._graph is None:
+                self._graph = self._capture()
+            wp.capture_launch(self._graph)
+        for mine, given in (*state, (data.sensordata, sensordata), (self._occupancy, occupancy)):
+            wp.copy(given, mine)
+
+    def _capture(self) -> wp.Graph:
+        with wp.ScopedCapture() as capture:
+            self._substep_all()
+        return capture.graph
+
+    def _substep_all(self) -> None:
+        """The physics steps of a control step; contacts are sensed in the last one."""
+        model, data = self._model, self._data
+        for left in reversed(range(self._substeps)):
+            model.opt.disableflags = self._blind if left else self._sensing
+            mujoco_warp.step(model, data)
+            counts = [data.ncollision, data.nacon, data.nefc, self._occupancy]
+            wp.launch(count, data.nworld, counts, device=self._device)
+
+
+def objects_on(device: wp.Device, rows: dict[str, np.ndarray]) -> Objects:
+    """The rows of a catalogue on a device."""
+    objects = Objects()
+    for name, dtype in OBJECT_FIELDS.items():
+        value = rows[name].reshape(len(rows[name]), -1, 2, 3) if name == "geom_aabb" else rows[name]
+        setattr(objects, name, wp.array(value, dtype=dtype, device=device))
+    return objects
+
+
+def meshes_on(device: wp.Device, model: mujoco.MjModel) -> dict[str, Any]:
+    """What Warp's model holds of meshes, by the fields' names, on a device."""
+    values: dict[str, Any] = {name: getattr(model, name) for name in ("nmesh", "npolygonmax", "nmeshdegmax")}
+    for field in dataclasses.fields(mujoco_warp.Model):
+        if field.name.startswith("mesh_"):
+            kind: Any = field.type
+            values[field.name] = wp.array(getattr(model, field.name), dtype=kind.dtype, device=device)
+    return values
+
+
+_worlds: "weakref.WeakValueDictionary[int, WarpWorlds]" = weakref.WeakValueDictionary()
+_handles = itertools.count()
+
+
+def register(worlds: WarpWorlds) -> int:
+    """A number by which `control_step` finds these worlds for as long as someone holds them."""
+    handle = next(_handles)
+    _worlds[handle] = worlds
+    return handle
+
+
+def _control_step(
+    handle: int,
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    qacc_warmstart: wp.array2d[float],
+    ctrl: wp.array2d[float],
+    table: wp.array[bool],
+    row: wp.array[int],
+    mass_scale: wp.array[float],
+    friction: wp.array[float],
+    base_position: wp.array[wp.vec3],
+    base_quaternion: wp.array[wp.quat],
+    anchor_position: wp.array[wp.vec3],
+    anchor_quaternion: wp.array[wp.quat],
+    stationary: wp.array[bool],
+    sensordata: wp.array2d[float],
+    occupancy: wp.array[int],
+) -> None:
+    placed = [table, row, mass_scale, friction, base_position, base_quaternion]
+    placed += [anchor_position, anchor_quaternion, stationary]
+    _worlds[handle].control_step(qpos, qvel, qacc_warmstart, ctrl, placed, sensordata, occupancy)
+
+
+control_step = jax_callable(
+    _control_step,
+    num_outputs=5,
+    # `WarpWorlds` captures a graph of its own: Warp's would be of JAX's buffers, and made anew wherever those move to.
+    graph_mode=JaxCallableGraphMode.NONE,
+    vmap_method=None,
+    in_out_argnames=["qpos", "qvel", "qacc_warmstart"],
+)

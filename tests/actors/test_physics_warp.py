@@ -1,0 +1,287 @@
+"""The engine warp on a CPU: a mesh for each world, resets, other objects, compiled loops, agreement with native."""
+
+import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from actors.physics import warp_worlds
+from actors.physics.catalogue import Catalogue
+from actors.physics.engine import World
+from actors.physics.native import NativePhysics
+from actors.physics.scene import compile_scene
+from actors.physics.warp import WarpPhysics
+from common.errors import CongraspError
+from common.objects import procedural
+from common.objects.spec import GraspObject, Piece
+from common.transport.ports import free_port
+from tests.actors.test_physics import HAND, TASK, above, grasp, one_each
+from tests.solids import mujoco_mass_properties
+
+ROOT = pathlib.Path(__file__).parents[2]
+OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "bowl", "mug", "ring"])]
+OTHERS = [procedural.generate(i, family) for i, family in enumerate(["ring", "cylinder", "bowl", "bowl", "box"], 7)]
+
+
+def _worlds(objects: Sequence[GraspObject]) -> World:
+    return jax.tree.map(jnp.asarray, above(one_each(objects).world, 0.19))
+
+
+@pytest.fixture(scope="module")
+def world():
+    return _worlds(OBJECTS)
+
+
+@pytest.fixture(scope="module")
+def others():
+    return _worlds(OTHERS)
+
+
+def _same(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def _picked(world: World, index: list[int]) -> World:
+    return World(*(leaf[np.array(index)] for leaf in world))
+
+
+def _agrees_with_native(objects: Sequence[GraspObject], world: World) -> None:
+    """A scripted grasp: tightly until something is touched and squeezed, statistically after that."""
+    native, warp = NativePhysics(HAND, TASK, objects, 1), WarpPhysics(HAND, TASK, objects)
+    step, batch = jax.jit(warp.step), len(objects)
+    a, b = native.start(world), warp.start(world)
+    table = np.ones(batch, bool)
+    force = np.zeros((2, batch))
+    for i in range(40):
+        target = grasp(world, i)
+        a, x = native.step(a, target, table)
+        b, y = step(b, jnp.asarray(target), jnp.asarray(table))
+        if i < 10:
+            assert not x.contact_found.any()
+            for name in ("q", "u", "object_position", "q_velocity", "u_velocity"):
+                np.testing.assert_allclose(getattr(x, name), getattr(y, name), atol=2e-4, err_msg=f"{name} at {i}")
+        if i == 20:
+            np.testing.assert_allclose(x.contact_force, y.contact_force, atol=0.5)
+            np.testing.assert_allclose(x.object_position, y.object_position, atol=1e-3)
+        force += [np.linalg.norm(seen.contact_force, axis=-1).sum((1, 2)) for seen in (x, y)]
+    assert (force[0] > 0).all(), "the script must touch every object"
+    assert not np.asarray(y.bad).any()
+    np.testing.assert_allclose(x.q, y.q, atol=0.25)
+    np.testing.assert_allclose(x.object_position, y.object_position, atol=0.03)
+    np.testing.assert_allclose(force[0], force[1], rtol=0.35, atol=20.0)
+    native.close()
+    warp.close()
+
+
+@pytest.mark.timeout(400)
+def test_primitives_and_meshes_of_one_pool_agree_with_native(world):
+    _agrees_with_native(OBJECTS, world)
+
+
+def _scanned(folder: pathlib.Path) -> GraspObject:
+    """The convex pieces of a scanned object, as if it had been imported with all their vertices."""
+    hulls = [trimesh.load(file).convex_hull.vertices for file in sorted(folder.glob("contact*.stl"))]
+    pieces = [Piece("mesh", (0.0, 0.0, 0.0), vertices=vertices) for vertices in hulls]
+    mass, center, inertia = mujoco_mass_properties(pieces, [500.0] * len(pieces))
+    pieces = [dataclasses.replace(piece, pos=tuple(-center)) for piece in pieces]
+    low = min(vertices[:, 2].min() for vertices in hulls) - center[2]
+    rest = np.array([[0.0, 0.0, -low, 1.0, 0.0, 0.0, 0.0]])
+    return dataclasses.replace(
+        OBJECTS[1], name=folder.name, pieces=tuple(pieces), mass=mass, inertia=inertia, rest_poses=rest
+    )
+
+
+@pytest.mark.timeout(400)
+def test_scanned_objects_agree_with_native(shared_objects):
+    objects = [_scanned(shared_objects / name) for name in ("camera", "flashlight", "hammer")]
+    assert max(len(obj.pieces) for obj in objects) > 1
+    _agrees_with_native(objects, _worlds(objects))
+
+
+def test_rows_are_what_mujoco_compiles():
+    catalogue = Catalogue(HAND, TASK, OBJECTS[0], 8)
+    before = {name: getattr(catalogue.model, name).copy() for name in ("geom_dataid", "geom_size", "body_mass")}
+    rows, meshes = catalogue.rows(OBJECTS)
+    for name, value in before.items():
+        np.testing.assert_array_equal(getattr(catalogue.model, name), value)
+    for n, obj in enumerate(OBJECTS):
+        scene = compile_scene(HAND, TASK, obj)
+        body = scene.body("object").id
+        np.testing.assert_allclose(rows["body_mass"][n], obj.mass)
+        np.testing.assert_allclose(rows["body_subtreemass"][n], scene.body_subtreemass[[0, body]])
+        np.testing.assert_allclose(rows["body_invweight0"][n], scene.body_invweight0[body], rtol=1e-4)
+        for name in ("body_invweight0", "dof_invweight0"):
+            hand = slice(0, scene.nv - 6) if name.startswith("dof") else slice(0, body)
+            np.testing.assert_allclose(getattr(catalogue.model, name)[hand], getattr(scene, name)[hand], rtol=1e-6)
+        used = [g for g in range(scene.ngeom) if scene.geom_bodyid[g] == body]
+        filled = rows["geom_dataid"][n] >= 0 if not obj.primitive else rows["geom_rbound"][n] > 0.002
+        assert filled.sum() == len(used)
+        for name in ("geom_size", "geom_rbound", "geom_aabb"):
+            mine = np.sort(rows[name][n][filled].reshape(len(used), -1), 0)
+            np.testing.assert_allclose(mine, np.sort(getattr(scene, name)[used].reshape(len(used), -1), 0), atol=1e-6)
+    assert set(rows["geom_dataid"][rows["geom_dataid"] >= 0]) == set(range(meshes.nmesh))
+
+
+def test_a_reset_picks_each_worlds_object_and_leaves_the_others(world):
+    warp, native = WarpPhysics(HAND, TASK, OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
+    step, table = jax.jit(warp.step), jnp.ones(4, bool)
+    state = warp.start(world)
+    for i in range(5):
+        state, _ = step(state, jnp.asarray(grasp(world, i)), table)
+    swapped = _picked(world, [3, 2, 1, 0])
+    mask = jnp.array([True, True, False, True])
+    mixed = World(
+        *(jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(swapped, world, strict=True))
+    )
+    started = jax.jit(warp.reset)(state, mask, swapped)
+    _same(jax.tree.map(lambda leaf: leaf[2], started), jax.tree.map(lambda leaf: leaf[2], state))
+    _same(started.world, mixed)
+    np.testing.assert_array_equal(warp.read(started).u[mask], 0.0)
+    a = native.start(mixed)
+    for i in range(20):
+        a, x = native.step(a, grasp(world, i), np.ones(4, bool))
+        started, y = step(started, jnp.asarray(grasp(world, i)), table)
+    assert x.contact_found[np.asarray(mask)].any((1, 2)).all()
+    for name in ("contact_force", "object_position", "q"):
+        given, expected = getattr(y, name)[mask], getattr(x, name)[mask]
+        np.testing.assert_allclose(given, expected, atol=0.5 if name == "contact_force" else 1e-4, err_msg=name)
+    assert step._cache_size() == 1
+    native.close()
+
+
+def test_other_objects_need_no_compiling_and_worlds_under_way_keep_theirs(world, others):
+    warp, untouched = WarpPhysics(HAND, TASK, OBJECTS), WarpPhysics(HAND, TASK, OBJECTS)
+    step, step_untouched, table = jax.jit(warp.step), jax.jit(untouched.step), jnp.ones(4, bool)
+    state, expected = warp.start(world), untouched.start(world)
+    for i in range(30):
+        target = jnp.asarray(grasp(world, i))
+        if i in (10, 20):
+            state = warp.replace_objects(state, OTHERS if i == 10 else OTHERS[::-1])
+        state, seen = step(state, target, table)
+        expected, seen_untouched = step_untouched(expected, target, table)
+        _same(seen, seen_untouched)
+    assert seen.contact_found.any()
+    native = NativePhysics(HAND, TASK, OTHERS[::-1], 1)
+    new = _picked(others, [4, 3, 2, 0])._replace(object_index=jnp.array([0, 1, 2, 4]))
+    state, a = warp.reset(state, table, new), native.start(new)
+    for i in range(20):
+        state, y = step(state, jnp.asarray(grasp(new, i)), table)
+        a, x = native.step(a, grasp(new, i), np.ones(4, bool))
+    assert x.contact_found.any((1, 2)).all()
+    np.testing.assert_allclose(x.contact_force, y.contact_force, atol=0.5)
+    np.testing.assert_allclose(x.object_position, y.object_position, atol=1e-4)
+    assert step._cache_size() == 1
+    native.close()
+
+
+def test_a_compiled_loop_is_the_same_as_single_steps(world):
+    """Resets in a branch, two loops after one another, and states that are used twice."""
+    warp = WarpPhysics(HAND, TASK, OBJECTS)
+    targets = jnp.stack([jnp.asarray(grasp(world, i)) for i in range(8, 20)])
+    table, swapped = jnp.ones(4, bool), _picked(world, [2, 3, 0, 1])
+
+    def advance(state, row):
+        i, target = row
+        state, seen = warp.step(state, target, table)
+        mask = jnp.array([True, False, False, True])
+        state = jax.lax.cond(i == 3, lambda s: warp.reset(s, mask, swapped), lambda s: s, state)
+        return state, (seen, warp.read(state))
+
+    loop = jax.jit(lambda state: jax.lax.scan(advance, state, (jnp.arange(len(targets)), targets)))
+    first = state = warp.start(world)
+    rows = []
+    for i, target in enumerate(targets):
+        state, row = jax.jit(advance)(state, (jnp.asarray(i), target))
+        rows.append(row)
+    for _ in range(2):  # the first state is still what it was
+        scanned, seen = loop(first)
+        _same(scanned, state)
+        _same(seen, jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
+
+
+def test_meshes_are_absent_from_a_world_alone_too(world):
+    """An unused mesh slot in the middle of a sheet would touch the table."""
+    sheet = dataclasses.replace(OBJECTS[0], pieces=(Piece("box", (0.04, 0.04, 0.0003)),))
+    warp = WarpPhysics(HAND, TASK, [sheet])
+    usage = []
+    for batch in (1, 2):
+        flat = _picked(world, [0] * batch)._replace(
+            object_position=jnp.tile(jnp.array([0.0, 0.0, 0.0003]), (batch, 1)),
+            object_quaternion=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (batch, 1)),
+        )
+        _, seen = warp.step(warp.start(flat), jnp.asarray(grasp(flat, 0)), jnp.ones(batch, bool))
+        usage.append(seen.usage)
+    np.testing.assert_array_equal(*usage)
+
+
+def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(world):
+    warp = WarpPhysics(HAND, TASK, OBJECTS)
+    start = warp.start(world)
+    target, table = jnp.asarray(grasp(world, 0)), jnp.ones(4, bool)
+    state, _ = warp.step(start, target, table)
+    _, expected = warp.step(state, target, table)
+    state, seen = warp.step(state._replace(qvel=state.qvel.at[1].set(jnp.nan)), target, table)
+    np.testing.assert_array_equal(seen.bad, [False, True, False, False])
+    assert all(np.isfinite(field).all() for field in seen)
+    _same(jax.tree.map(lambda leaf: leaf[1], state), jax.tree.map(lambda leaf: leaf[1], start))
+    np.testing.assert_allclose(seen.q[2:], expected.q[2:], atol=1e-6)
+    _, seen = warp.step(state, target, table)
+    assert not seen.bad.any()
+
+
+def test_buffers_are_as_full_as_what_mujoco_finds(world):
+    warp, native = WarpPhysics(HAND, TASK, OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
+    state, a = warp.start(world), native.start(world)
+    for i in range(5):
+        target, table = grasp(world, i), np.ones(4, bool)
+        (state, seen), _ = warp.step(state, jnp.asarray(target), jnp.asarray(table)), native.step(a, target, table)
+        found = [sum(cell.data.ncon for cell in native.cells), max(cell.data.nefc for cell in native.cells)]
+        room = [4 * warp_worlds.CONTACTS_PER_WORLD, warp_worlds.CONSTRAINTS_PER_WORLD]
+        np.testing.assert_allclose(seen.usage, np.divide(found, room), rtol=1e-5)
+    native.close()
+
+
+def test_what_had_no_room_is_counted(world, monkeypatch):
+    monkeypatch.setattr(warp_worlds, "CONTACTS_PER_WORLD", 2)
+    warp = WarpPhysics(HAND, TASK, OBJECTS)
+    _, crowded = warp.step(warp.start(world), jnp.asarray(grasp(world, 0)), jnp.ones(4, bool))
+    assert crowded.usage[0] > 1 > crowded.usage[1]
+
+
+def test_more_pieces_than_slots_are_one_clear_line(world):
+    with pytest.raises(CongraspError, match=r"'bowl.*' has 8 mesh pieces, and the worlds have room for 3"):
+        WarpPhysics(HAND, TASK, OBJECTS, mesh_slots=3)
+    warp = WarpPhysics(HAND, TASK, [OBJECTS[0]], mesh_slots=0)
+    state = warp.start(_picked(world, [0]))
+    with pytest.raises(CongraspError, match="room for 0"):
+        warp.replace_objects(state, [OBJECTS[1]])
+    boxes = dataclasses.replace(OBJECTS[0], pieces=OBJECTS[0].pieces * 4)
+    with pytest.raises(CongraspError, match="more than 3 box pieces"):
+        warp.replace_objects(state, [boxes])
+    _, seen = warp.step(state, jnp.asarray(grasp(state.world, 0)), jnp.ones(1, bool))
+    assert not seen.bad.any()
+
+
+def test_an_engine_uses_its_own_ranks_device():
+    """Two processes of one job: JAX counts the devices of both."""
+    port, environment = free_port(), {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "tests.actors.rank_engine"]
+    ranks = [
+        subprocess.Popen([*command, str(rank), str(port)], env=environment, stdout=subprocess.PIPE, text=True)
+        for rank in range(2)
+    ]
+    try:
+        for rank, process in enumerate(ranks):
+            assert process.communicate(timeout=120.0)[0].splitlines()[-1:] == [f"[{rank}] True"]
+    finally:
+        for process in ranks:
+            process.kill()
