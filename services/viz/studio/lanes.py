@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from common.hands import get_hand
 from common.task.constraints import CONSTRAINTS, Constraint
 from common.wire.codec import Message
-from services.record.goals import active_constraints
+from services.record.goals import active_blocks, active_constraints
 from services.record.poses import link_poses
 
 TOUCH = 0.05
@@ -72,15 +72,12 @@ def for_page(episode: Message) -> Message:
     )
     keep += ("visual_vertices", "visual_faces", "surface_points", "surface_minus")
     arrays: dict[str, Any] = {name: episode.arrays[name] for name in keep}
-    arrays |= {
-        name: np.asarray(value)
-        for name, value in episode.arrays.items()
-        if name.startswith(("reward/", "goal/", "active/"))
-    }
+    arrays |= {name: value for name, value in episode.arrays.items() if name.startswith(("reward/", "goal/"))}
+    arrays |= {f"active/{block}": np.array(on) for block, on in active_blocks(episode.arrays).items()}
     for name, lane in found.items():
         arrays |= {f"lane/{name}/met": lane.met, f"lane/{name}/counts": lane.counts}
         arrays |= {f"lane/{name}/{unit}": np.asarray(value, np.float32) for unit, value in lane.errors.items()}
-    if "pose" in found:
+    if "pose" in active_constraints(episode.arrays):
         hand, turn = get_hand(str(episode.meta["hand"])), _turn(episode.arrays["goal/pose_quaternion"])
         position, quaternion = link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
         arrays["ghost_position"] = (turn.apply(position) + episode.arrays["goal/pose_position"]).astype(np.float32)

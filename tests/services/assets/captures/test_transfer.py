@@ -10,7 +10,7 @@ from common.hands import get_hand
 from common.hands.human import HUMAN
 from common.hands.kinematics import grasp_frame, keypoints, link_transforms
 from services.assets.captures.fit import joint_positions
-from services.grasp.constraint_sets import describe, bank_of
+from services.grasp.constraint_sets import bank_of, describe
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write
 

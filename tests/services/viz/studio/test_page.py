@@ -208,7 +208,7 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
     assert (tmp_path / "motion.glb").read_bytes()[:4] == b"glTF"
     opened.click("#edit")
     opened.wait_for_selector("#player", state="hidden")
-    assert site.grasping.asked[-1].obj.name == "mug_1"
+    assert site.grasping.asked[-1][0].name == "mug_1"
     assert handle(opened, "tail") == pytest.approx(tail, abs=1.0)  # the constraints are seen from where they were
 
 
