@@ -24,8 +24,8 @@ from common.policy import network
 from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.normalizer import Statistics
 from common.policy.pretrained import policy_file
-from common.task import observation
 from common.request import GraspRequest
+from common.task import observation
 from common.task.constraints import blocks, goal_of
 from common.task.features import scene_of
 from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from actors.attempts import Outcome
 
+from actors.attempts import Outcome
 from common.errors import CongraspError, TransportError
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle

@@ -68,7 +68,13 @@ def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:
     assert lane.errors["share"][-1] == pytest.approx(0.2)
 
 
-def test_a_constraint_without_blocks_of_the_paper_has_a_lane_too() -> None:
+def test_of_a_pose_whose_wrist_the_path_decides_on_only_the_fingers_count() -> None:
+    made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 1, 0, 1)), pose_m=0.2)
+    pose = lanes(made)["pose"]
+    assert pose.met[-1] and set(pose.errors) == {"rad"} and "distance" not in pose.words
+
+
+def test_every_constraint_with_recorded_errors_has_a_lane() -> None:
     made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)), fingers_ratio=0.25)
     lane = lanes(Message({**made.arrays, "active/fingers": np.bool_(True)}, made.meta))["fingers"]
     assert not lane.met.any() and lane.words == "share of touching links of other fingers: 0 % at most"
