@@ -12,7 +12,7 @@ from common.wire.codec import Message
 
 _EPISODE = ("episode/", "term/")
 _BLOCKS = {constraint.name: constraint.blocks for constraint in CONSTRAINTS if constraint.optional}
-"""Bits of the mask, any of which says that an episode had the constraint; without any it had the heading alone."""
+"""Bits of the mask, all of which say that an episode had the constraint and nothing overrode a part of it."""
 
 
 def summary(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], 
     count = max((len(values) for values in joined.values()), default=0)
     none = np.zeros(count)
     active = {
-        name: np.any([joined.get(f"episode/mask_{block}", none) > 0 for block in blocks], 0)
+        name: np.all([joined.get(f"episode/mask_{block}", none) > 0 for block in blocks], 0)
         for name, blocks in _BLOCKS.items()
     }
     active["heading"] = ~np.any(list(active.values()), 0)

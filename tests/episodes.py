@@ -9,6 +9,8 @@ from common.hands.kinematics import grasp_frame
 from common.wire.codec import Message
 from services.record.poses import link_poses
 
+BLOCKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
+"""Blocks of the observation that a policy of the paper's constraints gates."""
 RADIUS, HEIGHT, CONTROL_DT = 0.03, 0.12, 0.01
 FORCE = 1.5  # N on each fingertip while it touches
 
@@ -16,7 +18,11 @@ FORCE = 1.5  # N on each fingertip while it touches
 def episode(
     steps: int = 12, *, removal: int = 8, mask: tuple[int, ...] = (1, 1, 1, 1), success: bool = True
 ) -> Message:
-    """`steps` control steps; the table goes at `removal`, the tips touch from two thirds of that on."""
+    """`steps` control steps; the table goes at `removal`, the tips touch from two thirds of that on.
+
+    Its errors are those of its way: the wrist comes straight along its path and ends, like the fingers, where the
+    reference pose has it. `mask` says which of `BLOCKS` are active.
+    """
     hand = get_hand("human")
     frame = grasp_frame(hand)
     direction = np.array([-1.0, 0.3, -0.35]) / np.linalg.norm([-1.0, 0.3, -0.35])
@@ -24,9 +30,10 @@ def episode(
     wrist_turn = Rotation.align_vectors([direction, cross], [frame.heading, frame.cross])[0]
     center = np.array([0.0, 0.0, HEIGHT / 2])
     tips = list(hand.tip_links)
-    frames = []
+    frames, shares = [], []
     for step in range(steps):
         share = min(step / (2 * removal / 3), 1.0)
+        shares.append(share)
         wrist = center - wrist_turn.apply(frame.center) - 0.12 * (1 - share) * direction
         q = hand.q_open + 0.4 * share * (hand.q_closed - hand.q_open)
         position, quaternion = link_poses(hand, q)
@@ -53,6 +60,13 @@ def episode(
         "table": np.arange(steps) < removal,
         "reward/contact": np.linspace(0, 0.5, steps, dtype=np.float32),
         "reward/distance": np.linspace(-0.5, -0.1, steps, dtype=np.float32),
+        "error/heading_rad": np.zeros(steps, np.float32),
+        "error/heading_m": np.zeros(steps, np.float32),
+        "error/affordance_ratio": np.zeros(steps, np.float32),
+        "error/pose_rad": np.abs(q - q[-1]).mean(-1),
+        "error/pose_m": 0.12 * (1 - np.array(shares, np.float32)),
+        "error/trajectory_rad": np.zeros(steps, np.float32),
+        "error/trajectory_m": np.zeros(steps, np.float32),
         "goal/heading_position": np.zeros(3, np.float32),
         "goal/heading_direction": direction.astype(np.float32),
         "goal/heading_cross": cross.astype(np.float32),
@@ -61,7 +75,7 @@ def episode(
         "goal/pose_quaternion": turn,
         "goal/trajectory_position": np.linspace(wrist_local - 0.12 * direction, wrist_local, 5).astype(np.float32),
         "goal/trajectory_quaternion": np.tile(turn, (5, 1)),
-        "goal/mask": np.array(mask, np.float32),
+        **{f"active/{name}": np.bool_(bit) for name, bit in zip(BLOCKS, mask, strict=True)},
         "piece_kind": np.array([1], np.int32),
         "piece_size": np.array([[RADIUS, HEIGHT / 2, 0]], np.float32),
         "piece_pos": np.zeros((1, 3), np.float32),
@@ -82,3 +96,10 @@ def episode(
         "metrics": {"return": 12.5, "links_at_removal": 5.0},
     }
     return Message(arrays, meta)
+
+
+def older(message: Message) -> Message:
+    """The episode as recordings had it before they named blocks and kept errors."""
+    arrays = {name: x for name, x in message.arrays.items() if not name.startswith(("active/", "error/"))}
+    mask = np.array([message.arrays[f"active/{name}"] for name in BLOCKS], np.float32)
+    return Message({**arrays, "goal/mask": mask}, message.meta)

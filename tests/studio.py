@@ -11,6 +11,7 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
 from common.objects.spec import GraspObject
+from common.request import GraspRequest
 from common.transport.keys import Keys
 from common.wire.codec import Message
 from services.record.channels import JsonChannels
@@ -18,7 +19,6 @@ from services.record.scene import episode_entries
 from services.record.writer import LogWriter
 from services.viz.studio.jobs import Progress
 from services.viz.studio.session import Catalogue, Session
-from services.viz.studio.state import Asked
 from services.viz.studio.training import TrainingWindow
 from tests.episodes import episode
 
@@ -34,18 +34,18 @@ class MadeUpGrasping:
 
     def __init__(self) -> None:
         self.hand, self.task = get_hand("human"), TaskConfig()
-        self.asked: list[Asked] = []
+        self.asked: list[tuple[GraspObject, GraspRequest]] = []
         self.fails = ""
 
     def newest(self) -> dict[str, Any]:
         return {"source": "made up", "version": 7, "trouble": ""}
 
-    def grasp(self, asked: Asked, progress: Progress) -> Message:
-        self.asked.append(asked)
+    def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
+        self.asked.append((obj, request))
         progress("grasping", 0.5)
         if self.fails:
             raise RuntimeError(self.fails)
-        found = episode(STEPS, removal=REMOVAL, mask=tuple(int(name in asked.constraints) for name in
+        found = episode(STEPS, removal=REMOVAL, mask=tuple(int(name in request.constraints) for name in
                         ("affordance", "pose", "pose", "trajectory")))  # fmt: skip
         return Message(found.arrays, {**found.meta, "metrics": {**found.meta["metrics"], "held": 1.0}, "note": ""})
 

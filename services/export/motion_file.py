@@ -182,7 +182,8 @@ def load_motion(path: pathlib.Path) -> GraspMotion:
             raise CongraspError(f"{path} has format {meta['format']}, not {FORMAT}.", remedy)
         facts = {name: meta[name] for name in _FACTS}
         facts["constraints"] = tuple(facts["constraints"])
-        goal = {_OLDER.get(name, name): arrays.pop(name) for name in set(arrays) - set(_ARRAYS)}
+        named = {_OLDER.get(name, name): array for name, array in arrays.items()}
+        goal = {name: array for name, array in named.items() if name in _GOALS}
         _check_shapes({**arrays, **goal}, {**_ARRAYS, **{name: _GOALS[name] for name in goal}})
         return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, goal=goal)
     except OSError as error:

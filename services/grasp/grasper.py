@@ -282,7 +282,7 @@ def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
 
 
 def _errors_of(constraints: tuple[str, ...]) -> list[str]:
-    names = [spec.name for c in CONSTRAINTS if c.name in constraints for spec in c.errors]
+    names = [spec.name for c in CONSTRAINTS if not c.optional or c.name in constraints for spec in c.errors]
     return [*names, "moved_at_removal", "force_link_max"]
 
 

@@ -39,6 +39,7 @@ def test_errors_and_success_count_where_their_constraint_was_active():
                 episode_pose_rad=[9.0, 9.0, 0.2, 0.4],
                 episode_trajectory_m=[9.0, 9.0, 9.0, 0.5],
                 episode_mask_affordance=[0, 0, 0, 0],
+                episode_mask_pose_finger=[0, 0, 1, 1],
                 episode_mask_pose_wrist=[0, 0, 1, 1],
                 episode_mask_trajectory=[0, 0, 0, 1],
             )
@@ -57,6 +58,25 @@ def test_errors_and_success_count_where_their_constraint_was_active():
     assert "success/affordance" not in means
 
 
+def test_a_pose_whose_wrist_a_trajectory_decides_on_counts_for_the_trajectory_alone():
+    means = episode_means(
+        [
+            rollout(
+                episode_success=[1, 0],
+                episode_pose_rad=[0.2, 9.0],
+                episode_trajectory_m=[9.0, 0.5],
+                episode_mask_pose_finger=[1, 1],
+                episode_mask_pose_wrist=[1, 0],
+                episode_mask_trajectory=[0, 1],
+            )
+        ]
+    )
+    expected = {"success/pose": 1.0, "success/trajectory": 0.0}
+    expected |= {"episode/pose_rad": 0.2, "episode/trajectory_m": 0.5}
+    assert {name: means[name] for name in expected} == pytest.approx(expected)
+    assert "success/heading" not in means
+
+
 def test_staleness_weighs_transitions():
     lags = figures([rollout(version=9, steps=300), rollout(version=7, steps=100)])
     assert lags == {"staleness_mean": 0.5, "staleness_max": 2.0, "episodes": 0.0}
@@ -64,10 +84,15 @@ def test_staleness_weighs_transitions():
 
 def test_the_batches_of_several_ranks_count_as_one():
     """The error of a constraint is over the episodes that had it, whichever rank they were on."""
-    first = [rollout(7, 300, episode_success=[1], episode_pose_rad=[0.1], episode_mask_pose_wrist=[1])]
+
+    def posed(version: int, steps: int, active: list[float], **episodes: list[float]) -> Message:
+        bits = {"episode_mask_pose_finger": active, "episode_mask_pose_wrist": active}
+        return rollout(version, steps, **episodes, **bits)
+
+    first = [posed(7, 300, [1], episode_success=[1], episode_pose_rad=[0.1])]
     second = [
-        rollout(9, 100, episode_success=[0, 0], episode_pose_rad=[9.0, 0.4], episode_mask_pose_wrist=[0, 1]),
-        rollout(9, 200, episode_success=[1], episode_pose_rad=[9.0], episode_mask_pose_wrist=[0]),
+        posed(9, 100, [0, 1], episode_success=[0, 0], episode_pose_rad=[9.0, 0.4]),
+        posed(9, 200, [0], episode_success=[1], episode_pose_rad=[9.0]),
     ]
     means, joint = figures(first, second), figures([*first, *second])
     assert means == pytest.approx(joint)

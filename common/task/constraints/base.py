@@ -68,6 +68,8 @@ class ErrorSpec(NamedTuple):
     """Name in tables and their JSON; the same as `name` if empty."""
     ratio: bool = False
     """Sums of two numbers over the window are divided, instead of a mean over its steps."""
+    block: str = ""
+    """Block of the constraint without which it says nothing, where others of its blocks can be active alone."""
 
 
 class ObservationField(NamedTuple):

@@ -72,7 +72,7 @@ class Pose(Constraint):
     )
     errors = (
         ErrorSpec("pose_rad", "rad", "hold", 0.25, 0.25, "joints and wrist hinges on average"),
-        ErrorSpec("pose_m", "m", "hold", 0.03, 0.02, "wrist's distance"),
+        ErrorSpec("pose_m", "m", "hold", 0.03, 0.02, "wrist's distance", block="pose_wrist"),
     )
     options = (
         Option(

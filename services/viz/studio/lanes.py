@@ -1,15 +1,16 @@
 """How each constraint was met, step by step: a lane is green where the hand keeps to it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.hands import get_hand
-from common.task.constraints import CONSTRAINTS, Constraint
+from common.task.constraints import CONSTRAINTS
+from common.task.constraints.base import ErrorSpec
 from common.wire.codec import Message
-from services.record.goals import active_constraints
+from services.record.goals import active_blocks, active_constraints
 from services.record.poses import link_poses
 
 TOUCH = 0.05
@@ -36,19 +37,20 @@ def lanes(episode: Message) -> dict[str, Lane]:
     table = arrays["table"].astype(bool)
     links = (np.linalg.norm(arrays["contact_force"], axis=-1) > TOUCH).sum(-1)
     found = {"contact": Lane(links >= 2, ~table, "two links or more touch the object", {"links": links.astype(float)})}
-    active = active_constraints(arrays)
+    active, blocks = active_constraints(arrays), active_blocks(arrays)
     for constraint in CONSTRAINTS:
-        if constraint.name in active and all(f"error/{spec.name}" in arrays for spec in constraint.errors):
-            found[constraint.name] = _lane(constraint, arrays, table)
+        errors = [spec for spec in constraint.errors if not spec.block or blocks.get(spec.block)]
+        if constraint.name in active and all(f"error/{spec.name}" in arrays for spec in errors):
+            found[constraint.name] = _lane(errors, arrays, table)
     return found
 
 
-def _lane(constraint: Constraint, arrays: Mapping[str, np.ndarray], table: np.ndarray) -> Lane:
-    values = {spec: arrays[f"error/{spec.name}"] for spec in constraint.errors}
+def _lane(errors: Sequence[ErrorSpec], arrays: Mapping[str, np.ndarray], table: np.ndarray) -> Lane:
+    values = {spec: arrays[f"error/{spec.name}"] for spec in errors}
     met = np.all([value <= spec.tolerance for spec, value in values.items()], 0)
-    counts = table if constraint.errors[0].window == "approach" else ~table
+    counts = table if errors[0].window == "approach" else ~table
     words = []
-    for spec in constraint.errors:
+    for spec in errors:
         factor, unit = _UNITS[spec.unit]
         words.append(f"{spec.meaning}: {factor * spec.tolerance:.0f}{unit} at most")
     return Lane(met, counts, "; ".join(words), {spec.unit or "share": value for spec, value in values.items()})
@@ -72,15 +74,12 @@ def for_page(episode: Message) -> Message:
     )
     keep += ("visual_vertices", "visual_faces", "surface_points", "surface_minus")
     arrays: dict[str, Any] = {name: episode.arrays[name] for name in keep}
-    arrays |= {
-        name: np.asarray(value)
-        for name, value in episode.arrays.items()
-        if name.startswith(("reward/", "goal/", "active/"))
-    }
+    arrays |= {name: value for name, value in episode.arrays.items() if name.startswith(("reward/", "goal/"))}
+    arrays |= {f"active/{block}": np.array(on) for block, on in active_blocks(episode.arrays).items()}
     for name, lane in found.items():
         arrays |= {f"lane/{name}/met": lane.met, f"lane/{name}/counts": lane.counts}
         arrays |= {f"lane/{name}/{unit}": np.asarray(value, np.float32) for unit, value in lane.errors.items()}
-    if "pose" in found:
+    if "pose" in active_constraints(episode.arrays):
         hand, turn = get_hand(str(episode.meta["hand"])), _turn(episode.arrays["goal/pose_quaternion"])
         position, quaternion = link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
         arrays["ghost_position"] = (turn.apply(position) + episode.arrays["goal/pose_position"]).astype(np.float32)

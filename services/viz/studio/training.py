@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from common.errors import CongraspError, TransportError
+from common.task.constraints import CONSTRAINTS
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, decode
@@ -26,7 +27,6 @@ from services.viz.studio.recordings import is_episode
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows first."""
-CONSTRAINTS = ("heading", "affordance", "pose", "trajectory")
 _EVENTS = 100
 _TREND = 200  # points of an actor's own history that are kept
 _STALE = 15.0  # seconds after which an actor that nobody lists any more is forgotten
@@ -182,9 +182,9 @@ class TrainingWindow:
                 "curves": {name: self._curves[name].thinned(points) for name in wanted},
                 "names": sorted(self._curves),
                 "constraints": {
-                    name: self._curves[f"success/{name}"].values[-1]
-                    for name in CONSTRAINTS
-                    if f"success/{name}" in self._curves
+                    constraint.name: self._curves[f"success/{constraint.name}"].values[-1]
+                    for constraint in CONSTRAINTS
+                    if f"success/{constraint.name}" in self._curves
                 },
                 "actors": [self._row(name, roles.get(name)) for name in sorted(self._actors)],
                 "events": list(self._events)[-20:][::-1],

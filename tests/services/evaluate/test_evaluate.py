@@ -8,8 +8,8 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from actors.environment import METRICS
 
+from actors.env import metric_names
 from common.config import NetworkConfig, RunConfig
 from common.errors import CongraspError
 from common.objects import procedural
@@ -51,7 +51,7 @@ def test_the_command_measures_rows_by_the_protocol(policy, tmp_path, capsys, mon
     assert all(row["hand"] == "human" and 0 <= row["held_2s"] <= row["success"] <= 1 for row in read["rows"])
     assert read["physics"] == "native" and "pose+trajectory" in capsys.readouterr().out
     for name, sample in samples.items():
-        assert len(sample.values["success"]) == 3 and matching(sample.values, name).all()
+        assert len(sample.values["success"]) == 3 and matching(sample.values, name, CONFIG.task).all()
         assert np.all(sample.values["length"] == 250)  # 50 steps with the table, 2 s without
         assert sample.link_force.shape == (3, 25, 16) and sample.torque.shape == (3, 25, 20)
         assert 0.0 < sample.torque.max() <= 1.0
@@ -64,7 +64,7 @@ def test_every_pool_of_objects_gets_its_share_of_the_episodes(monkeypatch):
         for pool in itertools.chain([self.objects], pools):
             self.objects = pool
             progress(episodes)
-            values = {name: np.ones(episodes, np.float32) for name in METRICS}
+            values = {name: np.ones(episodes, np.float32) for name in metric_names(CONFIG.task)}
             values["object_index"] = np.arange(episodes, dtype=np.float32) % len(pool)
             yield Sample(values, np.ones((episodes, 25, 16)), np.ones((episodes, 25, 20)))
 

@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from common.task.types import MASKS
+from common.config import TaskConfig
+from common.task.constraints import blocks
 from services.evaluate.scores import (
     PROBED_EPISODES,
     TABLES,
@@ -21,6 +22,8 @@ from services.evaluate.scores import (
     write_json,
 )
 
+TASK = TaskConfig()
+BLOCKS = blocks(TASK)
 REQUIRED = (
     *("constraint", "hand", "method", "episodes", "success", "heading_rad", "heading_m", "pose_rad", "pose_m"),
     *("traj_rad", "traj_m", "affordance_ratio"),
@@ -30,7 +33,13 @@ REQUIRED = (
 def _sample(success, held, **columns) -> Sample:
     count = len(success)
     names = ("return", "links_at_removal", "bad", "object_index", "heading_rad", "heading_m", "pose_rad", "pose_m")
-    names += ("trajectory_rad", "trajectory_m", "affordance_ratio", *(f"mask_{name}" for name in MASKS))
+    names += (
+        "trajectory_rad",
+        "trajectory_m",
+        "affordance_ratio",
+        "fingers_ratio",
+        *(f"mask_{name}" for name in BLOCKS),
+    )
     values = {name: np.zeros(count, np.float32) for name in names}
     values |= {"success": np.array(success, np.float32), "held": np.array(held, np.float32)}
     values |= {name: np.array(column, np.float32) for name, column in columns.items()}
@@ -59,10 +68,10 @@ def test_wilson_interval():
     ],
 )
 def test_only_episodes_with_exactly_the_rows_constraints_count(constraint, mask):
-    assert active_mask(constraint) == tuple(map(bool, mask))
+    assert active_mask(constraint, TASK) == dict(zip(BLOCKS, map(bool, mask), strict=True))
     every = np.array([[(i >> bit) & 1 for bit in range(4)] for i in range(16)])
-    values = {f"mask_{name}": every[:, i].astype(np.float32) for i, name in enumerate(MASKS)}
-    (found,) = np.flatnonzero(matching(values, constraint))
+    values = {f"mask_{name}": every[:, i].astype(np.float32) for i, name in enumerate(BLOCKS)}
+    (found,) = np.flatnonzero(matching(values, constraint, TASK))
     np.testing.assert_array_equal(every[found], mask)
 
 
@@ -127,8 +136,8 @@ def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
     rows.append(dataclasses.replace(rows[0], group="small (up to 8 cm)", paper=None))
     write_json(rows, tmp_path / "new" / "rows.json", {"seed": 0})
     read = json.loads((tmp_path / "new" / "rows.json").read_text())
-    assert read["seed"] == 0 and len(read["rows"]) == 7
+    assert read["seed"] == 0 and len(read["rows"]) == 8
     for row in read["rows"]:
         assert set(REQUIRED) <= set(row) and row["method"] == "ours"
     assert read["rows"][0]["pose_rad"] is None and read["rows"][0]["heading_rad"] == 0.0
-    assert all(table.row_count == 7 for table in tables_of(rows, "title"))
+    assert all(table.row_count == 8 for table in tables_of(rows, "title"))

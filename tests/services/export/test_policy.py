@@ -1,5 +1,6 @@
 """An exported policy answers as the Flax policy does, says what its numbers mean, and runs without JAX."""
 
+import dataclasses
 import importlib.util
 import json
 import pathlib
@@ -8,6 +9,7 @@ import sys
 import zipfile
 from typing import Any
 
+import jax
 import jax.export
 import numpy as np
 import onnxruntime
@@ -22,9 +24,11 @@ from common.policy import network
 from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.normalizer import Statistics
 from common.policy.pretrained import policy_file
+from common.request import GraspRequest
 from common.task import observation
-from common.task.features import features
-from common.task.types import CONTACTS_PER_LINK, MASKS, Goal, SceneState, Surface
+from common.task.constraints import blocks, goal_of
+from common.task.features import scene_of
+from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from services.export import policy as exports
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
@@ -142,23 +146,15 @@ def test_the_example_observes_what_the_policy_was_trained_on(shipped_onnx: pathl
         time=np.float32(grasp.time),
         table=np.bool_(False),
     )
-    zeros = {name: np.zeros(3) for name in Goal._fields}
-    goal = Goal(**{
-        **zeros,
-        "heading_position": grasp.heading_position,
-        "heading_direction": example.HEADING,
-        "pose_q": np.zeros(len(hand.joints)),
-        "pose_quaternion": np.array([1.0, 0, 0, 0]),
-        "trajectory_position": np.zeros((task.trajectory_points, 3)),
-        "trajectory_quaternion": np.tile([1.0, 0, 0, 0], (task.trajectory_points, 1)),
-        "mask": np.zeros(len(MASKS)),
-    })  # fmt: skip
+    heading = {"position": grasp.heading_position, "direction": example.HEADING, "cross": np.zeros(3)}
+    goal = goal_of(hand, task, GraspRequest({"heading": heading}))
+    goal = dataclasses.replace(goal, active=dict.fromkeys(blocks(task), np.bool_(False)))
 
     def batch(tree: Any) -> Any:
-        return type(tree)(*(np.asarray(x)[None].astype(bool if np.asarray(x).dtype == bool else "f4") for x in tree))
+        return jax.tree.map(lambda x: np.asarray(x)[None].astype(bool if np.asarray(x).dtype == bool else "f4"), tree)
 
     def observe(state: SceneState, surface: Surface, goal: Goal) -> Any:
-        return observation.observe(task, state, features(hand, task, state, surface, goal), goal)
+        return observation.observe(scene_of(hand, task, state, surface, goal))
 
     surface = Surface(grasp.points, np.zeros(len(grasp.points), bool))
     expected = np.asarray(jax.jit(observe)(batch(state), batch(surface), batch(goal)))[0]

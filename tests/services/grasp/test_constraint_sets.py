@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from PIL import Image
-from services.grasp.asked import read_asked
 
 from actors.bank import build_bank
 from common.config import TaskConfig
@@ -14,6 +13,7 @@ from common.task.sampling.headings import Headings, clear_table, feasible
 from common.wire.codec import Message
 from services.cli.main import load
 from services.grasp import constraint_sets
+from services.grasp.parse import read_request
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
@@ -111,11 +111,11 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
 
 def test_a_reference_is_refused_for_another_object_or_size(sets, file, tmp_path):
     mug, box = OBJECTS
-    pose = read_asked(mug, HAND, 15, pose=f"{file}:3").pose
-    np.testing.assert_array_equal(pose.q, sets[0].arrays["pose/q"][0, 3])
+    request = read_request(mug, HAND, 15, pose=f"{file}:3")
+    np.testing.assert_array_equal(request.given("pose", "q"), sets[0].arrays["pose/q"][0, 3])
     with pytest.raises(CongraspError, match=r"is for an object of .* cm, .*; 'box_0' has .*Name the set of this"):
-        read_asked(box, HAND, 15, trajectory=str(file))
+        read_request(box, HAND, 15, trajectory=str(file))
     larger = Message(sets[0].arrays, {**sets[0].meta, "object_scale": 1.4})
     file = constraint_sets.save(larger, tmp_path)
     with pytest.raises(CongraspError, match=r"1\.4 times as large, as the human hand is trained: add --scale 1\.4"):
-        read_asked(mug.scaled(1 / 1.4), HAND, 15, pose=str(file))
+        read_request(mug.scaled(1 / 1.4), HAND, 15, pose=str(file))

@@ -12,14 +12,15 @@ from PIL import Image
 from common.errors import CongraspError
 from common.policy import bundle as bundles
 from common.policy.pretrained import policy_file
+from common.request import GraspRequest
 from common.rotations import rotate
 from services.assets.objects.meshes import ImportOptions
 from services.assets.objects.named import one_object
 from services.cli.main import load
 from services.export.motion_file import load_motion, motion_of_episode
-from services.grasp.asked import Asked, Reference, read_asked
 from services.grasp.files import MOTION, OBJECT, PICTURE, RECORDING, RESULT, save_grasp
 from services.grasp.grasper import Grasp, Grasper
+from services.grasp.parse import read_request
 from services.record.reader import read_episodes
 from tests.episodes import episode
 
@@ -43,14 +44,15 @@ def grasper():
 def test_the_shipped_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     told = []
     minus = block.points[:, 2] < 0
-    asked = Asked(direction=np.array([0.0, 0.0, -1.0]), minus=minus)
-    found = grasper.grasp(block, asked, lambda what, done, total: told.append((what, done, total)))
+    heading = {"direction": np.array([0.0, 0.0, -1.0])}
+    request = GraspRequest({"heading": heading, "affordance": {}}, avoid=minus)
+    found = grasper.grasp(block, request, lambda what, done, total: told.append((what, done, total)))
     assert told[0][0].startswith("Compiling") and told[1] == ("Trying", 1, 75) and told[-1][1:] == (75, 75)
     assert 1 <= found.held <= found.tries <= 12 and found.success
     motion = found.motion
     assert motion.constraints == ("heading", "affordance") and motion.about["tries"] == found.tries
     assert len(motion.time) == 75 and motion.table.sum() == 49  # the table goes with the fiftieth step
-    np.testing.assert_allclose(motion.heading_direction, [0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     np.testing.assert_array_equal(motion.surface_minus, minus[:256])
     # The hand came along the block's own z axis: from its start to its end the wrist moved mostly that way.
     way = motion.wrist_position[48] - motion.wrist_position[0]
@@ -61,7 +63,7 @@ def test_the_shipped_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     facts = found.facts()
     assert facts["heading_rad"] < 0.5 and {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
 
-    again = grasper.grasp(block, asked).motion
+    again = grasper.grasp(block, request).motion
     np.testing.assert_array_equal(again.joint_position, motion.joint_position)
 
 
@@ -70,10 +72,10 @@ def test_what_cannot_be_is_said_before_anything_is_simulated(block, grasper):
     down = -np.asarray(rotate(block.rest_poses[0][3:] * [1, -1, -1, -1], np.array([0.0, 0.0, 1.0])))
     words = " ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)
     with pytest.raises(CongraspError, match=f'come through the table.* straight down is --heading "{words}"'):
-        grasper.grasp(lying, Asked(direction=-down))
-    below = Reference(grasper.hand.q_open, down, np.array([1.0, 0, 0, 0]))
+        grasper.grasp(lying, GraspRequest({"heading": {"direction": -down}}))
+    below = {"q": grasper.hand.q_open, "position": down, "quaternion": np.array([1.0, 0, 0, 0])}
     with pytest.raises(CongraspError, match="would be in the table in every resting pose of 'block'"):
-        grasper.grasp(lying, Asked(pose=below))
+        grasper.grasp(lying, GraspRequest({"heading": {}, "pose": below}))
 
 
 @pytest.fixture
@@ -81,7 +83,7 @@ def made_up(monkeypatch):
     """The command with grasps that are made up; the list of objects that were grasped."""
     calls = []
 
-    def grasp(self, obj, asked=None, progress=lambda what, done, total: None):
+    def grasp(self, obj, request=None, progress=lambda what, done, total: None):
         calls.append(obj.name)
         made = episode(success=obj.name != "loose")
         made.meta.update(object=obj.name)
@@ -174,6 +176,6 @@ def test_files_of_a_grasp_are_constraints_of_the_next(tmp_path, block, grasper, 
     found = Grasper.grasp(grasper, block)
     save_grasp(tmp_path, found, video=False, pictures=False, about={"key": "k"})
     text = str(tmp_path / MOTION)
-    asked = read_asked(block, grasper.hand, 15, pose=text, trajectory=text)
-    assert asked.pose is not None and asked.trajectory is not None
-    np.testing.assert_array_equal(asked.pose.q, found.motion.joint_position[7])
+    request = read_request(block, grasper.hand, 15, pose=text, trajectory=text)
+    assert set(request.constraints) == {"heading", "pose", "trajectory"}
+    np.testing.assert_array_equal(request.given("pose", "q"), found.motion.joint_position[7])

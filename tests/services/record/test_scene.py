@@ -17,9 +17,10 @@ from common.hands.spec import link_origin
 from common.wire.codec import Message, decode
 from services.record.channels import Entry
 from services.record.entries import Converter
+from services.record.goals import active_blocks, active_constraints
 from services.record.poses import link_poses
 from services.record.scene import SPACING
-from tests.episodes import CONTROL_DT, FORCE, episode
+from tests.episodes import CONTROL_DT, FORCE, episode, older
 
 HAND = get_hand("human")
 START = 1_000_000_000_000
@@ -105,6 +106,14 @@ def test_only_active_constraints_are_drawn(mask: tuple[int, ...], shown: set[str
     (entry,) = of(Converter()(KEY, episode(mask=mask), START), "scene")
     ids = {e.id for e in SceneUpdate.FromString(entry.data).entities}
     assert {name.removeprefix("constraint/") for name in ids if name.startswith("constraint/")} == shown
+
+
+def test_an_older_recording_is_drawn_as_it_is_now() -> None:
+    made = episode(mask=(1, 1, 0, 1))
+    (now,), (before,) = (of(Converter()(KEY, message, START), "scene") for message in (made, older(made)))
+    assert before.data == now.data
+    assert active_blocks(older(made).arrays) == active_blocks(made.arrays)
+    assert active_constraints(older(made).arrays) == ("heading", "affordance", "pose", "trajectory")
 
 
 def test_a_new_episode_removes_what_the_last_one_left(entries: list[Entry]) -> None:

@@ -82,7 +82,7 @@ def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks
     ("constraints", "changes", "words"),
     [
         (["flight"], {}, "no constraint 'flight'"),
-        (["affordance"], {}, "neither a heading"),
+        (["affordance"], {}, "nothing that guides the wrist. Add one of: heading, pose, trajectory"),
         (["heading", "affordance"], {"surface_minus": np.zeros(8, bool)}, "both sides"),
         (["heading", "affordance"], {"surface_minus": None}, "lacks the field 'surface_minus'"),
         (["heading"], {"q": None}, "lacks the field 'q'"),

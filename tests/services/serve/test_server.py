@@ -86,7 +86,7 @@ def test_answers_refusals_and_batches_are_counted(served, metrics):
     ("change", "words"),
     [
         ({"constraints": ["levitation"]}, "no constraint 'levitation'"),
-        ({"constraints": ["affordance"]}, "neither a heading"),
+        ({"constraints": ["affordance"]}, "nothing that guides the wrist. Add one of: heading, pose, trajectory"),
         ({"constraints": ["pose"]}, "lacks the field 'pose_q'"),
         ({"heading_direction": np.array([0.0, 0.0, 2.0])}, "not 1"),
         ({"heading_position": np.array([np.nan, 0.0, 0.0])}, "not finite"),

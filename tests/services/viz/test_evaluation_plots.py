@@ -6,12 +6,15 @@ import pathlib
 import numpy as np
 import pytest
 
-from actors.environment import METRICS
+from actors.env import metric_names
+from common.config import TaskConfig
 from common.errors import CongraspError
-from common.task.types import MASKS
 from services.cli.plot import plot
 from services.evaluate.plots import cells, plot_evaluation
 from services.evaluate.scores import Sample, active_mask, summarise, write_json
+
+TASK = TaskConfig()
+METRICS = metric_names(TASK)
 
 
 def evaluation(path: pathlib.Path) -> list[dict]:
@@ -23,7 +26,7 @@ def evaluation(path: pathlib.Path) -> list[dict]:
         for name in METRICS:
             if name.endswith(("_rad", "_m", "_ratio")):
                 values[name] = np.concatenate([np.linspace(0.1, 0.4, 30), np.full(10, 9.0)])
-        for name, bit in zip(MASKS, active_mask(constraint), strict=True):
+        for name, bit in active_mask(constraint, TASK).items():
             values[f"mask_{name}"][:] = bit
         sample = Sample(values, np.zeros((0, 1, 1)), np.zeros((0, 1, 1)))
         rows.append(summarise(constraint, "human", sample, held_2s=True))

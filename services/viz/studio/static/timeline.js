@@ -6,7 +6,11 @@ const ALMOST = "#bfe5d3"; // met where it does not count yet
 const IDLE = "#e4e8ed";
 const ROW = 22;
 
-const UNITS = { rad: (x) => `${((x * 180) / Math.PI).toFixed(0)}°`, m: (x) => `${(100 * x).toFixed(1)} cm` };
+const UNITS = {
+  rad: (x) => `${((x * 180) / Math.PI).toFixed(0)}°`,
+  m: (x) => `${(100 * x).toFixed(1)} cm`,
+  share: (x) => `${(100 * x).toFixed(0)} %`,
+};
 
 function worded(errors, step) {
   return Object.entries(errors)

@@ -16,10 +16,10 @@ from playwright.sync_api import sync_playwright
 
 from common.objects import procedural
 from common.objects.spec import GraspObject
+from common.request import GraspRequest
 from common.wire.codec import Message
 from services.viz.studio.server import PageServer
 from services.viz.studio.session import Catalogue, Session
-from services.viz.studio.state import Asked
 from tests.services.viz.studio.conftest import BROWSERS, SIZE
 from tests.studio import MadeUpGrasping, take_mesh
 
@@ -38,8 +38,8 @@ def many_faces() -> trimesh.Trimesh:
 class Fine(MadeUpGrasping):
     """Its grasps are of that object."""
 
-    def grasp(self, asked: Asked, progress: object) -> Message:
-        made, mesh = super().grasp(asked, lambda text, share: None), many_faces()
+    def grasp(self, obj: GraspObject, request: GraspRequest, progress: object) -> Message:
+        made, mesh = super().grasp(obj, request, lambda text, share: None), many_faces()
         arrays = {**made.arrays, "visual_vertices": np.asarray(mesh.vertices, np.float32)}
         return Message(arrays | {"visual_faces": np.asarray(mesh.faces, np.int32)}, made.meta)
 

@@ -6,13 +6,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from actors.trials import Outcome
+from actors.attempts import Outcome
 from common.errors import CongraspError, TransportError
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
 from common.policy.pretrained import policy_file
 from services.viz.studio import grasping
-from services.viz.studio.grasping import TRIES, PolicyGrasping
+from services.viz.studio.grasping import ATTEMPTS, PolicyGrasping
 from services.viz.studio.state import Studio
 from tests.studio import objects
 
@@ -31,15 +31,15 @@ class Source:
 
 def outcome(held: list[int], error: list[float]) -> Outcome:
     names = ("success", "held", "heading_rad", "heading_m", "moved_at_removal", "force_link_max")
-    metrics = {name: np.zeros(TRIES) for name in names}
+    metrics = {name: np.zeros(ATTEMPTS) for name in names}
     metrics["success"][held] = metrics["held"][held] = 1.0
     metrics["heading_rad"][: len(error)] = error
 
     class Trace:
-        object_position = np.zeros((3, TRIES, 3))
-        table = np.array([[1] * TRIES, [1] * TRIES, [0] * TRIES])
+        object_position = np.zeros((3, ATTEMPTS, 3))
+        table = np.array([[1] * ATTEMPTS, [1] * ATTEMPTS, [0] * ATTEMPTS])
 
-    none = np.zeros(TRIES, bool)
+    none = np.zeros(ATTEMPTS, bool)
     return Outcome(None, none, ~none, metrics, Trace())  # type: ignore[arg-type]
 
 
@@ -71,14 +71,14 @@ def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused_in_words(
 def test_what_was_drawn_is_tried_first_and_the_others_are_near_it() -> None:
     policy = PolicyGrasping(Source(), "file")
     studio = Studio(policy.hand, policy.task, objects().get("mug"))
-    beginnings, aside = grasping._beginnings(studio.request, policy.task.surface_points)
-    goal = beginnings.request.goal
-    np.testing.assert_allclose(goal.heading_position[0], studio.arrow.position, atol=1e-6)
-    np.testing.assert_allclose(goal.heading_direction[0], studio.arrow.direction, atol=1e-6)
+    episodes, aside = grasping._episodes(policy.hand, policy.task, studio.labelled, studio.request)
+    goal = episodes.goal["heading"]
+    np.testing.assert_allclose(goal.position[0], studio.arrow.position, atol=1e-6)
+    np.testing.assert_allclose(goal.direction[0], studio.arrow.direction, atol=1e-6)
     assert aside[0] == 0 and (aside[1:] > 0).all() and aside.max() < 0.04
-    cosine = goal.heading_direction @ studio.arrow.direction
+    cosine = goal.direction @ studio.arrow.direction
     assert (cosine > np.cos(0.5)).all() and cosine[1:].max() < 1 - 1e-6
-    np.testing.assert_allclose((goal.heading_direction * goal.heading_cross).sum(-1), 0.0, atol=1e-5)
+    np.testing.assert_allclose((goal.direction * goal.cross).sum(-1), 0.0, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -95,5 +95,5 @@ def test_what_was_drawn_is_shown_unless_another_is_clearly_better(
 ) -> None:
     found = outcome(held, error)
     assert grasping._best(found, ()) == index
-    assert says in grasping._note(found, index, np.full(TRIES, 0.004))
-    assert bool(says) == bool(grasping._note(found, index, np.full(TRIES, 0.004)))
+    assert says in grasping._note(found, index, np.full(ATTEMPTS, 0.004))
+    assert bool(says) == bool(grasping._note(found, index, np.full(ATTEMPTS, 0.004)))

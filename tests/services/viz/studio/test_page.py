@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from common.config import TaskConfig
 from common.transport.keys import Keys
 from services.export.motion_file import load_motion
 from services.record.reader import read_episodes
@@ -19,6 +20,7 @@ from services.viz.studio.server import PageServer
 from services.viz.studio.session import Session
 from services.viz.studio.training import TrainingWindow
 from tests import studio as made_up
+from tests.episodes import older
 from tests.studio import BEGIN, DIP
 
 pytestmark = pytest.mark.timeout(240)
@@ -177,6 +179,48 @@ def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
     assert "wrist trajectory guides the wrist" in opened.inner_text("#words")
 
 
+def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: Any) -> None:
+    grasping = made_up.MadeUpGrasping()
+    grasping.task = TaskConfig(constraints=("heading", "affordance", "fingers"))
+    session = made_up.session(grasping)
+    server = PageServer(session.gets, session.posts, "127.0.0.1", 0)
+
+    def fingers() -> list[str]:
+        return [name for name, on in session.state()["studio"]["others"][0]["flags"]["allowed"].items() if on]
+
+    page.goto(server.url)
+    page.wait_for_selector("body[data-first-picture]")
+    assert page.is_visible("[data-ask=affordance]") and not page.is_visible("[data-ask=pose]")
+    page.check("[data-ask=fingers]")
+    page.wait_for_selector("[data-mask=fingers][data-on=true]")
+    assert "Only the named fingers" in page.inner_text("#words") and fingers() == ["thumb", "index"]
+    page.check("#other-constraints label:has-text('middle') input")
+    eventually(lambda: fingers() == ["thumb", "index", "middle"])
+    assert page.is_checked("[data-ask=fingers]")
+    for name in ("index", "middle"):
+        page.uncheck(f"#other-constraints label:has-text('{name}') input")
+        eventually(lambda name=name: name not in fingers())
+    page.wait_for_selector("#trouble:has-text('fewer than two fingers. Allow two or more')")
+    assert page.is_disabled("#grasp")
+    page.uncheck("[data-ask=fingers]")
+    page.wait_for_selector("[data-mask=fingers][data-on=false]")
+    assert page.is_enabled("#grasp")
+    server.close()
+    session.close()
+
+
+def test_an_older_recording_is_played_with_its_constraints_and_contact_alone(opened: Any, site: Site) -> None:
+    opened.click("#show-training")
+    opened.wait_for_selector("tr[data-actor=a005]", state="attached")
+    before = older(made_up.actor_episode(5))
+    site.window.take(Keys("made-up").log("episode", "actor", "a005"), before, time.time())
+    opened.click("tr[data-actor=a005]")
+    opened.wait_for_selector("#result:has-text('thing-5')")
+    lanes = opened.locator("#lanes [data-lane]").all()
+    assert [item.get_attribute("data-lane") for item in lanes] == ["contact"]
+    assert red(picture(opened)).mean() > 0.001  # what must not be touched
+
+
 def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_path: pathlib.Path) -> None:
     assert opened.input_value("#hand") == "of the run"
     still, tail = picture(opened), handle(opened, "tail")
@@ -208,7 +252,7 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
     assert (tmp_path / "motion.glb").read_bytes()[:4] == b"glTF"
     opened.click("#edit")
     opened.wait_for_selector("#player", state="hidden")
-    assert site.grasping.asked[-1].obj.name == "mug_1"
+    assert site.grasping.asked[-1][0].name == "mug_1"
     assert handle(opened, "tail") == pytest.approx(tail, abs=1.0)  # the constraints are seen from where they were
 
 

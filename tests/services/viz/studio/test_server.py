@@ -105,7 +105,7 @@ def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasp
     page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, minus=True)
     page.do("grasp")
     assert page.wait()["error"] == ""
-    assert grasping.asked[-1].constraints == ("affordance",)
+    assert tuple(grasping.asked[-1][1].constraints) == ("heading", "affordance")
     motions = json.loads(page.ask("GET", "/api/state")[1])["motions"]
     assert motions[0]["held"] and motions[0]["steps"] == made_up.STEPS
     played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])

@@ -29,7 +29,7 @@ def masks(studio: Studio) -> dict[str, bool]:
 def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
     assert studio.trouble == ""
     request = studio.request
-    assert request.constraints == ()
+    assert tuple(request.constraints) == ("heading",)
     down = matrix(MUG.rest_poses[0][3:]) @ studio.arrow.direction
     np.testing.assert_allclose(down, [0, 0, -1], atol=1e-6)
     assert studio.words == ["The heading guides the wrist."]
@@ -54,7 +54,8 @@ def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: St
     shown = np.linalg.norm(studio.canvas.vertices - center, axis=-1)
     np.testing.assert_array_equal(studio.canvas.shown, shown <= 0.02)
     assert studio.asked == {"affordance"} and masks(studio)["affordance"]
-    np.testing.assert_array_equal(studio.request.obj.non_graspable_points, studio.canvas.minus)
+    np.testing.assert_array_equal(studio.labelled.non_graspable_points, studio.canvas.minus)
+    np.testing.assert_array_equal(studio.request.avoid, studio.canvas.minus)
     studio.paint([center], 0.03, minus=False)
     assert not studio.canvas.minus.any() and studio.asked == set()
 
@@ -75,7 +76,7 @@ def test_the_rules_are_told_in_words_and_masks(studio: Studio) -> None:
     assert "guides the wrist" in studio.words[0] and "trajectory" in studio.words[0]
     studio.ask("pose", False)
     studio.ask("affordance", False)
-    assert studio.request.constraints == ("trajectory",)
+    assert tuple(studio.request.constraints) == ("heading", "trajectory")
 
 
 def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studio) -> None:
@@ -113,7 +114,7 @@ def test_what_training_would_draw_can_be_suggested(studio: Studio) -> None:
     assert studio.trouble == ""
     studio.suggest("trajectory")
     studio.ask("trajectory", True)
-    assert studio.trouble == "" and studio.request.constraints == ("trajectory",)
+    assert studio.trouble == "" and tuple(studio.request.constraints) == ("heading", "trajectory")
 
 
 def test_suggestions_are_for_the_object_as_it_is_shown(studio: Studio) -> None:

@@ -33,6 +33,13 @@ def test_a_window_shows_a_hundred_actors_with_their_newest_episodes() -> None:
         window.episode("a999")
 
 
+def test_success_is_shown_for_every_constraint_that_the_learner_tells_of() -> None:
+    window, key = made_up.window(actors=0), KEYS.log("metrics", "learner", "0")
+    assert list(window.view()["constraints"]) == ["heading", "pose"]
+    window.take(key, Message({}, {"time": BEGIN, "update": 60, "values": {"success/fingers": 0.25}}), time.time())
+    assert window.view()["constraints"]["fingers"] == 0.25
+
+
 def test_an_actors_newer_episode_takes_the_place_of_the_one_before() -> None:
     window = made_up.window(actors=2)
     newer = made_up.actor_episode(77)

@@ -10,7 +10,7 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from services.assets.objects.meshes import ImportOptions, import_paths
 from services.export.motion_file import motion_of_episode, save_motion
-from services.grasp.asked import read_asked
+from services.grasp.parse import read_request
 from tests.episodes import HEIGHT, episode
 
 HAND = get_hand("human")
@@ -29,7 +29,7 @@ def block(tmp_path_factory):
 
 
 def asked(obj, **constraints):
-    return read_asked(obj, HAND, 15, **constraints)
+    return read_request(obj, HAND, 15, **constraints)
 
 
 def test_an_object_remembers_where_its_file_has_its_origin(block):
@@ -39,9 +39,10 @@ def test_an_object_remembers_where_its_file_has_its_origin(block):
 
 def test_headings_are_numbers_or_a_word(block):
     given = asked(block, heading="0 0 -2", at="0.1, -0.2, 0.34")
-    np.testing.assert_allclose(given.direction, [0, 0, -1])
-    np.testing.assert_allclose(given.position, [0, 0, 0.04], atol=1e-6)
-    assert asked(block, heading="above").above and asked(block, heading="above").direction is None
+    np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
+    np.testing.assert_allclose(given.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
+    above = asked(block, heading="above")
+    assert above.above and above.given("heading", "direction") is None
     with pytest.raises(CongraspError, match=r"--at lies 39.* m from 'block'"):
         asked(block, at="0 0 40")
     for text, complaint in (("down", "'down', not 3 numbers"), ("1 2", "'1 2', not 3"), ("0 0 0", "has no direction")):
@@ -56,11 +57,11 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
     upper.export(tmp_path / "upper.ply")
     high = block.points[:, 2] > 0.01
     clear = np.abs(block.points[:, 2] - 0.01) > 0.005
-    np.testing.assert_array_equal(asked(block, affordance=str(tmp_path / "upper.ply")).minus[clear], ~high[clear])
-    np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "upper.ply")).minus[clear], high[clear])
+    np.testing.assert_array_equal(asked(block, affordance=str(tmp_path / "upper.ply")).avoid[clear], ~high[clear])
+    np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "upper.ply")).avoid[clear], high[clear])
     trimesh.PointCloud(np.asarray(upper.sample(4000))).export(tmp_path / "cloud.ply")
-    np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "cloud.ply")).minus[clear], high[clear])
-    np.testing.assert_array_equal(asked(block, affordance="near half").minus, block.labels == 1)
+    np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "cloud.ply")).avoid[clear], high[clear])
+    np.testing.assert_array_equal(asked(block, affordance="near half").avoid, block.labels == 1)
     with pytest.raises(CongraspError, match=r"has no part 'handle'\. Its parts are: near half, far half"):
         asked(block, affordance="handle")
     with pytest.raises(CongraspError, match=r"there is no file .*none\.ply"):
@@ -74,10 +75,11 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
     motion = motion_of_episode(episode())
     save_motion(tmp_path / "grasp.npz", motion)
     given = asked(block, pose=str(tmp_path / "grasp.npz"), trajectory=str(tmp_path / "grasp.npz"))
+    pose = given.constraints["pose"]
     last = 7  # the last moment with the table
-    np.testing.assert_array_equal(given.pose.q, motion.joint_position[last])
-    np.testing.assert_allclose(given.pose.position, motion.wrist_position[last] - [0, 0, HEIGHT / 2], atol=1e-6)
-    path, turns = given.trajectory
+    np.testing.assert_array_equal(pose["q"], motion.joint_position[last])
+    np.testing.assert_allclose(pose["position"], motion.wrist_position[last] - [0, 0, HEIGHT / 2], atol=1e-6)
+    path, turns = given.constraints["trajectory"].values()
     assert path.shape == (15, 3) and turns.shape == (15, 4)
     np.testing.assert_allclose(path[[0, -1]], motion.wrist_position[[0, last]] - [0, 0, HEIGHT / 2], atol=1e-6)
     steps = np.linalg.norm(np.diff(path, axis=0), axis=-1)
@@ -85,13 +87,13 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
 
     wrist = {"position": [0.1, -0.2, 0.5], "quaternion": [2, 0, 0, 0]}
     (tmp_path / "pose.json").write_text(json.dumps({**wrist, "joints": {HAND.joints[3].name: 0.3}}))
-    pose = asked(block, pose=str(tmp_path / "pose.json")).pose
-    np.testing.assert_allclose(pose.position, [0, 0, 0.2], atol=1e-6)
-    np.testing.assert_allclose(pose.quaternion, [1, 0, 0, 0])
-    assert pose.q[3] == pytest.approx(0.3) and not pose.q[:3].any()
+    pose = asked(block, pose=str(tmp_path / "pose.json")).constraints["pose"]
+    np.testing.assert_allclose(pose["position"], [0, 0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(pose["quaternion"], [1, 0, 0, 0])
+    assert pose["q"][3] == pytest.approx(0.3) and not pose["q"][:3].any()
 
     (tmp_path / "path.csv").write_text("x,y,z,w,x,y,z\n0.1,-0.2,0.7,1,0,0,0\n0.1,-0.2,0.5,-1,0,0,0\n")
-    path, turns = asked(block, trajectory=str(tmp_path / "path.csv")).trajectory
+    path, turns = asked(block, trajectory=str(tmp_path / "path.csv")).constraints["trajectory"].values()
     np.testing.assert_allclose(path[:, 2], np.linspace(0.4, 0.2, 15), atol=1e-6)
     np.testing.assert_allclose(np.abs(turns[:, 0]), 1)
     assert (turns[:, 0] > 0).all() or (turns[:, 0] < 0).all()

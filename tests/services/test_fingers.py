@@ -1,0 +1,204 @@
+"""A constraint beyond the paper's, asked of policies that know it and of one that does not, at every door."""
+
+import dataclasses
+import json
+import pathlib
+
+import numpy as np
+import onnxruntime
+import pytest
+import trimesh
+
+from common.config import NetworkConfig, RunConfig, TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects import procedural
+from common.policy.bundle import PolicyBundle
+from common.task import observation
+from common.wire.codec import Message
+from services.cli.main import load
+from services.evaluate.evaluator import Evaluator
+from services.export.policy import describe, export_policy
+from services.grasp.files import RESULT
+from services.grasp.grasper import Grasper
+from services.grasp.parse import read_request
+from services.serve.inference import Answer, PolicyFunction
+from services.serve.load import example_episode
+from services.serve.requests import Layout
+from services.train.command import untrained
+from services.viz.studio.grasping import PolicyGrasping
+from services.viz.studio.lanes import for_page, lanes
+from services.viz.studio.state import Studio
+
+HAND = get_hand("human")
+TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))
+CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
+MUG = procedural.generate(1, "mug")
+PINCH = np.array([True, True, False, False, False])
+REFUSED = (
+    r"does not know the constraint 'fingers'\. It knows heading, affordance, pose, trajectory; train one with "
+    r"--task\.constraints … fingers\.$"
+)
+
+
+@pytest.fixture(scope="module")
+def policy() -> PolicyBundle:
+    """A policy that knows all constraints and has learnt nothing."""
+    return untrained(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def query() -> dict[str, np.ndarray]:
+    """The arrays of a query with the heading, from the start of an episode."""
+    episode = example_episode(1_000_000)
+    reset, state = episode["reset"], episode["state"]
+    given = {name: value for name, value in reset.items() if name.startswith("heading_")}
+    given |= {"q_target": reset["q"], "q_initial": reset["q"], "u_target": np.zeros(6), "time": np.float32(0)}
+    given |= {"base_position": reset["wrist"][0], "base_quaternion": reset["wrist"][1], "table": np.bool_(True)}
+    given |= {f"{name}_initial": state[name] for name in ("object_position", "object_quaternion")}
+    return {**given, **state, "surface_points": reset["surface"]}
+
+
+# A policy that does not know it.
+
+
+def test_the_command_refuses_it_in_one_line(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
+    options = ["--out", str(tmp_path / "out"), "--no-pictures", "--fingers", "thumb", "index"]
+    assert load("grasp")([str(tmp_path / "block.stl"), *options])() == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
+    assert line.startswith("congrasp: error: The policy does not know the constraint 'fingers'. It knows heading, ")
+    assert not (tmp_path / "out" / "block" / RESULT).exists()
+
+
+def test_a_query_for_it_is_refused_in_one_line(query: dict[str, np.ndarray]) -> None:
+    message = Message({**query, "fingers_allowed": PINCH}, {"constraints": ["heading", "fingers"]})
+    with pytest.raises(CongraspError, match=f"^This server's policy {REFUSED}"):
+        Layout(HAND, TaskConfig()).parse(message)
+
+
+def test_the_studio_refuses_it_in_one_line() -> None:
+    studio = Studio(HAND, TaskConfig(), MUG)
+    with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
+        studio.ask("fingers", True)
+    with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
+        studio.choose("fingers", "allowed", PINCH.tolist())
+    assert studio.asked == set() and studio.view()["others"] == [] and "fingers" not in studio.view()["known"]
+
+
+def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
+    evaluator = Evaluator(untrained(dataclasses.replace(CONFIG, task=TaskConfig())), [MUG], batch=8)
+    with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
+        evaluator.rows(["fingers"], 1)
+
+
+# A policy that knows it.
+
+
+def test_fingers_are_read_by_their_names() -> None:
+    request = read_request(MUG, HAND, 15, fingers=("thumb", "index"))
+    assert set(request.constraints) == {"heading", "fingers"}
+    np.testing.assert_array_equal(request.given("fingers", "allowed"), PINCH)
+    assert read_request(MUG, HAND, 15).given("fingers", "allowed") is None
+    with pytest.raises(CongraspError, match=r"no finger 'toe'\. Known: thumb, index, middle, ring, "):
+        read_request(MUG, HAND, 15, fingers=("thumb", "toe"))
+    with pytest.raises(CongraspError, match=r"--fingers names one finger.*Name two or more"):
+        read_request(MUG, HAND, 15, fingers=("thumb",))
+
+
+def test_a_grasp_is_asked_for_with_two_fingers(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
+    grasper = Grasper(policy, tries=2, rounds=1, seconds=0.25, threads=1)
+    found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index")))
+    grasper.close()
+    assert found.motion.constraints == ("heading", "fingers") and "fingers_ratio" in found.facts()
+    np.testing.assert_array_equal(found.motion.goal["fingers_allowed"], PINCH)
+    assert "Only the named fingers may touch the object." in found.words
+    arrays = found.episode.arrays
+    steps = len(arrays["table"])
+    other = np.isin(HAND.link_fingers, (2, 3, 4))
+    touching = np.linalg.norm(arrays["contact_force"], axis=-1) > 0
+    np.testing.assert_array_equal(arrays["error/fingers_ratio"] > 0, (touching & other).any(-1))
+    assert arrays["active/fingers"] and not arrays["active/pose_finger"]
+    assert lanes(found.episode)["fingers"].met.shape == (steps,)
+    assert "lane/fingers/share" in for_page(found.episode).arrays
+
+
+def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: dict[str, np.ndarray]) -> None:
+    function = PolicyFunction(HAND, TASK)
+    layout = function.layout
+    assert layout.shapes["fingers_allowed"] == (5,) and layout.shapes["asked"] == (5,)
+
+    def ask(constraints: list[str], **more: np.ndarray) -> Answer | Exception:
+        (answer,) = function(policy.acting, [layout.parse(Message({**query, **more}, {"constraints": constraints}))])
+        return answer
+
+    pinch = ask(["heading", "fingers"], fingers_allowed=PINCH)
+    assert isinstance(pinch, Answer)
+    assert pinch.words == [["Only the named fingers may touch the object.", "The heading guides the wrist."]]
+    free, ignored = ask(["heading"]), ask(["heading"], fingers_allowed=PINCH)
+    assert isinstance(free, Answer) and isinstance(ignored, Answer)
+    np.testing.assert_array_equal(free.vectors, ignored.vectors)
+    assert np.abs(pinch.vectors - free.vectors).max() > 1e-6
+    assert "fewer than two fingers. Allow two or more" in str(ask(["heading", "fingers"], fingers_allowed=0 * PINCH))
+    with pytest.raises(CongraspError, match="lacks the field 'fingers_allowed'"):
+        ask(["heading", "fingers"])
+    with pytest.raises(CongraspError, match="nothing that guides the wrist"):
+        ask(["fingers"], fingers_allowed=PINCH)
+
+
+def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
+    studio = Studio(HAND, TASK, MUG)
+    flags = dict(zip(HAND.fingers, PINCH.tolist(), strict=True))
+    assert studio.view()["others"] == [{"name": "fingers", "title": "fingers", "flags": {"allowed": flags}}]
+    studio.ask("fingers", True)
+    assert studio.view()["active"]["masks"]["fingers"] and studio.trouble == ""
+    np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), PINCH)
+    studio.choose("fingers", "allowed", [True, True, True, False, False])
+    assert json.loads(json.dumps(studio.view()))["others"][0]["flags"]["allowed"]["middle"]
+    np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), [1, 1, 1, 0, 0])
+    studio.choose("fingers", "allowed", [True, False, False, False, False])
+    assert studio.trouble == "The constraint 'fingers' allows fewer than two fingers. Allow two or more."
+    for values in ([True], "thumb"):
+        with pytest.raises(CongraspError, match="'fingers' takes 5 flags"):
+            studio.choose("fingers", "allowed", values)
+    with pytest.raises(CongraspError, match="nothing to choose for 'pose'"):
+        studio.choose("pose", "q", [])
+
+
+def test_the_studio_grasps_with_it(policy: PolicyBundle) -> None:
+    task = dataclasses.replace(TASK, approach_steps=4, hold_steps=2, hold_steps_max=2)
+    grasping = PolicyGrasping(lambda version: dataclasses.replace(policy, task=task), "untrained", threads=1)
+    studio = Studio(grasping.hand, grasping.task, MUG)
+    studio.ask("fingers", True)
+    episode = grasping.grasp(studio.labelled, studio.request, lambda text, share: None)
+    assert episode.arrays["active/fingers"] and "fingers_ratio" in episode.meta["metrics"]
+    np.testing.assert_array_equal(episode.arrays["goal/fingers_allowed"], PINCH)
+
+
+def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
+    assert export_policy(policy, "onnx", tmp_path / "policy.onnx") <= 1e-5
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    meta = {name: json.loads(text) for name, text in session.get_modelmeta().custom_metadata_map.items()}
+    block = [(field["field"], field["size"]) for field in meta["observation"] if field["block"] == "fingers"]
+    assert block == [("fingers_allowed", 5), ("fingers_room", 5), ("force_other", 3 * len(HAND.links))]
+    assert dict(meta["layout"])["fingers"] == sum(size for _, size in block)
+    assert (
+        meta["masks"]
+        == ["affordance", "pose_finger", "pose_wrist", "trajectory", "fingers"]
+        == describe(policy)["masks"]
+    )
+    assert sum(size for _, size in meta["layout"]) == sum(size for _, size in observation.layout(HAND, TASK))
+
+
+def test_an_evaluation_has_its_row(policy: PolicyBundle) -> None:
+    evaluator = Evaluator(policy, procedural.generate_many(2, 1_000_000), physics="native", batch=8)
+    sample = evaluator.samples(["fingers"], 6)["fingers"]
+    ratio = sample.values["fingers_ratio"]
+    assert (sample.values["mask_fingers"] == 1).all() and ((ratio >= 0) & (ratio <= 1)).all()
+    row = evaluator.row("fingers", sample)
+    assert (row.constraint, row.episodes) == ("fingers", 6) and row.paper is None
+    assert "fingers_ratio" in row.errors and row.errors["heading_rad"] is None
+    assert (row.errors["fingers_ratio"] is None) == (row.success == 0)
