@@ -4,8 +4,10 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from common.config import TaskConfig
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
+from common.task.constraints import blocks
 from common.wire.codec import Message
 from services.record.poses import link_poses
 
@@ -16,7 +18,10 @@ FORCE = 1.5  # N on each fingertip while it touches
 def episode(
     steps: int = 12, *, removal: int = 8, mask: tuple[int, ...] = (1, 1, 1, 1), success: bool = True
 ) -> Message:
-    """`steps` control steps; the table goes at `removal`, the tips touch from two thirds of that on."""
+    """`steps` control steps; the table goes at `removal`, the tips touch from two thirds of that on.
+
+    `mask` says which of the paper's blocks are active: affordance, pose_finger, pose_wrist, trajectory.
+    """
     hand = get_hand("human")
     frame = grasp_frame(hand)
     direction = np.array([-1.0, 0.3, -0.35]) / np.linalg.norm([-1.0, 0.3, -0.35])
@@ -61,7 +66,7 @@ def episode(
         "goal/pose_quaternion": turn,
         "goal/trajectory_position": np.linspace(wrist_local - 0.12 * direction, wrist_local, 5).astype(np.float32),
         "goal/trajectory_quaternion": np.tile(turn, (5, 1)),
-        "goal/mask": np.array(mask, np.float32),
+        **{f"active/{block}": np.array(bool(bit)) for block, bit in zip(blocks(TaskConfig()), mask, strict=True)},
         "piece_kind": np.array([1], np.int32),
         "piece_size": np.array([[RADIUS, HEIGHT / 2, 0]], np.float32),
         "piece_pos": np.zeros((1, 3), np.float32),
