@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors.environment import start
+from actors.bank import build_bank
+from actors.initial import sample
 from actors.physics import resolve_physics
 from actors.physics.engine import World
 from actors.physics.mjx import MjxPhysics
 from actors.physics.native import NativePhysics
 from actors.physics.slots import LEAVES, Pool
-from actors.bank import build_bank
 from common import rotations
 from common.config import TaskConfig
 from common.errors import CongraspError
@@ -33,10 +33,10 @@ WORLDS = 3
 
 
 @pytest.fixture(scope="module")
-def env():
+def initial():
+    """What the worlds start from: one for each object."""
     bank = build_bank(HAND, TASK, OBJECTS, 0)
-    fresh = start(HAND, TASK, bank, jax.random.key(1), WORLDS)
-    # One world for each object.
+    fresh = sample(HAND, TASK, bank, jax.random.key(1), WORLDS)
     index = jnp.arange(WORLDS)
     rest = bank.rest[index, 0]
     return fresh._replace(
@@ -60,45 +60,45 @@ def _grasp(world: World, step: int) -> np.ndarray:
     return target
 
 
-def test_objects_rest_and_the_hand_stays_without_commands(env):
+def test_objects_rest_and_the_hand_stays_without_commands(initial):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(_above(env.world, 0.3))
-    still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(env.world.q)], 1)
+    state = physics.start(_above(initial.world, 0.3))
+    still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(initial.world.q)], 1)
     for _ in range(50):
         state, seen = physics.step(state, still, np.ones(WORLDS, bool))
-    np.testing.assert_allclose(seen.object_position, env.world.object_position, atol=2e-3)
-    np.testing.assert_allclose(seen.q, env.world.q, atol=1e-3)  # gravity on the hand is compensated
+    np.testing.assert_allclose(seen.object_position, initial.world.object_position, atol=2e-3)
+    np.testing.assert_allclose(seen.q, initial.world.q, atol=1e-3)  # gravity on the hand is compensated
     assert not seen.contact_found.any() and not seen.bad.any()
     physics.close()
 
 
-def test_a_removed_table_lets_objects_fall_freely(env):
+def test_a_removed_table_lets_objects_fall_freely(initial):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(_above(env.world, 0.3))
-    still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(env.world.q)], 1)
+    state = physics.start(_above(initial.world, 0.3))
+    still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(initial.world.q)], 1)
     table = np.array([True, False, False])
     for _ in range(20):
         state, seen = physics.step(state, still, table)
-    drop = np.asarray(env.world.object_position)[:, 2] - seen.object_position[:, 2]
+    drop = np.asarray(initial.world.object_position)[:, 2] - seen.object_position[:, 2]
     assert abs(drop[0]) < 2e-3
     np.testing.assert_allclose(drop[1:], 0.5 * 9.81 * 0.2**2, rtol=0.05)
     physics.close()
 
 
-def test_a_stationary_object_stays_when_pushed(env):
+def test_a_stationary_object_stays_when_pushed(initial):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    world = _above(env.world, 0.19)._replace(stationary=np.ones(WORLDS, bool))
+    world = _above(initial.world, 0.19)._replace(stationary=np.ones(WORLDS, bool))
     state = physics.start(world)
     touched = np.zeros(WORLDS, bool)
     for step in range(40):
         state, seen = physics.step(state, _grasp(world, step), np.ones(WORLDS, bool))
         touched |= seen.contact_found.any((1, 2))
     assert touched.any()
-    np.testing.assert_allclose(seen.object_position, env.world.object_position, atol=4e-3)
+    np.testing.assert_allclose(seen.object_position, initial.world.object_position, atol=4e-3)
     physics.close()
 
 
-def test_contact_force_is_that_of_the_object_on_the_link(env):
+def test_contact_force_is_that_of_the_object_on_the_link(initial):
     """An object that lies on a flat, upturned hand presses it down with its weight."""
     box = dataclasses.replace(OBJECTS[0])
     physics = NativePhysics(HAND, TASK, [box], 1)
@@ -163,12 +163,12 @@ def test_gains_hold_half_a_kilogram_without_shaking():
     physics.close()
 
 
-def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp_path, monkeypatch):
+def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(initial, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     physics = NativePhysics(HAND, TASK, OBJECTS, 2)
-    world = _above(env.world, 0.3)
+    world = _above(initial.world, 0.3)
     state = physics.start(world)
-    still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(env.world.q)], 1)
+    still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(initial.world.q)], 1)
     state, _ = physics.step(state, still, np.ones(WORLDS, bool))
     physics.cells[1].data.qvel[:] = np.nan
     state, seen = physics.step(state, still, np.ones(WORLDS, bool))
@@ -181,10 +181,10 @@ def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp
     physics.close()
 
 
-def test_a_world_that_was_used_before_is_as_good_as_new(env):
+def test_a_world_that_was_used_before_is_as_good_as_new(initial):
     """Worlds are recycled: neither state nor mass of an earlier episode may be left in them."""
     physics, fresh = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, OBJECTS, 1)
-    world = _above(env.world, 0.19)
+    world = _above(initial.world, 0.19)
     everywhere = np.ones(WORLDS, bool)
     state = physics.start(world._replace(mass_scale=np.full(WORLDS, 3.0), stationary=everywhere))
     for step in range(30):
@@ -201,9 +201,9 @@ def test_a_world_that_was_used_before_is_as_good_as_new(env):
     fresh.close()
 
 
-def test_reset_changes_only_the_masked_worlds(env):
+def test_reset_changes_only_the_masked_worlds(initial):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    world = _above(env.world, 0.3)
+    world = _above(initial.world, 0.3)
     state = physics.start(world)
     moving = np.concatenate([np.full((WORLDS, 6), 0.05), np.asarray(world.q)], 1)
     for _ in range(10):
@@ -235,11 +235,11 @@ def test_a_pool_may_begin_with_an_object_whose_inertia_is_diagonal():
 
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize("implementation", ["warp", "jax"])
-def test_engines_agree(env, implementation, monkeypatch):
+def test_engines_agree(initial, implementation, monkeypatch):
     """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
     from actors.physics import mjx
 
-    world = _above(env.world, 0.19)
+    world = _above(initial.world, 0.19)
     native = NativePhysics(HAND, TASK, OBJECTS, 1)
     other = MjxPhysics(HAND, TASK, OBJECTS, implementation)
     step = jax.jit(other.step)
@@ -290,9 +290,9 @@ def test_a_demanded_gpu_that_is_missing_is_one_clear_line():
     assert resolve_physics("auto") == "native"
 
 
-def test_object_velocity_is_in_the_world_frame(env):
+def test_object_velocity_is_in_the_world_frame(initial):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(_above(env.world, 0.3))
+    state = physics.start(_above(initial.world, 0.3))
     cell = physics.cells[0]
     spin = np.array([0.0, 0.0, 3.0])  # about the world's vertical
     quaternion = jnp.asarray(cell.data.qpos[physics._where.object_qpos[3:]], jnp.float32)

@@ -1,4 +1,4 @@
-"""Task sets: references that the table allows, and references renewed by the policy's own grasps."""
+"""Constraint banks: references that the table allows, and references renewed by the policy's own grasps."""
 
 import dataclasses
 
@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors.physics.engine import where_worlds
-from actors.references import Grasps, renew
 from actors.bank import POSES, build_bank, make_references
+from actors.harvest import Grasps, renew
+from actors.physics.engine import where_worlds
 from common import rotations
 from common.config import TaskConfig
-from common.task.sampling.closed_poses import Poses
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from common.objects import procedural
+from common.task.sampling.closed_poses import Poses
 
 HAND = get_hand("human")
 TASK = TaskConfig()
@@ -71,7 +71,7 @@ def test_an_object_that_cannot_be_approached_is_named():
         build_bank(HAND, TASK, [lifted], 0)
 
 
-def test_a_grasp_replaces_one_reference_of_its_object_and_variant(bank):
+def test_a_grasp_replaces_one_reference_of_its_object_and_region(bank):
     found = jnp.array([True, False])
     grasps = Grasps(
         found,
