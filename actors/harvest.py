@@ -46,12 +46,12 @@ class Grasps(NamedTuple):
 def collect(
     task: TaskConfig, state: "EnvState", scene: Scene, error: Mapping[str, tuple[Array, Array]], up: Array
 ) -> Grasps:
-    """The grasps, with those that succeeded just now near to their heading, and under nothing drawn from references."""
+    """The grasps, with those that succeeded just now near to their heading, and under constraints that let them."""
     now = (state.time == task.approach_steps + task.hold_steps) & up
     for spec in get_constraint("heading").errors:
         now &= error[spec.name][0] < spec.tolerance
     for constraint in optional(task):
-        if constraint.from_reference:
+        if not constraint.harvested:
             now &= ~constraint.active(state.goal)
     position, quaternion = rotations.relative_pose(
         scene.state.object_position,

@@ -129,12 +129,16 @@ class Constraint:
     """Blocks of the observation that it gates, each with a bit of its own; the heading, always active, has none."""
     overrides: ClassVar[tuple[str, ...]] = ()
     """Weaker constraints, or single blocks of theirs, that are inactive where this one is asked for."""
+    overridden_by: ClassVar[tuple[str, ...]] = ()
+    """Constraints where this one is inactive, as far as they do not say so themselves."""
     guides: ClassVar[str] = ""
     """Block whose activity hands the wrist's guidance to `guidance`; empty if it leads no wrist."""
     region: ClassVar[int] = 0
     """Region of the constraint bank that its episodes draw from: 0 the whole surface, 1 the graspable region."""
     from_reference: ClassVar[bool] = False
-    """Whether it is drawn from reference grasps; grasps under it then make no new ones."""
+    """Whether it is drawn from reference grasps."""
+    harvested: ClassVar[bool] = True
+    """Whether successful grasps under it may become references."""
     weights: ClassVar[tuple[Weight, ...]] = ()
     errors: ClassVar[tuple[ErrorSpec, ...]] = ()
     relations: ClassVar[tuple[Relation, ...]] = ()

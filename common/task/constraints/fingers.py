@@ -32,6 +32,8 @@ class Fingers(Constraint):
 
     name, title, goal = "fingers", "fingers", FingersGoal
     blocks = ("fingers",)
+    overridden_by = ("pose",)
+    harvested = False
     weights = (
         Weight("fingers_distance", 0.02, "For each unit of softplus((margin - d)/sharpness), finger by finger."),
         Weight("fingers_contact", 0.3, "For each link of another finger that touches the object."),
@@ -97,7 +99,9 @@ class Fingers(Constraint):
         return jnp.sum(own.allowed, -1) >= 2
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """It keeps the others away."""
+        """It keeps the others away, unless a reference pose names its own contacts."""
+        if overridden:
+            return ["The choice of fingers is overridden by the reference pose, which names its own contacts."]
         return ["Only the named fingers may touch the object."]
 
     def parse(self, given: Mapping[str, Any], hand: Hand) -> dict[str, np.ndarray] | None:

@@ -59,7 +59,7 @@ class Pose(Constraint):
     blocks = ("pose_finger", "pose_wrist")
     overrides = ("heading", "affordance")
     guides = "pose_wrist"
-    from_reference = True
+    from_reference, harvested = True, False
     weights = (
         Weight(
             "pose_finger",

@@ -44,12 +44,12 @@ class Contradiction(NamedTuple):
 
 def _overrides(stronger: Constraint, weaker: str) -> bool:
     """Whether it overrides a constraint or one of its blocks."""
-    return not {weaker, *get_constraint(weaker).blocks}.isdisjoint(stronger.overrides)
+    return any(_hits(stronger, block, get_constraint(weaker)) for block in (weaker, *get_constraint(weaker).blocks))
 
 
 def _hits(stronger: Constraint, block: str, owner: Constraint) -> bool:
     """Whether it overrides this block."""
-    return not {block, owner.name}.isdisjoint(stronger.overrides)
+    return not {block, owner.name}.isdisjoint(stronger.overrides) or stronger.name in owner.overridden_by
 
 
 def active_blocks(asked: Mapping[str, Array]) -> dict[str, Array]:

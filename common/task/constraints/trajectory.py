@@ -51,7 +51,7 @@ class Trajectory(Constraint):
     blocks = ("trajectory",)
     overrides = ("heading", "pose_wrist")
     guides = "trajectory"
-    from_reference = True
+    from_reference, harvested = True, False
     weights = (
         Weight("trajectory_position", 20.0, "w_traj-p: per square metre between the wrist and the active waypoint."),
         Weight("trajectory_rotation", 0.5, "w_traj-q: per square radian between the wrist and the active waypoint."),
