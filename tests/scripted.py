@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
+from actors.bank import build_bank
 from actors.physics.native import NativePhysics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes
-from actors.bank import build_bank
 from common.config import TaskConfig
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject

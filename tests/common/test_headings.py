@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from common.objects.procedural import FAMILIES, generate
 from common.task.sampling.headings import (
     INWARD,
     MAX_WIDTH,
@@ -16,7 +17,6 @@ from common.task.sampling.headings import (
     feasible,
     sample_headings,
 )
-from common.objects.procedural import FAMILIES, generate
 
 DOWN, LEVEL, UP = [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
 FLAT = np.array([0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0])
