@@ -14,7 +14,6 @@ from common.task.constraints.fingers import Fingers
 from common.task.constraints.heading import Heading
 from common.task.constraints.pose import Pose
 from common.task.constraints.trajectory import Trajectory
-
 from common.task.types import Goal
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
 
 
 def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
-    """The goal arrays of a request, without batch axis, before the priority rules; neutral where it leaves them free."""
+    """The goal arrays of a request, without batch axis, before the priority rules; neutral where it names none."""
     values = {}
     for constraint in known(task):
         given = request.constraints.get(constraint.name, {})
