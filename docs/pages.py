@@ -74,14 +74,24 @@ def _help(words: list[str]) -> str:
 
 
 def _fields(config: typing.Any, prefix: str) -> Iterator[tuple[str, typing.Any, str]]:
-    """Name, default and docstring of every field, those of nested dataclasses after a dot."""
-    docs = dict(re.findall(r'^    (\w+): [^\n]*\n    """(.+?)"""', inspect.getsource(type(config)), re.M | re.S))
+    """Name, default and meaning of every field, those of nested dataclasses after a dot."""
+    meanings = _meanings(type(config))
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), f"{prefix}{field.name}".replace("_", "-")
         if dataclasses.is_dataclass(value):
             yield from _fields(value, f"{prefix}{field.name}.")
         else:
-            yield name, value, " ".join(docs[field.name].split())
+            yield name, value, " ".join(meanings[field.name].split())
+
+
+def _meanings(kind: type) -> dict[str, str]:
+    """What the fields of a dataclass mean: the docstrings under them, or `Doc` where constraints declare them."""
+    written = "".join(inspect.getsource(base) for base in kind.__mro__ if base.__module__ == kind.__module__)
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {
+        **{name: hint.__metadata__[0].documentation for name, hint in hints.items() if hasattr(hint, "__metadata__")},
+        **dict(re.findall(r'^    (\w+): [^\n]*\n    """(.+?)"""', written, re.M | re.S)),
+    }
 
 
 def _entries(spec: MessageSpec) -> Iterator[tuple[str, str, str]]:

@@ -4,6 +4,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.hands import get_hand
+from common.task.constraints import CONSTRAINTS
+from common.task.constraints.affordance import AffordanceGoal
+from common.task.constraints.fingers import FingersGoal
+from common.task.constraints.heading import HeadingGoal
+from common.task.constraints.pose import PoseGoal
+from common.task.constraints.trajectory import TrajectoryGoal
 from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 
 HAND = get_hand("human")
@@ -54,19 +60,28 @@ def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
     )
     direction = units(rng, batch)
     cross = np.cross(direction, units(rng, batch))
-    goal = Goal(
-        heading_position=normal(3, scale=0.03),
-        heading_direction=direction,
-        heading_cross=(cross / np.linalg.norm(cross, axis=-1, keepdims=True)).astype(np.float32),
-        pose_q=rng.uniform(HAND.lower, HAND.upper, (batch, F)).astype(np.float32),
-        pose_position=normal(3, scale=0.1),
-        pose_quaternion=quaternions(rng, batch),
-        trajectory_position=normal(K, 3, scale=0.15),
-        trajectory_quaternion=quaternions(rng, batch, K),
-        mask=np.ones((batch, 4), np.float32),
-    )
+    values = {
+        "heading": HeadingGoal(
+            position=normal(3, scale=0.03),
+            direction=direction,
+            cross=(cross / np.linalg.norm(cross, axis=-1, keepdims=True)).astype(np.float32),
+        ),
+        "affordance": AffordanceGoal(),
+        "pose": PoseGoal(
+            q=rng.uniform(HAND.lower, HAND.upper, (batch, F)).astype(np.float32),
+            position=normal(3, scale=0.1),
+            quaternion=quaternions(rng, batch),
+        ),
+        "trajectory": TrajectoryGoal(position=normal(K, 3, scale=0.15), quaternion=quaternions(rng, batch, K)),
+    }
     surface = Surface(normal(N, 3, scale=0.03), rng.random((batch, N)) < 0.5)
-    return state, surface, goal
+    values["fingers"] = FingersGoal(np.arange(len(HAND.fingers)) < rng.integers(2, len(HAND.fingers), (batch, 1)))
+    return state, surface, Goal(values, active(*(block for c in CONSTRAINTS for block in c.blocks), batch=batch))
+
+
+def active(*blocks: str, batch: int = 4) -> dict[str, np.ndarray]:
+    """Which blocks are active: these, everywhere."""
+    return {block: np.full(batch, block in blocks) for c in CONSTRAINTS for block in c.blocks}
 
 
 def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:
@@ -84,13 +99,9 @@ def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:
         return points.astype(np.float32), quaternions.astype(np.float32)
 
     (pose, pose_turn), (way, way_turn) = near(1), near(K)
-    return goal._replace(
-        heading_position=pose[:, 0],
-        pose_position=pose[:, 0],
-        pose_quaternion=pose_turn[:, 0],
-        trajectory_position=way,
-        trajectory_quaternion=way_turn,
-    )
+    goal = goal.replace("heading", position=pose[:, 0])
+    goal = goal.replace("pose", position=pose[:, 0], quaternion=pose_turn[:, 0])
+    return goal.replace("trajectory", position=way, quaternion=way_turn)
 
 
 def moved(state: SceneState, position: np.ndarray, turn: Rotation) -> SceneState:

@@ -56,4 +56,4 @@ def grasps(
     )
     rollout = worker.collect(None, task.approach_steps + task.hold_steps_max)
     physics.close()
-    return finished_episodes(rollout), rollout
+    return finished_episodes(rollout, task), rollout

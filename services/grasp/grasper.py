@@ -228,7 +228,7 @@ class Grasper:
         )
         asked = tuple(request.constraints)
         words = explain(asked, bool(outcome.redirected[index]))
-        written = [name for name in asked if name != "heading" or request.constraints[name]]
+        written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
         avoid = labelled.non_graspable_points
         words += [found.words for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
         return Grasp(episode, motion_of_episode(episode), tries, held, rest, tuple(words))

@@ -6,17 +6,20 @@ import types
 import jax
 import numpy as np
 import pytest
-from actors.environment import EPISODE_FIELDS
 
 from actors import process
+from actors.env import episode_fields
 from actors.rollout import Rollout, Trace
 from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
 from common.policy.bundle import PolicyBundle, policy_spec
-from common.task.reward import TERMS
-from common.task.types import Goal, Surface
+from common.request import GraspRequest
+from common.task import metrics
+from common.task.constraints import goal_of
+from common.task.reward import terms
+from common.task.types import Surface
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import encode
@@ -39,6 +42,7 @@ CONFIG = RunConfig(
 HAND = get_hand("human")
 SPEC = policy_spec(CONFIG.task, CONFIG.network)
 FORM = RolloutForm(T, B, sum(size for _, size in SPEC.layout), SPEC.action_size, half=True)
+FIELDS = episode_fields(CONFIG.task)
 
 
 def invented(episodes: np.ndarray) -> Rollout:
@@ -50,7 +54,8 @@ def invented(episodes: np.ndarray) -> Rollout:
         **dict.fromkeys(("wrist_quaternion", "object_quaternion"), (T, 4)),
         "contact_force": (T, len(HAND.links), 3),
         "action": (T, SPEC.action_size),
-        "terms": (T, len(TERMS)),
+        "terms": (T, len(terms(CONFIG.task))),
+        "errors": (T, len(metrics.specs(CONFIG.task))),
     }
     flags = dict.fromkeys(("table", "terminal"), np.zeros(T, bool))
     given = {
@@ -70,10 +75,11 @@ class InventedWorker:
     rollout: Rollout
 
     def __init__(self, *args, **options):
-        goal = Goal(*(np.zeros((1, 4), np.float32) for _ in Goal._fields))
+        neutral = goal_of(HAND, CONFIG.task, GraspRequest())
+        goal = jax.tree.map(lambda array: array[None], neutral)
         surface = Surface(np.zeros((1, 8, 3), np.float32), np.zeros((1, 8), bool))
         world = types.SimpleNamespace(object_index=np.zeros(1, int))
-        self.env = types.SimpleNamespace(time=np.zeros(1), goal=goal, surface=surface, world=world)
+        self.state = types.SimpleNamespace(time=np.zeros(1), goal=goal, surface=surface, world=world)
 
     def configure(self, *args, **options):
         pass
@@ -134,17 +140,17 @@ def test_steps_in_which_the_physics_left_contacts_out_are_counted():
 
 @pytest.mark.timeout(60)
 def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(heard):
-    episodes = np.tile(np.arange(len(EPISODE_FIELDS), dtype=np.float32), (B, 1))
-    episodes[0, EPISODE_FIELDS.index("episode/heading_rad")] = np.nan
-    episodes[2, EPISODE_FIELDS.index("term/contact")] = np.inf
+    episodes = np.tile(np.arange(len(FIELDS), dtype=np.float32), (B, 1))
+    episodes[0, FIELDS.index("episode/heading_rad")] = np.nan
+    episodes[2, FIELDS.index("term/contact")] = np.inf
     batch, logs = heard(invented(episodes))
     assert batch is not None, "the learner refused the rollout"
     arrays = batch[0].arrays
-    for i, name in enumerate(EPISODE_FIELDS):  # world 1's
+    for i, name in enumerate(FIELDS):  # world 1's
         np.testing.assert_array_equal(arrays[name], [i], err_msg=name)
     assert logs["metrics"].meta["values"]["episodes_left_out"] == 2
     episode = logs["episode"].meta["metrics"]
-    assert "heading_rad" not in episode and episode["heading_m"] == EPISODE_FIELDS.index("episode/heading_m")
+    assert "heading_rad" not in episode and episode["heading_m"] == FIELDS.index("episode/heading_m")
     for message in logs.values():
         encode(message)  # a number that JSON has not would be an error here, and the end of the actor
     validate(logs["episode"], EPISODE)

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from actors.environment import EPISODE_FIELDS, METRICS
 
-from actors import environment
+from actors import initial
 from actors.bank import build_bank
+from actors.env import GraspEnv, episode_fields, metric_names
 from actors.physics.engine import Readout, where_worlds
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker, finished_episodes
@@ -19,7 +19,7 @@ from common.hands import get_hand
 from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
 from common.objects import procedural
 from common.task.observation import layout
-from common.task.types import CONTACTS_PER_LINK, MASKS, Action
+from common.task.types import CONTACTS_PER_LINK, Action
 
 HAND = get_hand("human")
 TASK = TaskConfig()
@@ -44,36 +44,36 @@ def _worker(bank, task=TASK, seed=0, batch=BATCH):
 
 
 def test_masks_are_drawn_as_in_the_paper(bank):
-    _, goal, _, _, hold = environment.sample_episodes(HAND, TASK, bank, jax.random.key(0), 4000)
-    mask = np.asarray(goal.mask)
-    named = dict(zip(MASKS, mask.T, strict=True))
+    drawn = initial.sample(HAND, TASK, bank, jax.random.key(0), 4000)
+    named = {block: np.asarray(active, float) for block, active in drawn.goal.active.items()}
+    assert list(named) == ["affordance", "pose_finger", "pose_wrist", "trajectory"]
     assert abs(named["trajectory"].mean() - 0.5) < 0.08
     assert abs(named["pose_finger"].mean() - 0.5) < 0.08
     assert np.all(named["pose_wrist"] == named["pose_finger"] * (1 - named["trajectory"]))
     assert not np.any(named["affordance"] * named["pose_finger"])  # the pose overrides it
-    assert np.all(np.asarray(hold) == TASK.hold_steps)
+    assert np.all(np.asarray(drawn.hold) == TASK.hold_steps)
 
 
 def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(bank):
-    world, goal, *_ = environment.sample_episodes(HAND, TASK, bank, jax.random.key(1), 256)
-    trajectory = np.asarray(goal.mask)[:, 3] > 0
+    world, goal, *_ = initial.sample(HAND, TASK, bank, jax.random.key(1), 256)
+    trajectory = np.asarray(goal.active["trajectory"])
     first = rotations.compose_pose(
         world.object_position,
         world.object_quaternion,
-        goal.trajectory_position[:, 0],
-        goal.trajectory_quaternion[:, 0],
+        goal["trajectory"].position[:, 0],
+        goal["trajectory"].quaternion[:, 0],
     )
     np.testing.assert_allclose(np.asarray(world.base_position)[trajectory], np.asarray(first[0])[trajectory], atol=1e-5)
     # Otherwise v points along v-bar, and the hand centre lies 15 cm before p-bar.
-    direction = np.asarray(rotations.rotate(world.object_quaternion, goal.heading_direction))
+    direction = np.asarray(rotations.rotate(world.object_quaternion, goal["heading"].direction))
     v = np.asarray(rotations.rotate(world.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, (256, 3))))
     np.testing.assert_allclose(v[~trajectory], direction[~trajectory], atol=1e-4)
     center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, world.q)))
     center = np.asarray(rotations.rotate(world.base_quaternion, center) + world.base_position)
-    target = np.asarray(rotations.rotate(world.object_quaternion, goal.heading_position) + world.object_position)
+    target = np.asarray(rotations.rotate(world.object_quaternion, goal["heading"].position) + world.object_position)
     np.testing.assert_allclose((center + TASK.back_off * direction)[~trajectory], target[~trajectory], atol=1e-4)
-    pose = np.asarray(goal.mask)[:, 1] > 0
-    np.testing.assert_allclose(np.asarray(world.q)[pose], np.asarray(goal.pose_q)[pose], atol=1e-6)
+    pose = np.asarray(goal.active["pose_finger"])
+    np.testing.assert_allclose(np.asarray(world.q)[pose], np.asarray(goal["pose"].q)[pose], atol=1e-6)
     np.testing.assert_allclose(np.asarray(world.q)[~pose], np.tile(HAND.q_open, (256 - pose.sum(), 1)), atol=1e-6)
 
 
@@ -84,8 +84,8 @@ def test_rollouts_go_through_whole_episodes_and_on(bank):
     assert np.isfinite(np.asarray(first.observation, np.float32)).all()
     terminal = np.asarray(first.terminal)
     assert terminal[-1].all() and not terminal[:-1].any()
-    episodes = finished_episodes(first)
-    assert set(episodes) == set(EPISODE_FIELDS) and len(episodes["episode/return"]) == BATCH
+    episodes = finished_episodes(first, TASK)
+    assert set(episodes) == set(episode_fields(TASK)) and len(episodes["episode/return"]) == BATCH
     np.testing.assert_allclose(episodes["episode/return"], np.asarray(first.reward).sum(0), rtol=1e-3)
     terms = sum(values for name, values in episodes.items() if name.startswith("term/"))
     np.testing.assert_allclose(terms, episodes["episode/return"], rtol=1e-3, atol=1e-2)
@@ -93,14 +93,14 @@ def test_rollouts_go_through_whole_episodes_and_on(bank):
     # The table goes after fifty steps.
     np.testing.assert_array_equal(first.trace.table, np.arange(1, 76) < TASK.approach_steps)
     second = worker.collect(None, 30)
-    assert not np.asarray(second.terminal).any() and not len(finished_episodes(second)["episode/return"])
+    assert not np.asarray(second.terminal).any() and not len(finished_episodes(second, TASK)["episode/return"])
     # The first observation of a rollout is the last one of the rollout before.
     np.testing.assert_array_equal(second.observation[0], first.last_observation)
-    assert np.all(np.asarray(worker.env.time) == 30)
+    assert np.all(np.asarray(worker.state.time) == 30)
     worker.restart()
-    assert not np.asarray(worker.env.time).any()
+    assert not np.asarray(worker.state.time).any()
     third = worker.collect(None, 1)
-    np.testing.assert_allclose(third.trace.object_position[0], worker.env.world.object_position[0], atol=0.01)
+    np.testing.assert_allclose(third.trace.object_position[0], worker.state.world.object_position[0], atol=0.01)
     worker.physics.close()
 
 
@@ -111,7 +111,7 @@ def test_success_needs_the_object_to_stay_up(bank):
     physics = NativePhysics(HAND, task, OBJECTS, 2)
     still = lambda p, o, k: (jnp.zeros((o.shape[0], 26)).at[:, 20:23].set(-20.0), jnp.zeros(o.shape[0]))  # noqa: E731
     worker = RolloutWorker(HAND, task, physics, away, still, batch=BATCH, seed=0, half=False)
-    episodes = finished_episodes(worker.collect(None, 75))
+    episodes = finished_episodes(worker.collect(None, 75), task)
     untouched = episodes["episode/links_at_removal"] == 0
     assert untouched.any()
     assert not episodes["episode/success"][untouched].any()
@@ -119,24 +119,34 @@ def test_success_needs_the_object_to_stay_up(bank):
     physics.close()
 
 
+def _begun(physics, task, conditions):
+    """An environment, its state, and what the engine shows of it."""
+    env = GraspEnv(HAND, task, physics)
+    return env, env.reset(conditions), physics.read(None)
+
+
+def _advance(env, targets):
+    """A control step of which the engine's part is given."""
+    step = jax.jit(lambda state, readout: env.advance(state, targets, readout, env.settings))
+    return lambda state, readout: step(state._replace(scene=()), readout)
+
+
 def test_a_lifted_object_that_stays_is_a_success(bank):
     """The protocol's bookkeeping on invented readouts: held up, against dropped by more than 5 cm."""
-    env = environment.start(HAND, TASK, bank, jax.random.key(2), 2)
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    readout = physics.read(physics.start(env.world))
+    env, state, readout = _begun(physics, TASK, initial.sample(HAND, TASK, bank, jax.random.key(2), 2))
     found = np.zeros(readout.contact_found.shape, bool)
     found[:, 0, 0] = True
     readout = readout._replace(contact_found=found)
-    targets = Action(env.q_target, env.u_target)
-    score = jax.jit(lambda e, r: environment.score(HAND, TASK, TASK.reward, e, r, targets)[0])
+    advance = _advance(env, Action(state.q_target, state.u_target))
     for step in range(75):
         position = np.array(readout.object_position)
         if step >= 55:
-            position[1, 2] = env.world.object_position[1, 2] - 0.06
-        env = score(env, readout._replace(object_position=position))
-    finished = dict(zip(EPISODE_FIELDS, np.asarray(env.finished).T, strict=True))
+            position[1, 2] = state.world.object_position[1, 2] - 0.06
+        state, _ = advance(state, readout._replace(object_position=position))
+    finished = dict(zip(episode_fields(TASK), np.asarray(state.finished).T, strict=True))
     np.testing.assert_array_equal(finished["episode/success"], [1.0, 0.0])
-    assert set(METRICS) <= {name.removeprefix("episode/") for name in EPISODE_FIELDS}
+    assert set(metric_names(TASK)) <= {name.removeprefix("episode/") for name in finished}
     physics.close()
 
 
@@ -144,23 +154,22 @@ def test_a_lifted_object_that_stays_is_a_success(bank):
 def test_a_longer_hold_changes_neither_success_nor_the_errors(bank, end_when_fallen, ends):
     """Errors and forces are those of the paper's 25 steps; only `held` looks at the end of the hold."""
     task = dataclasses.replace(TASK, hold_steps_max=40, end_when_fallen=end_when_fallen)
-    env = environment.start(HAND, task, bank, jax.random.key(2), 2)
-    env = env._replace(hold=jnp.full(2, 40))
     physics = NativePhysics(HAND, task, OBJECTS, 1)
-    readout = physics.read(physics.start(env.world))
+    drawn = initial.sample(HAND, task, bank, jax.random.key(2), 2)
+    env, state, readout = _begun(physics, task, drawn._replace(hold=jnp.full(2, 40)))
     found, force = np.zeros(readout.contact_found.shape, bool), np.zeros(readout.contact_force.shape, np.float32)
     found[:, 0, 0] = True
-    targets = Action(env.q_target, env.u_target)
-    score = jax.jit(lambda e, r: environment.score(HAND, task, task.reward, e, r, targets)[:2])
+    advance = _advance(env, Action(state.q_target, state.u_target))
     terminal = []
     for step in range(1, 91):
         position = np.array(readout.object_position)
         position[1, 2] -= 0.06 if step > 80 else 0.0
         pressed = force.copy()
         pressed[:, 0, 0, 0] = 3.0 if step <= 75 else 30.0
-        env, scored = score(env, readout._replace(object_position=position, contact_found=found, contact_force=pressed))
-        terminal.append(np.asarray(scored.terminal))
-    finished = dict(zip(EPISODE_FIELDS, np.asarray(env.finished).T, strict=True))
+        shown = readout._replace(object_position=position, contact_found=found, contact_force=pressed)
+        state, transition = advance(state, shown)
+        terminal.append(np.asarray(transition.terminal))
+    finished = dict(zip(episode_fields(task), np.asarray(state.finished).T, strict=True))
     np.testing.assert_array_equal(np.argmax(terminal, 0) + 1, ends)
     np.testing.assert_array_equal(finished["episode/success"], [1.0, 1.0])
     np.testing.assert_array_equal(finished["episode/held"], [1.0, 0.0])
@@ -216,7 +225,12 @@ class _Touching:
 
 def test_a_world_that_goes_on_keeps_its_contacts_when_another_restarts(bank):
     worker = RolloutWorker(HAND, TASK, _Touching(), bank, _noise, batch=2, seed=0, half=False)
-    worker.env = worker.env._replace(time=jnp.array([70, 70]), hold=jnp.array([25, 100]), links_at_removal=jnp.ones(2))
+    state = worker.state
+    worker.state = state._replace(
+        time=jnp.array([70, 70]),
+        hold=jnp.array([25, 100]),
+        success=state.success._replace(links_at_removal=jnp.ones(2)),
+    )
     rollout = worker.collect(None, 7)
     flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation
     touching = np.asarray(rollout.observation)[..., flags : flags + len(HAND.links)].all(-1)

@@ -9,7 +9,6 @@ import scipy.stats
 from common.config import NetworkConfig
 from common.errors import CongraspError
 from common.policy import network
-from common.task.types import MASKS
 
 LAYOUT = (
     ("state", 7),
@@ -20,6 +19,7 @@ LAYOUT = (
     ("trajectory", 6),
     ("mask", 4),
 )
+MASKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 SIZE = sum(size for _, size in LAYOUT)
 ACTIONS = 3
 CONFIG = NetworkConfig(hidden=(16, 8), encoder=4, initial_std=0.6)

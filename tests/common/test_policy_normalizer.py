@@ -9,7 +9,6 @@ import pytest
 
 from common.policy import normalizer
 from common.policy.normalizer import Statistics
-from common.task.types import MASKS
 
 LAYOUT = (
     ("state", 2),
@@ -20,6 +19,7 @@ LAYOUT = (
     ("trajectory", 1),
     ("mask", 4),
 )
+MASKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 SIZE = sum(size for _, size in LAYOUT)
 
 

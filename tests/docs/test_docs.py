@@ -10,7 +10,9 @@ import sys
 
 import pytest
 
-from actors.environment import EPISODE_FIELDS
+from actors.env import episode_fields
+from common.config import TaskConfig
+from common.task.constraints import CONSTRAINTS
 from services.cli import main
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -54,7 +56,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
 def test_metrics_of_episodes_are_documented():
     page = (ROOT / "docs" / "reference" / "metrics.md").read_text()
     known = set(re.findall(r"`([^`]+)`", page))
-    for name in EPISODE_FIELDS:
+    for name in episode_fields(TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))):
         assert name in known or name.startswith(("episode/mask_", "term/")), name
 
 

@@ -65,7 +65,7 @@ def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
 
 
 def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
-    """Goal arrays of a request, without batch axis, before the priority rules; neutral where it leaves them free."""
+    """The goal arrays of a request, without batch axis, before the priority rules; neutral where it names none."""
     values = {}
     for constraint in known(task):
         given = request.constraints.get(constraint.name, {})

@@ -1,4 +1,4 @@
-"""Task sets: references that the table allows, and references renewed by the policy's own grasps."""
+"""Constraint banks: references that the table allows, and references renewed by the policy's own grasps."""
 
 import dataclasses
 
@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from actors.references import Grasps, renew
 
 from actors.bank import POSES, build_bank, make_references
+from actors.harvest import Grasps, renew
 from actors.physics.engine import where_worlds
 from common import rotations
 from common.config import TaskConfig
@@ -71,7 +71,7 @@ def test_an_object_that_cannot_be_approached_is_named():
         build_bank(HAND, TASK, [lifted], 0)
 
 
-def test_a_grasp_replaces_one_reference_of_its_object_and_variant(bank):
+def test_a_grasp_replaces_one_reference_of_its_object_and_region(bank):
     found = jnp.array([True, False])
     grasps = Grasps(
         found,

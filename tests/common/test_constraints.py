@@ -1,0 +1,248 @@
+"""What every constraint must keep to, so that all that is derived from its one file fits together."""
+
+import dataclasses
+import functools
+import itertools
+from collections import Counter
+
+import jax
+import numpy as np
+import pytest
+
+from actors.bank import build_bank
+from actors.initial import InitialConditions, sample
+from common.config import GraspWeights, RewardWeights, TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects import procedural
+from common.request import GraspRequest
+from common.task.constraints import CONSTRAINTS, PAPER, blocks, get_constraint, goal_of, known, require_known
+from common.task.constraints.priority import active_blocks
+from common.task.features import scene_of
+from common.task.observation import fields, layout, observe
+from common.task.reward import reward_terms, terms
+from tests.scenes import HAND, active, scene
+
+NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
+OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional)
+TASK = TaskConfig(constraints=NAMES)
+OBJECTS = [procedural.generate(1, family) for family in ("hammer", "mug")]
+BATCH = 256
+each = pytest.mark.parametrize("constraint", CONSTRAINTS, ids=NAMES)
+each_optional = pytest.mark.parametrize("constraint", OPTIONAL, ids=lambda constraint: constraint.name)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """A scene in which every constraint is active."""
+    return scene_of(HAND, TASK, *scene(9))
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return build_bank(HAND, TASK, OBJECTS, 0)
+
+
+def _without(whole, constraint):
+    """The scene with this constraint's blocks inactive."""
+    others = (block for other in OPTIONAL if other is not constraint for block in other.blocks)
+    return whole._replace(goal=dataclasses.replace(whole.goal, active=active(*others)))
+
+
+@each
+def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
+    described, sizes = fields(HAND, TASK), dict(layout(HAND, TASK))
+    names = constraint.blocks or (constraint.name,)
+    seen = constraint.observe(whole)
+    assert len(seen) == len(names) == len(constraint.fields(HAND, TASK))
+    for name, parts in zip(names, seen, strict=True):
+        assert [part.shape[-1] for part in parts] == [field.size for field in described[name]], name
+        assert sum(part.shape[-1] for part in parts) == sizes[name]
+        assert all(field.name and field.meaning for field in described[name])
+
+
+def test_the_observation_is_as_wide_as_its_layout(whole):
+    assert observe(whole).shape == (4, sum(size for _, size in layout(HAND, TASK)))
+    assert dict(layout(HAND, TASK))["mask"] == len(blocks(TASK)) == 5
+
+
+def test_names_are_unique_over_all_constraints():
+    arrays = [f"{constraint.name}_{name}" for constraint in CONSTRAINTS for name in constraint.arrays]
+    errors = [error for constraint in CONSTRAINTS for error in constraint.errors]
+    groups = {
+        "constraints": NAMES,
+        "goal arrays": arrays,
+        "errors": [error.name for error in errors],
+        "columns": [error.column or error.name for error in errors],
+        "weights": [
+            *(weight.name for constraint in CONSTRAINTS for weight in constraint.weights),
+            *(field.name for field in dataclasses.fields(GraspWeights)),
+        ],
+        "blocks": ["state", *(block for c in CONSTRAINTS for block in c.blocks or (c.name,)), "mask"],
+        "options": [option.name for constraint in CONSTRAINTS for option in constraint.options],
+    }
+    for group, names in groups.items():
+        twice = [name for name, count in Counter(names).items() if count > 1]
+        assert not twice, f"{group}: {twice}"
+
+
+@each
+def test_what_it_declares_is_what_it_computes(constraint, whole):
+    paid, measured = constraint.reward(whole), constraint.measure(whole)
+    assert list(paid) == [weight.name for weight in constraint.weights]
+    assert list(measured) == [error.name for error in constraint.errors]
+    for error in constraint.errors:
+        assert isinstance(measured[error.name], tuple) == error.ratio, error.name
+        assert error.tolerance >= 0 and error.scale > 0 and error.unit in ("rad", "m", "")
+    for value in jax.tree.leaves((paid, measured)):
+        assert value.shape == (4,) and np.isfinite(value).all()
+    for weight in constraint.weights:
+        assert getattr(RewardWeights(), weight.name) == weight.default
+    assert not constraint.optional or getattr(TASK, f"p_{constraint.name}") == 0.5
+
+
+@each_optional
+def test_it_shows_pays_and_forbids_nothing_while_it_is_inactive(constraint, whole):
+    off = _without(whole, constraint)
+    start, mask = 0, dict(zip(blocks(TASK), range(len(blocks(TASK))), strict=True))
+    on_observation, off_observation = np.asarray(observe(whole)), np.asarray(observe(off))
+    for name, size in layout(HAND, TASK):
+        block = slice(start, start + size)
+        start += size
+        if name in constraint.blocks:
+            assert on_observation[:, block].any() and not off_observation[:, block].any(), name
+        elif name == "mask":
+            silent = [mask[block] for block in constraint.blocks]
+            np.testing.assert_array_equal(off_observation[:, block] == 0, np.tile(np.isin(range(5), silent), (4, 1)))
+        else:
+            np.testing.assert_array_equal(on_observation[:, block], off_observation[:, block], err_msg=name)
+    assert not any(np.any(value) for value in constraint.reward(off).values())
+    touching, force = whole.features.touching, whole.features.force
+    for before, after in zip((touching, force), constraint.earning(off, touching, force), strict=True):
+        np.testing.assert_array_equal(before, after)
+    # Nor does it change what the others are paid, but for contacts that it forbids.
+    others, paid = (reward_terms(one, RewardWeights()) for one in (whole, off))
+    own = {weight.name for weight in constraint.weights}
+    for name in set(terms(TASK)) - own - {"contact", "force"}:
+        np.testing.assert_array_equal(others[name], paid[name], err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("hand", "sizes"), [("human", {"F": 20, "G": 5, "K": 15}), ("allegro", {"F": 16, "G": 4, "K": 15})]
+)
+@each
+def test_neutral_arrays_have_their_declared_shapes_and_are_unit(constraint, hand, sizes):
+    neutral = constraint.neutral(get_hand(hand), TASK)
+    assert neutral._fields == tuple(constraint.arrays) == constraint.goal._fields
+    for name, array in constraint.arrays.items():
+        value = getattr(neutral, name)
+        assert value.shape == tuple(sizes.get(n, n) for n in array.shape), name
+        assert value.dtype == (bool if array.kind == "flag" else np.float32)
+        if array.kind in ("direction", "quaternion"):
+            assert value.shape[-1] == {"direction": 3, "quaternion": 4}[array.kind]
+            np.testing.assert_allclose(np.linalg.norm(value, axis=-1), 1.0, rtol=1e-6)
+    # What a person begins with fits in their place.
+    suggested = constraint.suggested(get_hand(hand), TASK)
+    assert {name: np.shape(value) for name, value in suggested.items()} == {
+        name: getattr(neutral, name).shape for name in neutral._fields
+    }
+    labels = constraint.labels(get_hand(hand))
+    assert {name: len(words) for name, words in labels.items()} == {
+        name: getattr(neutral, name).shape[0] for name, array in constraint.arrays.items() if array.kind == "flag"
+    }
+
+
+@each
+def test_names_that_it_gives_are_there(constraint):
+    weaker = CONSTRAINTS[: NAMES.index(constraint.name)]
+    assert set(constraint.overrides) <= {name for other in weaker for name in (other.name, *other.blocks)}
+    assert set(constraint.overridden_by) <= {*NAMES} - {constraint.name}
+    assert {relation.weaker for relation in constraint.relations} <= {other.name for other in weaker}
+    assert constraint.guides in ("", constraint.name, *constraint.blocks)
+    assert constraint.title and constraint.options and constraint.name.isidentifier()
+
+
+def test_the_papers_constraints_come_first():
+    assert PAPER == NAMES[:4] == TaskConfig().constraints == ("heading", "affordance", "pose", "trajectory")
+    assert [c.name for c in known(TaskConfig(constraints=("trajectory", "heading")))] == ["heading", "trajectory"]
+
+
+def test_what_is_not_known_is_named():
+    with pytest.raises(CongraspError, match=r"no constraint 'glove'.*Choose from: heading, affordance"):
+        get_constraint("glove")
+    with pytest.raises(CongraspError, match="heading is always active"):
+        known(TaskConfig(constraints=("pose",)))
+    with pytest.raises(
+        CongraspError, match=r"The policy does not know the constraint 'fingers'.*constraints … fingers"
+    ):
+        require_known(["heading", "fingers"], TaskConfig())
+
+
+def test_requests_fill_the_arrays_that_they_give():
+    request = GraspRequest(
+        {"heading": {"direction": np.array([0.0, 1.0, 0.0])}, "fingers": {"allowed": [1, 0, 1, 0, 0]}}
+    )
+    goal = goal_of(HAND, TASK, request)
+    np.testing.assert_array_equal(goal["heading"].direction, np.array([0, 1, 0], np.float32))
+    np.testing.assert_array_equal(goal["heading"].position, np.zeros(3))
+    np.testing.assert_array_equal(goal["fingers"].allowed, [True, False, True, False, False])
+    assert goal["fingers"].allowed.dtype == bool and goal["heading"].direction.dtype == np.float32
+    assert set(goal.flat()) == {f"{c.name}_{name}" for c in CONSTRAINTS for name in c.arrays}
+
+
+TABLE = [
+    dict(zip([c.name for c in OPTIONAL], flags, strict=True)) for flags in itertools.product([False, True], repeat=4)
+]
+
+
+@pytest.mark.parametrize("asked", TABLE, ids=lambda asked: "+".join(name for name in asked if asked[name]) or "heading")
+def test_active_blocks(asked):
+    """The paper's figure of priorities; the choice of fingers yields to a reference pose as the affordance does."""
+    affordance, pose, trajectory, fingers = (asked[c.name] for c in OPTIONAL)
+    found = active_blocks({name: np.full(2, flag) for name, flag in asked.items()})
+    expected = {
+        "affordance": affordance and not pose,
+        "pose_finger": pose,
+        "pose_wrist": pose and not trajectory,
+        "trajectory": trajectory,
+        "fingers": fingers and not pose,
+    }
+    assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _draw(task: TaskConfig, bank) -> InitialConditions:
+    return sample(HAND, task, bank, jax.random.key(3), BATCH)
+
+
+def _same(some: InitialConditions, more: InitialConditions, but: str) -> None:
+    """Everything that does not belong to one constraint is the same."""
+    goals = [dict(part.goal.flat().items()) for part in (some, more)]
+    actives = [part.goal.active for part in (some, more)]
+    own = {*get_constraint(but).blocks, *(f"{but}_{name}" for name in get_constraint(but).arrays)}
+    assert (
+        goals[0] and set(goals[1]) - set(goals[0]) <= own and set(actives[1]) - set(actives[0]) == own & {*blocks(TASK)}
+    )
+    for one, other in (goals, actives):
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+    for name in ("world", "surface", "region", "hold"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(some, name), getattr(more, name))
+
+
+@each_optional
+def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint, bank):
+    """A policy that knows a constraint, of which no episode has it, learns from the same episodes."""
+    task = dataclasses.replace(TASK, constraints=tuple(name for name in NAMES if name != constraint.name))
+    more = dataclasses.replace(TASK, **{f"p_{constraint.name}": 0.0})
+    some, all_of_them = _draw(task, bank), _draw(more, bank)
+    assert not any(np.any(all_of_them.goal.active[block]) for block in constraint.blocks)
+    _same(some, all_of_them, constraint.name)
+
+
+def test_episodes_with_fingers_are_those_without_in_all_else(bank):
+    some, more = _draw(TaskConfig(), bank), _draw(TASK, bank)
+    _same(some, more, "fingers")
+    chosen = np.asarray(more.goal.active["fingers"])
+    pose = np.asarray(more.goal.active["pose_finger"])
+    assert not chosen[pose].any() and abs(chosen[~pose].mean() - 0.5) < 0.15

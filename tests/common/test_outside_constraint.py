@@ -1,0 +1,208 @@
+"""A constraint that only this file knows: all that the project makes of a constraint, it makes of this one.
+
+Options, weights and probabilities are made of the constraints when their modules are imported. So the test runs this
+file as a program, which adds the constraint before it imports anything else.
+"""
+
+import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from common import rotations
+from common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Weight
+
+ROOT = pathlib.Path(__file__).parents[2]
+
+
+class LevelGoal(NamedTuple):
+    """Whether it is the wrist or the hand's centre that must be as high as the object's centre."""
+
+    wrist: Annotated[np.ndarray, GoalArray((1,), "the wrist, else the hand's centre", "flag")]
+
+
+class Level(Constraint):
+    """The hand stays as high as the object."""
+
+    name, title, goal = "level", "level hand", LevelGoal
+    blocks = ("level",)
+    weights = (Weight("level_height", 0.7, "Per metre of height."),)
+    errors = (ErrorSpec("level_m", "m", "hold", 0.05, 0.05, "height beside the object's"),)
+    options = (Option("level", "What must be as high as the object: wrist or centre."),)
+
+    def fields(self, hand, task):
+        return (
+            (ObservationField("level_wrist", 1, "1 for the wrist"), ObservationField("level_height", 1, "m, world")),
+        )
+
+    def sample(self, hand, draw, key):
+        return LevelGoal(jax.random.bernoulli(key, 0.5, (*draw.objects.shape, 1)))
+
+    def observe(self, scene):
+        return ([scene.goal["level"].wrist.astype(jnp.float32), self._height(scene)[:, None]],)
+
+    def reward(self, scene):
+        return {"level_height": -scene.gate("level") * jnp.abs(self._height(scene))}
+
+    def measure(self, scene):
+        return {"level_m": jnp.abs(self._height(scene))}
+
+    def parse(self, given, hand):
+        return {"wrist": np.array([given["level"] == "wrist"])} if given["level"] else None
+
+    def _height(self, scene):
+        features = scene.features
+        center = features.wrist_position + rotations.rotate(features.wrist_quaternion, features.center)
+        wrist = scene.goal["level"].wrist[:, 0]
+        return jnp.where(wrist, features.wrist_position[:, 2], center[:, 2]) - scene.state.object_position[:, 2]
+
+
+def test_nothing_else_must_be_changed():
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "tests.common.test_outside_constraint"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=220)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.splitlines() == ["episodes", "tables", "server", "command line", "ONNX"]
+
+
+def episodes(task):
+    """Metrics of short episodes with it; it is sampled, observed, rewarded and measured in them."""
+    from actors.bank import build_bank
+    from actors.physics.native import NativePhysics
+    from actors.rollout import RolloutWorker, finished_episodes
+    from common.hands import get_hand
+    from common.objects import procedural
+    from common.task.observation import layout
+
+    hand, batch = get_hand("human"), 32
+    objects = [procedural.generate(0, "box")]
+    physics = NativePhysics(hand, task, objects, 1)
+
+    def policy(parameters, observation, key):
+        return jnp.zeros((batch, len(hand.joints) + 6)), jnp.zeros(batch)
+
+    worker = RolloutWorker(
+        hand, task, physics, build_bank(hand, task, objects, 0), policy,
+        batch=batch, seed=0, half=False, traced=slice(None),
+    )  # fmt: skip
+    goal = jax.device_get(worker.state.goal)
+    rollout = worker.collect(None, task.approach_steps + task.hold_steps)
+    physics.close()
+    active, wrist = goal.active["level"], goal["level"].wrist[:, 0]
+    assert 0.25 < active.mean() < 0.75 and 0.25 < wrist.mean() < 0.75
+    found = finished_episodes(rollout, task)
+    np.testing.assert_array_equal(found["episode/mask_level"], active)
+
+    # What the engine shows, worked out from the traces; in `final` the steps after the table's removal.
+    height = np.asarray(rollout.trace.wrist_position - rollout.trace.object_position)[..., 2]
+    final = np.asarray(rollout.trace.table)[-1] == 0
+    assert final.all() and task.hold_steps == 1
+    np.testing.assert_allclose(found["episode/level_m"][wrist], np.abs(height[-1])[wrist], atol=1e-5)
+    paid = np.where(active & wrist, 0.7 * np.abs(height).sum(0), 0.0)
+    np.testing.assert_allclose(-found["term/level_height"][wrist], paid[wrist], atol=1e-4)
+    assert (found["term/level_height"][active] < 0).all() and not found["term/level_height"][~active].any()
+    sizes = dict(layout(hand, task))
+    assert sizes["level"] == 2 and sizes["mask"] == 5 and [name for name in sizes][-2:] == ["level", "mask"]
+    block = np.asarray(rollout.observation)[..., -7:-5]
+    np.testing.assert_array_equal(block[0, :, 0], active & wrist)
+    np.testing.assert_allclose(block[1, :, 1][active & wrist], height[0][active & wrist], atol=1e-5)
+    assert not block[:, ~active].any()
+    return {name.removeprefix("episode/"): values for name, values in found.items() if name.startswith("episode/")}
+
+
+def tables(task, values):
+    """Its row of an evaluation, from those episodes that had it alone, as if they had all held the object."""
+    from services.evaluate import scores
+
+    assert scores.TABLES["single"][-1] == "level" and scores.ERRORS["level"] == {"level_m": "level_m"}
+    alone = scores.matching(values, "level", task)
+    assert alone.any()
+    expected = (values["mask_level"] > 0) & ~np.any(
+        [values[f"mask_{name}"] for name in ("trajectory", "pose_finger")], 0
+    )
+    np.testing.assert_array_equal(alone, expected & (values["mask_affordance"] == 0))
+    some = {name: column[alone] for name, column in {**values, "success": np.ones(len(alone))}.items()}
+    nothing = np.zeros((0, 1, 1))
+    row = scores.summarise("level", "human", scores.Sample(some, nothing, nothing), held_2s=False)
+    np.testing.assert_allclose(row.errors["level_m"], some["level_m"].mean())
+    assert row.to_json()["level_m"] == row.errors["level_m"] and row.errors["heading_m"] is None
+    assert any("level" in cell for cell in scores.rate_cells(row))
+
+
+def server(task):
+    """Its field of a query."""
+    from common.hands import get_hand
+    from services.serve.requests import Layout
+
+    layout = Layout(get_hand("human"), task)
+    assert layout.shapes["level_wrist"] == (1,) and layout.shapes["asked"] == (5,)
+    assert layout.description()["fields"]["level_wrist"] == [layout.offsets["level_wrist"], 1]
+
+
+def command_line():
+    """Its option, what becomes of it, and its settings of a run."""
+    import contextlib
+    import io
+
+    from common.config import RunConfig
+    from common.hands import get_hand
+    from common.objects import procedural
+    from services.cli import main
+    from services.grasp.parse import read_request
+
+    for command, options in {"grasp": ["--level"], "train": ["--task.p-level", "--task.reward.level-height"]}.items():
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+            main.load(command)(["--help"])
+        for option in options:
+            assert option in said.getvalue(), option
+    parsed = main._parsed("grasp", main.load("grasp"), ["can.obj", "--level", "wrist"])
+    assert "level='wrist'" in repr(parsed)
+    request = read_request(procedural.generate(0, "box"), get_hand("human"), 15, level="wrist")
+    assert list(request.constraints) == ["heading", "level"] and request.constraints["level"]["wrist"].tolist() == [
+        True
+    ]
+    assert RunConfig().task.reward.level_height == 0.7
+
+
+def onnx(task):
+    """Its block in what is written beside an exported policy."""
+    from common.config import NetworkConfig, RunConfig
+    from services.export.policy import describe
+    from services.train.command import untrained
+
+    said = describe(untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=2))))
+    assert said["masks"][-1] == "level" and ["level", 2] in said["layout"]
+    fields = [entry for entry in said["observation"] if entry["block"] == "level"]
+    assert [(entry["field"], entry["size"], entry["meaning"]) for entry in fields] == [
+        ("level_wrist", 1, "1 for the wrist"),
+        ("level_height", 1, "m, world"),
+    ]
+
+
+if __name__ == "__main__":
+    from common.task import constraints
+
+    constraints.CONSTRAINTS = (*constraints.CONSTRAINTS, Level())
+
+    from common.config import TaskConfig
+
+    TASK = dataclasses.replace(
+        TaskConfig(constraints=(*constraints.PAPER, "level")), approach_steps=2, hold_steps=1, hold_steps_max=1
+    )
+    seen = episodes(TASK)
+    print("episodes")
+    tables(TASK, seen)
+    print("tables")
+    server(TASK)
+    print("server")
+    command_line()
+    print("command line")
+    onnx(TASK)
+    print("ONNX")
