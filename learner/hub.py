@@ -99,8 +99,8 @@ class LearnerHub:
         if audit is not None:
             staleness.note_undone(audit.begin(self.life, epoch, staleness.version, staleness.max_staleness))
         transport.serve(self.keys.config, self._on_config)
-        charging, turnstile = self._credit.charging, self._turnstile
-        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, turnstile=turnstile)
+        charging, admission = self._credit.charging, self._admission
+        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=admission)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
         transport.serve(self.keys.weights, self._on_weights, workers=2, depth=16)
         transport.serve(
@@ -109,7 +109,7 @@ class LearnerHub:
             workers=2,
             depth=8,
             on_damage=self._on_damage,
-            turnstile=turnstile,
+            admission=admission,
         )
         transport.watch_alive(self.keys.everyone, self._on_alive)
         transport.declare_alive(self.keys.alive("learner", name, self.life))
@@ -337,7 +337,7 @@ class LearnerHub:
         actors = ", ".join(sorted({header.actor for header in stale}))
         self._event("warning", f"Dropped as too old at version {self._staleness.version}: {len(stale)} of {actors}.")
 
-    def _turnstile(self, key: str) -> Message | None:
+    def _admission(self, key: str) -> Message | None:
         if self._credit.admits(key):
             return None
         self._event("warning", f"Too many useless requests of {_sender(key)}: turned away.", kind="turned away")

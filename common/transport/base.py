@@ -16,7 +16,7 @@ Answerer = Callable[[str, Message], "Message | Future[Message]"]
 """A handler that may also return a future of the reply: its thread then goes on with the next request."""
 Damage = Callable[[str, CongraspError], None]
 """(key, what is wrong): a request arrived that could not be decoded."""
-Turnstile = Callable[[str], Message | None]
+Admission = Callable[[str], Message | None]
 """key -> the reply with which a request is turned away before anyone looks at it, or None to let it pass."""
 
 
@@ -94,7 +94,7 @@ class Transport(Protocol):
         workers: int = 1,
         depth: int = 4,
         on_damage: Damage | None = None,
-        turnstile: Turnstile | None = None,
+        admission: Admission | None = None,
     ) -> None:
         """Answers queries.
 
@@ -104,7 +104,7 @@ class Transport(Protocol):
           workers: threads that run the handler.
           depth: queries that wait; further ones wait at their senders.
           on_damage: told about requests that cannot be decoded, which are refused without asking the handler.
-          turnstile: asked before a request is decoded; it may send it away with a reply.
+          admission: asked before a request is decoded; it may send it away with a reply.
         """
         ...
 

@@ -25,14 +25,12 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Answerer, Damage, RefusedError, Subscription, Turnstile, join
+from common.transport.base import Admission, Answerer, Damage, RefusedError, Subscription, join
 from common.transport.keys import FLOWS, Flow, flow
+from common.transport.ports import shifted
 from common.transport.security import Credentials, refusal, secured
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-"""Where the learner listens unless told otherwise: on this machine only."""
-_ENDPOINT = re.compile(r"(?P<address>[a-z]+/[^/]+):(?P<port>\d{1,5})(?P<rest>[?#].*)?")
 _LEASE_MS: dict[Flow, int] = {"control": 2500, "bulk": 10000, "log": 10000, "policy": 2500}
 _BLOCK_US: dict[Flow, int] = {"control": 2_000_000, "bulk": 5_000_000, "log": 1_000_000, "policy": 2_000_000}
 _OVERHEAD = 64 << 10  # bytes that Zenoh may add to a message
@@ -103,12 +101,12 @@ class ZenohTransport:
         workers: int = 1,
         depth: int = 4,
         on_damage: Damage | None = None,
-        turnstile: Turnstile | None = None,
+        admission: Admission | None = None,
     ) -> None:
         """See `Transport.serve`."""
         queryable = self._session(key).declare_queryable(key, FifoChannel(depth))
         self._declared.append(queryable)
-        hooks = on_damage or (lambda *_: None), turnstile or (lambda _: None)
+        hooks = on_damage or (lambda *_: None), admission or (lambda _: None)
         for _ in range(workers):
             self._work.start(_serve, queryable.handler, handler, *hooks, self._max_message)
 
@@ -136,7 +134,7 @@ class ZenohTransport:
             raise TransportError(f"No answer for {key} within {timeout:g} s.")
         if refusal is not None:
             raise RefusedError(refusal.decode(errors="replace"))
-        raise TransportError(f"Nobody answers {key}.", "The process that serves it may have ended.")
+        raise TransportError(f"No response for {key}.", "The process that serves it may have ended.")
 
     def publish(self, key: str, message: Message) -> None:
         """See `Transport.publish`; once closed it does nothing."""
@@ -255,14 +253,6 @@ class _Work:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
 
-def shifted(endpoint: str, offset: int) -> str:
-    """The endpoint with a port `offset` above; a CongraspError if it is none."""
-    match = _ENDPOINT.fullmatch(endpoint)
-    if not match or not 0 < int(match["port"]) + offset < 1 << 16:
-        raise CongraspError(f"'{endpoint}' is not an endpoint.", f"Write it like {DEFAULT_ENDPOINT}.")
-    return f"{match['address']}:{int(match['port']) + offset}{match['rest'] or ''}"
-
-
 def _config(
     name: Flow, endpoints: list[str], listens: bool, max_message: int, extra: Mapping[str, Any]
 ) -> zenoh.Config:
@@ -317,7 +307,7 @@ def _connect(
                 where = ", ".join(endpoints)
                 remedy = "Start the learner or the server there, or correct the address."
                 if "Unable to connect" in str(error):
-                    raise TransportError(f"Nobody answers at {where}.", remedy) from None
+                    raise TransportError(f"No response from {where}.", remedy) from None
                 raise TransportError(f"Cannot connect to {where}: {_first_line(error)}.", remedy) from None
 
 
@@ -333,16 +323,16 @@ def _received(channel: Any) -> Iterator[Any]:
             yield channel.recv()
 
 
-def _serve(queries: Any, handler: Answerer, on_damage: Damage, turnstile: Turnstile, max_message: int) -> None:
+def _serve(queries: Any, handler: Answerer, on_damage: Damage, admission: Admission, max_message: int) -> None:
     for query in _received(queries):
         key = str(query.key_expr)
-        _reply(query, key, functools.partial(_ask, query, key, handler, on_damage, turnstile, max_message))
+        _reply(query, key, functools.partial(_ask, query, key, handler, on_damage, admission, max_message))
 
 
 def _ask(
-    query: Any, key: str, handler: Answerer, on_damage: Damage, turnstile: Turnstile, max_message: int
+    query: Any, key: str, handler: Answerer, on_damage: Damage, admission: Admission, max_message: int
 ) -> Message | Future[Message]:
-    if (turned_away := turnstile(key)) is not None:
+    if (turned_away := admission(key)) is not None:
         return turned_away
     try:
         request = decode(query.payload.to_bytes() if query.payload else b"", max_bytes=max_message)

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from common.errors import CongraspError, TransportError
+from common.transport import urls
 from common.transport.keys import Keys
-from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 from services.ops.audit import audit
 
@@ -40,7 +40,7 @@ class Victim:
         """Waits until the run's learner listens."""
         self._process = process
         endpoint = _until(lambda: self._argument("learner", "--listen"))
-        self._transport = ZenohTransport(connect=[endpoint], wait=_DEADLINE)
+        self._transport = urls.connect(endpoint, "observer", wait=_DEADLINE)
 
     def _argument(self, role: str, name: str) -> str | None:
         return next((c.cmdline()[c.cmdline().index(name) + 1] for c in self.children(role)), None)

@@ -11,9 +11,9 @@ import psutil
 from rich.console import Console
 
 from common.errors import CongraspError
+from common.transport import urls
 from common.transport.keys import Keys
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
+from common.transport.ports import local_url
 from learner.process import run_learner
 from learner.run_directory import create_run
 from services.record.recorder import Recorder
@@ -33,7 +33,7 @@ def bench_recording(actors: int, seconds: float, turns: int) -> None:
     stop = threading.Event()
     paces: dict[bool, list[float]] = {False: [], True: []}
     busy = recorded = size = 0.0
-    with tempfile.TemporaryDirectory() as folder, ZenohTransport(listen=[endpoint := _endpoint()]) as transport:
+    with tempfile.TemporaryDirectory() as folder, urls.listen(endpoint := local_url(), "learner") as transport:
         run_dir = pathlib.Path(folder, "run")
         create_run(run_dir, config)
         said = transport.subscribe(Keys(config.name).actor_metrics, depth=10**6)
@@ -91,10 +91,6 @@ def bench_recording(actors: int, seconds: float, turns: int) -> None:
         f"The actors spent {transported:.2f} % of their time on weights and uploads, and waited {waited:.2f} % of it "
         f"for permission to go on ({len(shares)} rollouts)."
     )
-
-
-def _endpoint() -> str:
-    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def _wait_for(marks: list[tuple[float, float]], count: int) -> None:

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from common.errors import TransportError
+from common.transport import urls
+from common.transport.base import Transport
 from common.transport.keys import Keys
-from common.transport.ports import free_port
-from common.transport.security import Credentials
-from common.transport.zenoh_transport import ZenohTransport
+from common.transport.ports import local_url
 from common.wire.codec import Message
 from learner.limits import Credit
 from services.ops.certificates import create_authority, issue
@@ -56,27 +56,26 @@ def measure(repeats: int) -> dict[str, float]:
 @contextlib.contextmanager
 def _learner(certs: pathlib.Path | None) -> Iterator[tuple[str, Credit]]:
     """What answers tickets and rollouts as a learner's hub does, without looking into them."""
-    credentials = None if certs is None else Credentials(certs / "learner.0", "learner")
-    endpoint, credit = f"tcp/127.0.0.1:{free_port()}", Credit()
+    endpoint, credit = local_url(), Credit()
 
     def accept(key: str, request: Message) -> Message:
         return Message(meta={"outcome": "refused" if key.endswith(_EVIL) else "accepted"})
 
-    def turnstile(key: str) -> Message | None:
+    def admission(key: str) -> Message | None:
         return None if credit.admits(key) else Message(meta={"outcome": "retry"})
 
-    with ZenohTransport(listen=[endpoint], credentials=credentials) as transport:
+    with urls.listen(endpoint, "learner", certs=certs) as transport:
         for keys in (_KEYS.tickets, _KEYS.rollouts):
-            transport.serve(keys, credit.charging(accept), workers=2, depth=8, turnstile=turnstile)
+            transport.serve(keys, credit.charging(accept), workers=2, depth=8, admission=admission)
         yield endpoint, credit
 
 
-def _connected(endpoint: str, certs: pathlib.Path | None, number: int) -> ZenohTransport:
-    credentials = None if certs is None else Credentials(certs / f"actor.{number}", "actor")
-    return ZenohTransport(connect=[endpoint], credentials=credentials, flows=("control", "bulk"))
+def _connected(endpoint: str, certs: pathlib.Path | None, number: int) -> Transport:
+    """An actor's connection, with the certificate of this number where there are certificates."""
+    return urls.connect(endpoint, "actor", certs=None if certs is None else certs / f"actor.{number}")
 
 
-def _seconds(transport: ZenohTransport, key: str, message: Message, count: int) -> float:
+def _seconds(transport: Transport, key: str, message: Message, count: int) -> float:
     """The median of the times that a request takes."""
     times = []
     for _ in range(count + 1):

@@ -23,8 +23,8 @@ from zenoh.handlers import FifoChannel
 from actors.link import ActorLink, RunFinished
 from common.errors import CongraspError
 from common.journal import AUDIT, Journal
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
+from common.transport import urls
+from common.transport.ports import free_port, local_url
 from common.wire.codec import Message, encode
 from common.wire.messages import RolloutForm
 from learner.audit import AuditLog
@@ -82,8 +82,8 @@ def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]
 
 @contextlib.contextmanager
 def _learner(folder: pathlib.Path) -> Iterator[tuple[LearnerHub, str]]:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with ZenohTransport(listen=[endpoint]) as transport:
+    endpoint = local_url()
+    with urls.listen(endpoint, "learner") as transport:
         hub = LearnerHub(
             transport,
             run=_RUN,
@@ -212,7 +212,7 @@ def _processes(count: int, role: Callable[[str, pathlib.Path, int], None], *argu
 def _link(endpoint: str, folder: pathlib.Path, number: int) -> Iterator[ActorLink]:
     journal = Journal(folder / AUDIT / f"a{number}.jsonl")
     with (
-        ZenohTransport(connect=[endpoint], flows=("control", "bulk", "log")) as transport,
+        urls.connect(endpoint, "actor") as transport,
         ActorLink(transport, _RUN, f"a{number}", window=2, journal=journal) as link,
         contextlib.suppress(RunFinished),
     ):

@@ -5,9 +5,11 @@ from typing import Annotated
 
 import tyro
 
+from common.transport.ports import LEARNER_URL
+
 
 def status(
-    connect: str = "tcp/127.0.0.1:7447",
+    connect: str = LEARNER_URL,
     run: str = "quickstart",
     watch: bool = False,
     every: float = 1.0,
@@ -31,11 +33,10 @@ def status(
     from rich.console import Console
     from rich.live import Live
 
-    from common.transport.zenoh_transport import ZenohTransport
-    from services.ops.access import credentials
+    from common.transport import urls
     from services.ops.status import ask, follow, tables
 
-    with ZenohTransport(connect=[connect], credentials=credentials(certs, "observer")) as transport:
+    with urls.connect(connect, "observer", certs=certs) as transport:
         found = ask(transport, run)
         if not watch:
             if json:

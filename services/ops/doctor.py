@@ -16,9 +16,8 @@ from typing import NamedTuple
 from packaging.requirements import Requirement
 
 from common.errors import CongraspError
+from common.transport import urls
 from common.transport.keys import FLOWS
-from common.transport.zenoh_transport import ZenohTransport
-from services.ops.access import credentials
 from services.ops.certificates import certificates
 from services.ops.status import ask
 
@@ -230,8 +229,7 @@ def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
 def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Iterator[Finding]:
     """Whether a learner answers, and how far its clock is from this one."""
     try:
-        mine = credentials(certs, "observer")
-        with ZenohTransport(connect=[connect], wait=5.0, credentials=mine) as transport:
+        with urls.connect(connect, "observer", certs=certs, wait=5.0) as transport:
             ask(transport, run)
             began = time.time()
             status = ask(transport, run)

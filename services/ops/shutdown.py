@@ -83,8 +83,8 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
         writer.close()
 
 
-def take_along(child: subprocess.Popen[bytes]) -> None:
-    """Names a child that a forced end of this process ends, too."""
+def register_child(child: subprocess.Popen[bytes]) -> None:
+    """Registers a child, which a forced end of this process ends, too."""
     _children.add(child)
 
 

@@ -17,7 +17,7 @@ from common.policy.bundle import Acting, PolicyBundle, content_hash
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode
-from services.ops.logs import say
+from services.ops.logs import log
 from services.serve.batching import Batcher, Late, Overloaded
 from services.serve.inference import BATCH_SIZES, Answer, PolicyFunction
 from services.serve.requests import PACKED, STATES_LIMIT, Query
@@ -184,7 +184,7 @@ class PolicyServer:
                 continue  # the learner is away; it may come back
             except CongraspError as error:
                 if str(error) != self._trouble:
-                    say("warning", str(error))
+                    log("warning", str(error))
                 self._trouble = str(error)
 
     def _swap(self, newer: PolicyBundle) -> None:
