@@ -14,8 +14,8 @@ import dacite
 from common.errors import CongraspError
 
 PhysicsName = Literal["auto", "warp", "jax", "native"]
-Board = Literal["tensorboard", "wandb", "wandb-offline"]
-"""Where else a learner's figures are shown, beside the recordings."""
+MetricWriter = Literal["tensorboard", "wandb", "wandb-offline"]
+"""Where else a learner's metrics are written, beside the recordings."""
 
 
 @dataclasses.dataclass(frozen=True)

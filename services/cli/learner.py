@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from common.config import Board, RunConfig, run_config_from_json, to_json
+from common.config import MetricWriter, RunConfig, run_config_from_json, to_json
 from common.transport.ports import LEARNER_URL, rank_url
 from services.cli.train import defaults as defaults
 from services.cli.watch import Watch, Watched
@@ -34,7 +34,7 @@ def learner(
     ranks: int = 1,
     coordinator: str = "127.0.0.1:7440",
     inside: bool = False,
-    boards: tuple[Board, ...] = ("tensorboard",),
+    boards: tuple[MetricWriter, ...] = ("tensorboard",),
     watch: Watched = Watch(),  # noqa: B008
 ) -> int:
     """The learner alone; actors on this machine or on others connect to it with `congrasp actor --connect`.
@@ -81,7 +81,7 @@ def learner(
                 create_run(run_dir, config, None if initial is None else bundles.load(initial))
             joined = Ranks.join(rank, ranks, coordinator)
             config = run_config_from_json(joined.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
-            _learn(run_dir, config, transport, stop, joined, resume=resume, inside=inside, boards=boards, watch=watch)
+            _learn(run_dir, config, transport, stop, joined, resume=resume, inside=inside, writers=boards, watch=watch)
             return stop.exit_code
     except CongraspError as error:
         if ranks > 1:
@@ -98,7 +98,7 @@ def _learn(
     *,
     resume: bool,
     inside: bool,
-    boards: Sequence[Board],
+    writers: Sequence[MetricWriter],
     watch: Watch,
 ) -> None:
     """Runs the learner until it is finished or told to stop."""
@@ -126,7 +126,7 @@ def _learn(
                 resume=resume,
                 ranks=ranks,
                 wire=transport,
-                boards=boards,
+                writers=writers,
                 on_update=updated,
                 on_event=log,
             )
@@ -138,7 +138,7 @@ def _learn(
                 stop_event=stop,
                 resume=resume,
                 ranks=ranks,
-                recorder=recorded(transport, config, run_dir, boards) if ranks.rank == 0 else None,
+                recorder=recorded(transport, config, run_dir, writers) if ranks.rank == 0 else None,
                 on_update=updated,
                 on_event=log,
             )

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from common.config import Board, RunConfig
+from common.config import MetricWriter, RunConfig
 from learner.run_directory import CONFIG_FILE, open_run
 from services.train.presets import get_preset, with_hand
 
@@ -24,7 +24,7 @@ def train(
     certs: pathlib.Path | None = None,
     insecure: bool = False,
     evaluation: int = 64,
-    boards: tuple[Board, ...] = ("tensorboard",),
+    boards: tuple[MetricWriter, ...] = ("tensorboard",),
     metrics_port: int = 0,
 ) -> int:
     """Trains a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
@@ -65,7 +65,7 @@ def train(
         initial=initial,
         evaluation=evaluation,
         ranks=ranks,
-        boards=boards,
+        writers=boards,
         metrics_port=metrics_port,
         listen=listen,
         certs=certs,

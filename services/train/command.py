@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from rich.console import Console
 
-from common.config import Board, ObjectsConfig, PhysicsName, RunConfig
+from common.config import MetricWriter, ObjectsConfig, PhysicsName, RunConfig
 from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.policy import bundle as bundles
@@ -68,7 +68,7 @@ def run_training(
     resume: bool,
     evaluation: int,
     initial: pathlib.Path | None = None,
-    boards: Sequence[Board] = ("tensorboard",),
+    writers: Sequence[MetricWriter] = ("tensorboard",),
     metrics_port: int = 0,
     listen: str | None = None,
     certs: pathlib.Path | None = None,
@@ -98,7 +98,7 @@ def run_training(
                     physics=plan.physics,
                     stop=stop,
                     resume=resume,
-                    boards=boards,
+                    writers=writers,
                     metrics_port=metrics_port,
                     on_update=progress.update,
                 )
@@ -112,7 +112,7 @@ def run_training(
                         stop=stop,
                         ranks=ranks,
                         gpus=plan.gpus,
-                        boards=boards,
+                        writers=writers,
                         metrics_port=metrics_port,
                         endpoint=listen,
                         certs=certs,

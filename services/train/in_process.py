@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from actors.process import run_actor
-from common.config import Board, PhysicsName, RunConfig
+from common.config import MetricWriter, PhysicsName, RunConfig
 from common.transport import urls
 from common.transport.base import Transport
 from common.transport.pair import PairTransport
@@ -35,7 +35,7 @@ def train_in_process(
     wire: Transport | None = None,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
     on_event: Callable[[str, str], None] = lambda level, text: None,
-    boards: Sequence[Board] = (),
+    writers: Sequence[MetricWriter] = (),
     metrics_port: int = 0,
 ) -> None:
     """The same learner and one actor in this process, over the in-memory transport.
@@ -48,7 +48,7 @@ def train_in_process(
       physics: engine of the actor.
       stop: ends training.
       wire: a transport that listens, where others may ask how things stand, and send rollouts, too.
-      boards: which metric writers get its metrics.
+      writers: which metric writers get its metrics.
       metrics_port: port of a Prometheus endpoint on the loopback interface; 0 for none.
     """
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, max_staleness=0))
@@ -72,7 +72,7 @@ def train_in_process(
                 resume=resume,
                 ranks=ranks,
                 audit=False,
-                recorder=recorded(memory, config, run_dir, boards) if rank == 0 else None,
+                recorder=recorded(memory, config, run_dir, writers) if rank == 0 else None,
                 on_update=updated,
                 on_event=on_event,
             )

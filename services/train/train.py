@@ -14,7 +14,7 @@ from typing import Any
 import jax
 
 from actors.physics import resolve_physics
-from common.config import Board, PhysicsName, RunConfig
+from common.config import MetricWriter, PhysicsName, RunConfig
 from common.errors import CongraspError, TransportError
 from common.journal import AUDIT
 from common.transport import urls
@@ -78,7 +78,7 @@ def train(
     insecure: bool = False,
     report: Report = lambda status: None,
     notify: Callable[[str], None] = lambda text: None,
-    boards: Sequence[Board] = (),
+    writers: Sequence[MetricWriter] = (),
     metrics_port: int = 0,
 ) -> None:
     """Runs a prepared run directory to its end with one learner and `actors` actor processes, or several of both.
@@ -100,7 +100,7 @@ def train(
       insecure: listen beyond loopback without certificates.
       report: shows progress.
       notify: given a message when something is restarted.
-      boards: which metric writers get rank 0's metrics.
+      writers: which metric writers get rank 0's metrics.
       metrics_port: port of rank 0's Prometheus endpoint on the loopback interface; 0 for none.
 
     Raises:
@@ -114,7 +114,7 @@ def train(
     logs = run_dir / "logs"
     logs.mkdir(exist_ok=True)
     learners = _learners(run_dir, listen, connect[0], ranks=ranks, inside=not actors, gpus=gpus)
-    learners[0].arguments += ["--metrics-port", str(metrics_port), "--boards", *boards]
+    learners[0].arguments += ["--metrics-port", str(metrics_port), "--boards", *writers]
     children = _actors(run_dir, config.name, connect, ranks=ranks, actors=actors, physics=physics)
     try:
         for child in (*learners, *children):
