@@ -47,7 +47,7 @@ def bundle(version, epoch):
 
 
 def rollout(steps, value, version):
-    """All values are the same, so that a torn one shows."""
+    """All values are the same, so that a corrupted one shows."""
     arrays = {
         "observation": np.full((steps, B, D), value, np.float16),
         "action": np.full((steps, B, A), value, np.float32),
@@ -89,7 +89,7 @@ def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0):
             for message in batch:
                 expected = message.meta["sequence"] % 1000
                 for name, array in message.arrays.items():
-                    assert name == "terminal" or (array == expected).all(), f"torn: {name}"
+                    assert name == "terminal" or (array == expected).all(), f"corrupted: {name}"
                 history.append([message.meta[name] for name in ("actor", "incarnation", "sequence")])
             time.sleep(pause)
             version, updates = version + 1, updates + 1
@@ -224,7 +224,7 @@ class Cluster:
     def stop(self, learner):
         """Ends the learner and the actors gently; returns what the learner found in its books, and the audit's counts.
 
-        Whatever happened before: nothing that was accepted is lost, duplicated or torn.
+        Whatever happened before: nothing that was accepted is lost, duplicated or corrupted.
         """
         for process in self.processes:  # those that a test has stopped must hear of the end
             if process.poll() is None:

@@ -28,7 +28,7 @@ def join(threads: Iterable[threading.Thread], deadline: float) -> None:
 
 
 class RefusedError(TransportError):
-    """The peer answered, and its answer is an error in words."""
+    """The peer answered with an error message."""
 
 
 class Subscription:
@@ -100,7 +100,7 @@ class Transport(Protocol):
 
         Args:
           key: key or key expression.
-          handler: makes the reply, in a daemon thread of its own; a CongraspError that it raises is answered in words.
+          handler: makes the reply, in a daemon thread of its own; the text of a CongraspError that it raises is sent.
           workers: threads that run the handler.
           depth: queries that wait; further ones wait at their senders.
           on_damage: told about requests that cannot be decoded, which are refused without asking the handler.
@@ -118,7 +118,7 @@ class Transport(Protocol):
 
         Raises:
           RefusedError: the peer answered with an error.
-          TransportError: nobody serves the key, or no answer came in time.
+          TransportError: nobody serves the key, or there was no response in time.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""What a certificate says, and the credentials of a role in a folder of certificates."""
+"""Reads certificates, and finds the credentials of a role in a folder of them."""
 
 import datetime
 import os
@@ -14,7 +14,7 @@ from common.transport.security import CERTIFICATE_FILE, NUMBERS, ROLES, Credenti
 
 
 class Certificate(NamedTuple):
-    """What a certificate says."""
+    """Content of a certificate."""
 
     role: str
     """One of `ROLES`; `ca` for the authority."""
@@ -47,7 +47,7 @@ def load(path: pathlib.Path) -> x509.Certificate:
 
 
 def read(path: pathlib.Path) -> Certificate:
-    """What a certificate's file says.
+    """Reads a certificate's file.
 
     Raises:
       CongraspError: it cannot be read, or is no certificate of this project.
@@ -70,7 +70,7 @@ def read(path: pathlib.Path) -> Certificate:
 
 
 def find(folder: pathlib.Path, role: str) -> tuple[Credentials, Certificate]:
-    """The credentials of a role, and what its certificate says.
+    """The credentials of a role, and its certificate.
 
     Args:
       folder: one that was issued for the role, or the authority's, whose number 0 is then taken.

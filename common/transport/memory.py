@@ -54,7 +54,7 @@ class MemoryHub:
         self.listening = False
 
     def notify(self, key: str, alive: bool) -> None:
-        """Tells the watchers; the caller holds the lock."""
+        """Notifies the watchers; the caller holds the lock."""
         for watcher in self.watchers:
             if matches(watcher.expression, key):
                 watcher.changes.put((key, alive))
@@ -183,10 +183,12 @@ class MemoryTransport:
         self.close()
 
     def _check_open(self) -> None:
+        """Raises `TransportError` once it is closed."""
         if self._closed:
             raise TransportError("The transport is closed.")
 
     def _start(self, name: str, target: Callable[..., None], *arguments: object) -> None:
+        """Runs a function in a daemon thread."""
         thread = threading.Thread(target=target, args=arguments, daemon=True, name=name)
         self._threads.append(thread)
         thread.start()
@@ -236,6 +238,7 @@ def _refuse_waiting(server: _Server) -> None:
 
 
 def _serve(server: _Server, handler: Answerer, admission: Admission) -> None:
+    """Answers questions, in a thread of its own, until the server ends."""
     while not server.ended.is_set():
         question = server.questions.get()
         if question is not None:
@@ -243,10 +246,12 @@ def _serve(server: _Server, handler: Answerer, admission: Admission) -> None:
 
 
 def _ask(question: _Question, handler: Answerer, admission: Admission) -> "Message | Future[Message]":
+    """The handler's answer to a question that admission lets pass."""
     return admission(question.key) or handler(question.key, question.request)
 
 
 def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message]]") -> None:
+    """Gives a question the outcome of a function, or what it raises."""
     try:
         result = outcome()
         if isinstance(result, Future):
@@ -261,6 +266,7 @@ def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message
 
 
 def _watch(watcher: _Watcher, on_change: Callable[[str, bool], None]) -> None:
+    """Reports liveliness tokens, in a thread of its own."""
     while (change := watcher.changes.get()) is not None:
         try:
             on_change(*change)

@@ -68,7 +68,7 @@ class ZenohTransport:
 
         Raises:
           CongraspError: an endpoint or key is malformed, a port is in use, or the certificates are not accepted.
-          TransportError: nobody answers.
+          TransportError: there is no response.
         """
         if bool(connect) == bool(listen):
             raise CongraspError("A transport needs endpoints either to connect to or to listen on.")
@@ -190,6 +190,7 @@ class ZenohTransport:
         self.close()
 
     def _session(self, key: str) -> zenoh.Session:
+        """The session of the flow that a key belongs to."""
         name = flow(key)
         session = self._work.sessions.get(name)
         if session is None:
@@ -199,6 +200,7 @@ class ZenohTransport:
         return session
 
     def _encode(self, message: Message) -> bytes:
+        """A message as bytes; a CongraspError if it is too long."""
         payload = encode(message)
         if len(payload) > self._max_message:
             raise CongraspError(
@@ -256,6 +258,7 @@ class _Work:
 def _config(
     name: Flow, endpoints: list[str], listens: bool, max_message: int, extra: Mapping[str, Any]
 ) -> zenoh.Config:
+    """Zenoh's configuration of one flow's session."""
     settings = {
         "mode": "peer" if listens else "client",
         "listen/endpoints": endpoints if listens else [],
@@ -281,6 +284,7 @@ def _config(
 
 
 def _listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
+    """A session that listens; a CongraspError if its port is in use."""
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
@@ -296,6 +300,7 @@ def _listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
 def _connect(
     config: zenoh.Config, endpoints: list[str], deadline: float, credentials: Credentials | None
 ) -> zenoh.Session:
+    """A session that is connected; a TransportError if nobody listens until the deadline."""
     while True:
         try:
             return zenoh.open(config)
@@ -324,6 +329,7 @@ def _received(channel: Any) -> Iterator[Any]:
 
 
 def _serve(queries: Any, handler: Answerer, on_damage: Damage, admission: Admission, max_message: int) -> None:
+    """Answers queries, in a thread of its own, until the session closes."""
     for query in _received(queries):
         key = str(query.key_expr)
         _reply(query, key, functools.partial(_ask, query, key, handler, on_damage, admission, max_message))
@@ -332,6 +338,7 @@ def _serve(queries: Any, handler: Answerer, on_damage: Damage, admission: Admiss
 def _ask(
     query: Any, key: str, handler: Answerer, on_damage: Damage, admission: Admission, max_message: int
 ) -> Message | Future[Message]:
+    """The handler's answer to a query, unless admission or damage keeps it from the handler."""
     if (turned_away := admission(key)) is not None:
         return turned_away
     try:
@@ -343,7 +350,7 @@ def _ask(
 
 
 def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]]) -> None:
-    """Answers a query with what a function returns, once it is there, or in words with what it raises."""
+    """Answers a query with what a function returns, once it is there, or with the message of what it raises."""
     payload, words = b"", ""
     try:
         result = outcome()
@@ -364,6 +371,7 @@ def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]
 
 
 def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:
+    """Moves samples to a subscription, with the number of those lost before each."""
     last: dict[str, tuple[bytes, int]] = {}
     for sample in _received(samples):
         key, lost = str(sample.key_expr), 0
@@ -377,10 +385,12 @@ def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> No
 
 
 def _decoded(payload: zenoh.ZBytes, max_message: int) -> Message:
+    """A message of a payload."""
     return decode(payload.to_bytes(), max_bytes=max_message)
 
 
 def _watch(samples: Any, on_change: Callable[[str, bool], None]) -> None:
+    """Reports liveliness tokens, in a thread of its own, until the session closes."""
     for sample in _received(samples):
         try:
             on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)

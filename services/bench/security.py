@@ -1,4 +1,4 @@
-"""What mutual TLS, access control and a hostile actor cost, as ratios against a run without them."""
+"""Cost of mutual TLS, access control and a hostile actor, as ratios against a run without them."""
 
 import contextlib
 import multiprocessing

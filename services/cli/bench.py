@@ -1,4 +1,4 @@
-"""Benchmarks, as ratios against a reference in the same run, and what a run does when it is told to end."""
+"""Benchmarks, as ratios against a reference in the same run, and how a run ends on a signal."""
 
 import pathlib
 
@@ -11,7 +11,7 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
     The bare `native` engine goes through the states that the actor has just gone through, with nothing but `mj_step`.
 
     Args:
-      environments: Worlds that run side by side.
+      environments: Environments that run side by side.
       threads: Threads of the native engine; 0 takes all cores.
       repeats: Measurements of each, alternating; medians and their ratio are printed, and the ratio of the best.
       engines: Engines to measure; those that the machine is made for if none is named.
@@ -57,19 +57,19 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
 def shutdown(tries: int = 100, within: float = 45.0, seed: int = 0) -> int:
     """Whether a run with a learner and two actors ends within 5 s of a signal, and leaves no process behind.
 
-    Starts one again and again, and sends SIGINT and SIGTERM in turn at random moments, also while it starts. The exit
+    Starts one again and again, and sends SIGINT and SIGTERM in turn at random times, also while it starts. The exit
     code is 1 if any took longer or left something.
 
     Args:
       tries: How often.
-      within: Seconds in which the moments lie; after some 30 it trains.
-      seed: Seed of the moments.
+      within: Seconds in which the times lie; after some 30 it trains.
+      seed: Seed of the times.
     """
     from rich.progress import track
 
-    from services.bench.drain import Try, attempts, summary
+    from services.bench.shutdown import Attempt, attempts, summary
 
-    results: list[Try] = []
+    results: list[Attempt] = []
     try:
         for one in track(attempts(tries, within, seed), "shutting down", total=tries):
             results.append(one)

@@ -37,7 +37,7 @@ COMMANDS = {
     "render": "draw the hand, or an episode of a run",
     "view": "the constraint studio and a window on a training, in the browser",
     "status": "who works on a run, and how it goes",
-    "audit": "what became of every rollout of a run",
+    "audit": "the outcome of every rollout of a run",
     "bench": "benchmarks, as ratios against a reference",
     "certs": "certificates for mutual TLS between the processes of a run",
     "doctor": "what is wrong with this machine or installation",

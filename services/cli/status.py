@@ -16,9 +16,9 @@ def status(
     certs: pathlib.Path | None = None,
     json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Who works on a run, and how it goes: versions, lag, rates, and what became of tickets and rollouts.
+    """Who works on a run, and how it goes: versions, lag, rates, and the outcomes of tickets and rollouts.
 
-    The exit code is 1 where the ledger does not add up.
+    The exit code is 1 where the counters do not add up.
 
     Args:
       connect: The learner's endpoint.

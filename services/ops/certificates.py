@@ -152,6 +152,7 @@ def _builder(
     days: float,
     at_most: datetime.datetime | None = None,
 ) -> x509.CertificateBuilder:
+    """What all certificates have: names, key, serial number and the time for which they are good."""
     now = datetime.datetime.now(datetime.UTC)
     if not -CA_DAYS <= days <= 2 * CA_DAYS:
         raise CongraspError(f"A certificate cannot be good for {days:g} days.", f"Choose at most {2 * CA_DAYS}.")
@@ -169,6 +170,7 @@ def _builder(
 
 
 def _host(name: str) -> x509.GeneralName:
+    """A host's name or address as certificates hold it."""
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:
@@ -182,6 +184,7 @@ def _host(name: str) -> x509.GeneralName:
 
 
 def _authority(folder: pathlib.Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """Certificate and key of the authority in a folder."""
     try:
         key = serialization.load_pem_private_key((folder / CA_KEY_FILE).read_bytes(), None)
     except (OSError, ValueError):
@@ -191,6 +194,7 @@ def _authority(folder: pathlib.Path) -> tuple[x509.Certificate, ec.EllipticCurve
 
 
 def _write_secret(path: pathlib.Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """Writes a key that its owner alone can read."""
     path.unlink(missing_ok=True)
     text = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()

@@ -56,7 +56,7 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
     root.addHandler(handler)
     _logger.setLevel(logging.INFO)
     yield
-    # After an exception the handler stays: `log_error` may still have to say why.
+    # After an exception the handler stays: `log_error` may still write why.
     root.removeHandler(handler)
 
 

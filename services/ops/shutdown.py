@@ -15,7 +15,7 @@ from collections.abc import Iterator
 GRACE = 3.5
 """Seconds between a signal and the end of the process at the latest."""
 PARENT_VARIABLE = "CONGRASP_PARENT"
-"""Environment variable by which a process tells its children that they must not outlive it."""
+"""Environment variable by which a process makes its children end with it."""
 _REAP = 0.5  # seconds for all children to be gone
 _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 

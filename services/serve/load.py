@@ -150,7 +150,7 @@ def measure(
 
 
 def one_answer(client: PolicyClient, episode: dict[str, Any]) -> str:
-    """Asks for the first action of an episode; the answer in words."""
+    """Asks for the first action of an episode; the answer as text."""
     client.reset(**episode["reset"])
     answer = client.act(episode["state"])
     with np.printoptions(precision=3, suppress=True):

@@ -267,6 +267,7 @@ class _Progress:
             self._print()
 
     def _print(self) -> None:
+        """Prints the line if it has changed."""
         if self._line != self._printed:
             console.print(f"  {self._line}", soft_wrap=True)
             self._printed = self._line
@@ -289,14 +290,17 @@ class _Progress:
 
 
 def _steps_per_update(config: RunConfig) -> int:
+    """Environment steps of one update of one rank."""
     return config.rollout_steps * config.environments * config.ppo.rollouts_per_update
 
 
 def _minutes(seconds: float) -> str:
+    """A duration as minutes and seconds; `?` if it is not known."""
     return "?" if not np.isfinite(seconds) else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
 def _evaluator(policy: PolicyBundle, config: RunConfig, seed: int, batch: int) -> Evaluator:
+    """An evaluator on objects that training never sees."""
     objects = load_pool(
         ObjectsConfig(families=config.objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
         if not config.objects.folder
@@ -314,6 +318,7 @@ def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, when: str)
 
 
 def _compare(before: list[Row], after: list[Row]) -> None:
+    """Prints metrics before and after, and whether their difference exceeds the noise."""
     console.print(f"Before and after, mean ± standard deviation over {_SEEDS} draws of episodes:")
     for name, label, factor in (
         ("episode_return", "return", 1.0),
@@ -357,6 +362,7 @@ def _pretrained_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
 
 
 def _next_steps(run_dir: pathlib.Path) -> None:
+    """Prints where the results are and which commands show more."""
     congrasp = _command()
     pictures = (
         (EPISODE, "an episode of the trained policy"),

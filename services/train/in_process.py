@@ -41,7 +41,7 @@ def train_in_process(
     """The same learner and one actor in this process, over the in-memory transport.
 
     The two share their processors: to act under old weights while the learner updates would gain nothing. So updates
-    are on-policy, whatever `max_staleness` says.
+    are on-policy, whatever `max_staleness` is.
 
     Args:
       run_dir: see `run_learner`, as `config`, `resume`, `ranks`, `on_update` and `on_event`.

@@ -87,7 +87,7 @@ def train(
     one of several ranks dies, the others end, too, and all are started again.
 
     Args:
-      run_dir: made by `learner.run_directory.create_run`; with checkpoints, the run goes on from the latest.
+      run_dir: made by `learner.run_directory.create_run`; with checkpoints, the run resumes from the latest.
       config: the run's configuration.
       actors: number of actor processes of each rank; with none, an actor lives in each rank's process.
       physics: engine of the actors.
