@@ -23,10 +23,10 @@ def status(
     Args:
       connect: The learner's endpoint.
       run: Name of the run.
-      watch: Go on until Ctrl-C, also while the learner is away.
+      watch: Go on until Ctrl-C, also while the learner is disconnected.
       every: Seconds between two looks with --watch.
       certs: Folder of an observer's certificate (congrasp certs).
-      json: Print JSON instead of tables; with --watch one object a line, and null while the learner is away.
+      json: Print JSON instead of tables; with --watch one object a line, and null while the learner is disconnected.
     """
     import json as json_module
 
@@ -49,7 +49,7 @@ def status(
         else:
             with Live(tables(found), auto_refresh=False) as live:
                 for now in follow(transport, run, every):
-                    live.update(tables(now) if now else f"The learner of '{run}' is away …", refresh=True)
+                    live.update(tables(now) if now else f"The learner of '{run}' is disconnected …", refresh=True)
         return 1 if found["warnings"] else 0
 
 

@@ -33,7 +33,7 @@ def ask(transport: Transport, run: str) -> dict[str, Any]:
 
 
 def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, Any] | None]:
-    """The status, again and again; None while the learner is away."""
+    """The status, again and again; None while the learner is disconnected."""
     while True:
         began = time.monotonic()
         try:
