@@ -18,7 +18,7 @@ from learner.process import run_learner
 from learner.run_directory import create_run
 from services.record.recorder import Recorder
 from services.train.presets import get_preset
-from services.train.train import Child, end_all
+from services.train.processes import Child, end_all
 
 _PATIENCE = 300.0
 

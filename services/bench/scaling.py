@@ -19,7 +19,7 @@ from rich.table import Table
 from common.config import RunConfig
 from common.errors import CongraspError, TransportError
 from learner.run_directory import create_run
-from services.train.train import engine_of, leave_gpus_to, train
+from services.train.processes import engine_of, leave_gpus_to, train
 
 _WARM_UPDATES = 5
 """Updates before the measurement: the first ones compile, and begin with fresh episodes everywhere."""

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import psutil
+from rich.progress import track
 
 LIMIT = 5.0
 """Seconds that a run may take to end."""
@@ -47,6 +48,20 @@ class Attempt(NamedTuple):
     def fine(self) -> bool:
         """Whether all ended together and in time."""
         return self.seconds <= LIMIT and not self.orphans
+
+
+def bench_shutdown(count: int, within: float, seed: int) -> bool:
+    """Prints every attempt that failed, and a summary; returns whether none did. For the arguments see `attempts`."""
+    results: list[Attempt] = []
+    try:
+        for one in track(attempts(count, within, seed), "shutting down", total=count):
+            results.append(one)
+            if not one.fine:
+                left = f", left behind: {'; '.join(one.orphans)}" if one.orphans else ""
+                print(f"{one.signal} after {one.after:.1f} s: took {one.seconds:.1f} s{left}", flush=True)
+    finally:
+        print(summary(results), flush=True)
+    return all(one.fine for one in results)
 
 
 def attempts(count: int, within: float, seed: int = 0) -> Iterator[Attempt]:

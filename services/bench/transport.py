@@ -38,6 +38,23 @@ _BATCH = 4
 _WARM_UP = 1.0  # seconds that are not counted
 _START = 30.0  # seconds that processes may take to start
 _INTERVAL = 0.25  # seconds between two versions of the weights
+_WEIGHTS_MB = 4.0
+
+
+def bench_transport(senders: int, seconds: float, repeats: int, actors: int, versions: int) -> None:
+    """Prints the throughput of rollouts beside both references, and the delays of weights."""
+    ours, queries, bare = measure_ingest(senders, seconds, repeats)
+    print(
+        f"rollouts of 8 MB: {ours:.0f} MB/s into the learner, {queries:.0f} MB/s as bare Zenoh queries, "
+        f"{bare:.0f} MB/s by PUSH/PULL (ratios {ours / queries:.2f} and {ours / bare:.2f})",
+        flush=True,
+    )
+    delays = measure_weights(actors, versions, _WEIGHTS_MB)
+    p50, p99 = (1e3 * delays[int(share * (len(delays) - 1))] for share in (0.5, 0.99))
+    print(
+        f"weights of {_WEIGHTS_MB:g} MB to {actors} actors: "
+        f"p50 {p50:.0f} ms, p99 {p99:.0f} ms, longest {1e3 * delays[-1]:.0f} ms"
+    )
 
 
 def measure_ingest(senders: int, seconds: float, repeats: int) -> list[float]:

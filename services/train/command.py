@@ -32,7 +32,7 @@ from services.serve.client import PolicyClient
 from services.serve.load import example_episode, one_answer, serving, wait_until_ready
 from services.train.in_process import train_in_process
 from services.train.presets import PRESETS, easier
-from services.train.train import engine_of, leave_gpus_to, train
+from services.train.processes import engine_of, leave_gpus_to, train
 from services.viz.render import episode_sheet
 from services.viz.sheets import save_png
 
@@ -86,7 +86,7 @@ def run_training(
     _check_connections(actors, listen, certs, insecure=insecure)
     plan = _plan(config, actors, ranks, listens=listen is not None or certs is not None)
     _prepare(run_dir, config, initial, resume=resume)
-    simplifications = _announce(config, run_dir, plan)
+    easier_task = _announce(config, run_dir, plan)
     with on_signal() as stop:
         before = _evaluate(untrained(config), config, evaluation, "before training") if evaluation else []
         began = time.monotonic()
@@ -125,7 +125,7 @@ def run_training(
             return stop.exit_code
         console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
         if evaluation:
-            _show(run_dir, config, evaluation, before, pretrained=simplifications)
+            _show(run_dir, config, evaluation, before, pretrained=easier_task)
         _next_steps(run_dir)
     return 0
 
