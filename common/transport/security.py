@@ -22,6 +22,7 @@ from common.errors import CongraspError
 from common.transport.keys import ROOT, Flow, flow
 
 ROLES = ("learner", "actor", "server", "client", "observer")
+"""Certificate roles."""
 LISTENERS = ("learner", "server")
 """Roles whose certificates others connect to."""
 NUMBERS = 256

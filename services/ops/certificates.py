@@ -93,9 +93,9 @@ def issue(
       CongraspError: there is no authority, the certificate is there already, or a value makes no sense.
     """
     if role not in ROLES:
-        raise CongraspError(f"There is no role {ascii(role)[:40]}.", f"Choose one of: {', '.join(ROLES)}.")
+        raise CongraspError(f"There is no certificate role {ascii(role)[:40]}.", f"Choose one of: {', '.join(ROLES)}.")
     if hosts and role not in LISTENERS:
-        raise CongraspError(f"A certificate for the role {role} names no hosts.", f"Only {' and '.join(LISTENERS)} do.")
+        raise CongraspError(f"A certificate of the role {role} names no hosts.", f"Only {' and '.join(LISTENERS)} do.")
     if number is None:
         number = next((i for i in range(NUMBERS) if not (folder / f"{role}.{i}").exists()), NUMBERS)
     if not 0 <= number < NUMBERS:

@@ -63,7 +63,7 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
 @pytest.mark.parametrize(
     ("role", "options", "words"),
     [
-        ("boss", {}, "no role 'boss'"),
+        ("boss", {}, "no certificate role 'boss'"),
         ("actor", {"hosts": ["gpu"]}, "names no hosts"),
         ("server", {"hosts": ["a b"]}, "neither a host name nor an address"),
         ("server", {"hosts": [""]}, "neither a host name nor an address"),
