@@ -17,8 +17,8 @@ from common.errors import CongraspError
 from common.task.constraints import CONSTRAINTS, PAPER
 
 PhysicsName = Literal["auto", "warp", "jax", "native"]
-Board = Literal["tensorboard", "wandb", "wandb-offline"]
-"""Where else a learner's figures are shown, beside the recordings."""
+MetricWriter = Literal["tensorboard", "wandb", "wandb-offline"]
+"""Where else a learner's metrics are written, beside the recordings."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -100,7 +100,7 @@ class LearnerHub:
             staleness.note_undone(audit.begin(self.session_id, run_id, staleness.version, staleness.max_staleness))
         transport.serve(self.keys.config, self._on_config)
         charging = self._rate_limit.charging
-        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, turnstile=self._turn_away)
+        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._turn_away)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
         transport.serve(self.keys.weights, self._on_weights, workers=2, depth=16)
         transport.serve(
@@ -109,7 +109,7 @@ class LearnerHub:
             workers=2,
             depth=8,
             on_damage=self._on_damage,
-            turnstile=self._turn_away,
+            admission=self._turn_away,
         )
         transport.watch_alive(self.keys.everyone, self._on_alive)
         transport.declare_alive(self.keys.alive("learner", name, self.session_id))

@@ -22,9 +22,9 @@ import numpy as np
 from actors.link import ActorLink, RunFinished, RunRestarted
 from common.errors import TransportError
 from common.journal import AUDIT, Journal
+from common.transport import urls
 from common.transport.keys import FLOWS, Keys
 from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 from common.wire.schema import RolloutForm
 from learner.audit import AuditLog
@@ -36,7 +36,6 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 KEYS = Keys("chaos")
 T, B, D, A = 20, 16, 32, 4
 BATCH = 2
-LIMIT = 64 << 20
 
 
 def bundle(version, epoch):
@@ -69,7 +68,7 @@ def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0):
         version = int(published.read_text()) + 1
     stopped = []
     signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
-    with ZenohTransport(listen=[endpoint], max_message=LIMIT) as transport:
+    with urls.listen(endpoint, "learner") as transport:
         hub = LearnerHub(
             transport, run="chaos", config_json="{}", run_id=epoch, schema="s",
             form=RolloutForm(steps, B, D, A, half=True), staleness=StalenessManager(1, BATCH),
@@ -86,7 +85,7 @@ def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0):
             for message in batch:
                 expected = message.meta["sequence"] % 1000
                 for name, array in message.arrays.items():
-                    assert name == "terminal" or (array == expected).all(), f"torn: {name}"
+                    assert name == "terminal" or (array == expected).all(), f"corrupted: {name}"
                 history.append([message.meta[name] for name in ("actor", "incarnation", "sequence")])
             time.sleep(pause)
             version, updates = version + 1, updates + 1
@@ -113,7 +112,7 @@ def run_actor(folder, endpoint, *, name, steps=T, pause=0.0):
     journal = Journal(folder / AUDIT / f"{name}.jsonl")
     with (
         open(folder / f"{name}.log", "a", buffering=1) as log,
-        ZenohTransport(connect=[endpoint], flows=["control", "bulk", "log"], max_message=LIMIT) as transport,
+        urls.connect(endpoint, "actor") as transport,
         ActorLink(transport, "chaos", name, window=2, request_timeout=3.0, journal=journal) as link,
     ):
         made = []
@@ -187,7 +186,7 @@ class Cluster:
         process = self.start("learner", **options)
         assert process.stdout.readline() == b"ready\n", (self.folder / "learner.err").read_text()
         if self.observer is None:
-            self.observer = ZenohTransport(connect=[self.endpoint], max_message=LIMIT)
+            self.observer = urls.connect(self.endpoint, "observer")
         return process
 
     def start_actor(self, name="a", **options):
@@ -221,7 +220,7 @@ class Cluster:
     def stop(self, learner):
         """Ends the learner and the actors gently; returns what the learner found in its books, and the audit's counts.
 
-        Whatever happened before: nothing that was accepted is lost, duplicated or torn.
+        Whatever happened before: nothing that was accepted is lost, duplicated or corrupted.
         """
         for process in self.processes:  # those that a test has stopped must hear of the end
             if process.poll() is None:

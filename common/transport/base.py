@@ -16,7 +16,7 @@ Answerer = Callable[[str, Message], "Message | Future[Message]"]
 """A handler that may also return a future of the reply: its thread then goes on with the next request."""
 Damage = Callable[[str, CongraspError], None]
 """(key, what is wrong): a request arrived that could not be decoded."""
-Turnstile = Callable[[str], Message | None]
+Admission = Callable[[str], Message | None]
 """key -> the reply with which a request is turned away before anyone looks at it, or None to let it pass."""
 
 
@@ -28,7 +28,7 @@ def join(threads: Iterable[threading.Thread], deadline: float) -> None:
 
 
 class RefusedError(TransportError):
-    """The peer answered, and its answer is an error in words."""
+    """The peer answered with an error message."""
 
 
 class Subscription:
@@ -94,17 +94,17 @@ class Transport(Protocol):
         workers: int = 1,
         depth: int = 4,
         on_damage: Damage | None = None,
-        turnstile: Turnstile | None = None,
+        admission: Admission | None = None,
     ) -> None:
         """Answers queries.
 
         Args:
           key: key or key expression.
-          handler: makes the reply, in a daemon thread of its own; a CongraspError that it raises is answered in words.
+          handler: makes the reply, in a daemon thread of its own; the text of a CongraspError that it raises is sent.
           workers: threads that run the handler.
           depth: queries that wait; further ones wait at their senders.
           on_damage: told about requests that cannot be decoded, which are refused without asking the handler.
-          turnstile: asked before a request is decoded; it may send it away with a reply.
+          admission: asked before a request is decoded; it may send it away with a reply.
         """
         ...
 
@@ -118,7 +118,7 @@ class Transport(Protocol):
 
         Raises:
           RefusedError: the peer answered with an error.
-          TransportError: nobody serves the key, or no answer came in time.
+          TransportError: nobody serves the key, or there was no response in time.
         """
         ...
 

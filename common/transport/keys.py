@@ -114,7 +114,7 @@ class Keys:
 
     @property
     def status(self) -> str:
-        """Query: roles, versions, rates and the ledger."""
+        """Query: roles, versions, rates and counters."""
         return self._key("status")
 
     @property

@@ -9,12 +9,13 @@ import logging
 import queue
 import threading
 import time
+import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import NamedTuple, Self
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Answerer, Damage, RefusedError, Subscription, Turnstile, join
+from common.transport.base import Admission, Answerer, Damage, RefusedError, Subscription, join
 from common.transport.keys import matches
 from common.wire.codec import Message
 
@@ -50,9 +51,10 @@ class MemoryHub:
         self.subscriptions: list[tuple[str, Subscription]] = []
         self.tokens: list[str] = []
         self.watchers: list[_Watcher] = []
+        self.listening = False
 
     def notify(self, key: str, alive: bool) -> None:
-        """Tells the watchers; the caller holds the lock."""
+        """Notifies the watchers; the caller holds the lock."""
         for watcher in self.watchers:
             if matches(watcher.expression, key):
                 watcher.changes.put((key, alive))
@@ -61,9 +63,9 @@ class MemoryHub:
 class MemoryTransport:
     """A `Transport` between the endpoints of a hub."""
 
-    def __init__(self, hub: MemoryHub):
-        """Makes an endpoint."""
-        self._hub = hub
+    def __init__(self, hub: MemoryHub, on_close: Callable[[], None] = lambda: None):
+        """Makes an endpoint; `on_close` is called once, when it closes."""
+        self._hub, self._on_close = hub, on_close
         self._servers: list[_Server] = []
         self._subscriptions: list[Subscription] = []
         self._tokens: list[str] = []
@@ -79,7 +81,7 @@ class MemoryTransport:
         workers: int = 1,
         depth: int = 4,
         on_damage: Damage | None = None,
-        turnstile: Turnstile | None = None,
+        admission: Admission | None = None,
     ) -> None:
         """See `Transport.serve`; nothing is ever damaged here."""
         self._check_open()
@@ -88,7 +90,7 @@ class MemoryTransport:
             self._hub.servers.append(server)
         self._servers.append(server)
         for _ in range(workers):
-            self._start(f"memory-{key}", _serve, server, handler, turnstile or (lambda _: None))
+            self._start(f"memory-{key}", _serve, server, handler, admission or (lambda _: None))
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
@@ -97,7 +99,7 @@ class MemoryTransport:
         with self._hub.lock:
             server = next((server for server in self._hub.servers if matches(server.key, key)), None)
         if server is None:
-            raise TransportError(f"Nobody answers {key}.", "The process that serves it may have ended.")
+            raise TransportError(f"No response for {key}.", "The process that serves it may have ended.")
         question = _Question(key, request, Future())
         try:
             server.questions.put(question, timeout=timeout)
@@ -156,6 +158,7 @@ class MemoryTransport:
         if self._closed:
             return
         self._closed = True
+        self._on_close()
         with self._hub.lock:
             for server in self._servers:
                 self._hub.servers.remove(server)
@@ -180,13 +183,44 @@ class MemoryTransport:
         self.close()
 
     def _check_open(self) -> None:
+        """Raises `TransportError` once it is closed."""
         if self._closed:
             raise TransportError("The transport is closed.")
 
     def _start(self, name: str, target: Callable[..., None], *arguments: object) -> None:
+        """Runs a function in a daemon thread."""
         thread = threading.Thread(target=target, args=arguments, daemon=True, name=name)
         self._threads.append(thread)
         thread.start()
+
+
+_named: weakref.WeakValueDictionary[str, MemoryHub] = weakref.WeakValueDictionary()
+"""Hubs with an endpoint, by name."""
+_listening = threading.Condition()
+
+
+def listen_in_memory(name: str) -> MemoryTransport:
+    """The endpoint of a named hub that the others connect to; a CongraspError if there is one already."""
+    with _listening:
+        hub = _named.setdefault(name, MemoryHub())
+        if hub.listening:
+            raise CongraspError(f"memory/{name} is in use in this process.", "Choose another name.")
+        hub.listening = True
+        _listening.notify_all()
+    return MemoryTransport(hub, on_close=functools.partial(setattr, hub, "listening", False))
+
+
+def connect_in_memory(name: str, wait: float) -> MemoryTransport:
+    """An endpoint of a named hub; a TransportError if nobody listens within `wait` seconds."""
+
+    def found() -> MemoryHub | None:
+        hub = _named.get(name)
+        return hub if hub and hub.listening else None
+
+    with _listening:
+        if hub := _listening.wait_for(found, wait):
+            return MemoryTransport(hub)
+    raise TransportError(f"No response from memory/{name}.", "It is reached from within its own process only.")
 
 
 def _refuse_waiting(server: _Server) -> None:
@@ -197,24 +231,27 @@ def _refuse_waiting(server: _Server) -> None:
         except queue.Empty:
             break
         if question is not None:
-            question.answer.set_exception(TransportError(f"Nobody answers {question.key} any more."))
+            question.answer.set_exception(TransportError(f"No response for {question.key}: its server has closed."))
     for _ in range(server.workers):
         with contextlib.suppress(queue.Full):
             server.questions.put_nowait(None)
 
 
-def _serve(server: _Server, handler: Answerer, turnstile: Turnstile) -> None:
+def _serve(server: _Server, handler: Answerer, admission: Admission) -> None:
+    """Answers questions, in a thread of its own, until the server ends."""
     while not server.ended.is_set():
         question = server.questions.get()
         if question is not None:
-            _answer(question, functools.partial(_ask, question, handler, turnstile))
+            _answer(question, functools.partial(_ask, question, handler, admission))
 
 
-def _ask(question: _Question, handler: Answerer, turnstile: Turnstile) -> "Message | Future[Message]":
-    return turnstile(question.key) or handler(question.key, question.request)
+def _ask(question: _Question, handler: Answerer, admission: Admission) -> "Message | Future[Message]":
+    """The handler's answer to a question that admission lets pass."""
+    return admission(question.key) or handler(question.key, question.request)
 
 
 def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message]]") -> None:
+    """Gives a question the outcome of a function, or what it raises."""
     try:
         result = outcome()
         if isinstance(result, Future):
@@ -229,6 +266,7 @@ def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message
 
 
 def _watch(watcher: _Watcher, on_change: Callable[[str, bool], None]) -> None:
+    """Reports liveliness tokens, in a thread of its own."""
     while (change := watcher.changes.get()) is not None:
         try:
             on_change(*change)

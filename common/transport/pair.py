@@ -1,4 +1,4 @@
-"""One end on two wires: a learner's that also has an actor in its own process."""
+"""Two transports as one: for a learner that also has an actor in its own process."""
 
 from collections.abc import Callable
 from typing import Any, Self
@@ -11,7 +11,7 @@ class PairTransport:
     """Serves, shows itself and publishes on two transports, which stay the caller's; asks and listens on the first."""
 
     def __init__(self, first: Transport, second: Transport):
-        """Joins the two."""
+        """`query` and `subscribe` use the first alone."""
         self._first, self._both = first, (first, second)
 
     def serve(self, key: str, handler: Answerer, **options: Any) -> None:

@@ -22,6 +22,7 @@ from common.errors import CongraspError
 from common.transport.keys import ROOT, Flow, flow
 
 ROLES = ("learner", "actor", "server", "client", "observer")
+"""Certificate roles."""
 LISTENERS = ("learner", "server")
 """Roles whose certificates others connect to."""
 NUMBERS = 256
@@ -129,7 +130,7 @@ LIMITS: dict[str, tuple[Limit, ...]] = {
         Limit("ticket/*", _SMALL, 0.0),  # the hub counts these by actor
         *(Limit(f"log/{channel}/**", _LOG, 100.0) for channel in ("metrics", "event", "version", "episode", "rollout")),
     ),
-    # The policy server's own queue refuses what is too much, in words.
+    # The policy server's own queue refuses what is too much, with a message.
     "server": (Limit("policy/act", 1 << 20, 0.0), Limit("policy/health", _SMALL, 100.0)),
 }
 """By the role that listens. Rollouts are limited by the longest message and by the learner's hub."""
@@ -170,9 +171,9 @@ def check_exposure(endpoint: str, credentials: Credentials | None, *, insecure: 
 
 
 def refusal(endpoint: str, credentials: Credentials | None) -> CongraspError | None:
-    """Why a connection cannot be made, if the reason is the certificates: tries once, and costs a second or two.
+    """Why a connection cannot be made, if the reason is the certificates: takes one attempt, of a second or two.
 
-    Zenoh says of every failure only that nobody can be connected to.
+    Zenoh reports every failure alike: that it could not connect.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if not match or not match["port"]:
@@ -186,6 +187,7 @@ def refusal(endpoint: str, credentials: Credentials | None) -> CongraspError | N
 
 
 def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Credentials | None) -> CongraspError | None:
+    """What a TLS handshake fails with, if it is the certificates."""
     context = ssl.create_default_context()
     if credentials is None:
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
@@ -218,6 +220,7 @@ def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Creden
 
 
 def _is_loopback(endpoint: str) -> bool:
+    """Whether only this machine reaches an endpoint."""
     match = _ENDPOINT.fullmatch(endpoint)
     if not match:
         return False
@@ -231,6 +234,7 @@ def _is_loopback(endpoint: str) -> bool:
 
 
 def _access_control(role: str, name_of_flow: Flow) -> dict[str, Any]:
+    """What a listener allows each certificate to do in one flow; nothing else passes."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -292,11 +296,13 @@ def _split(rights: Rights) -> tuple[Rights, Rights]:
 
 
 def _filled(rights: Rights, name: str) -> Rights:
+    """The rights of one name, in place of `{name}`."""
     parts = dataclasses.asdict(rights)
     return Rights(**{kind: tuple(key.replace("{name}", name) for key in keys) for kind, keys in parts.items()})
 
 
 def _limits(role: str, name: Flow) -> dict[str, Any]:
+    """Size and rate of the messages that a listener takes in one flow."""
     both = {"flows": ["ingress"], "messages": ["query", "put"]}
     limits = [(key, limit) for limit in LIMITS[role] for key in _of_flow([limit.keys], name)]
     sizes = [{"id": key, **both, "key_exprs": [key], "size_limit": limit.size} for key, limit in limits]

@@ -25,14 +25,12 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 from common.errors import CongraspError, TransportError
-from common.transport.base import Answerer, Damage, RefusedError, Subscription, Turnstile, join
+from common.transport.base import Admission, Answerer, Damage, RefusedError, Subscription, join
 from common.transport.keys import FLOWS, Flow, flow
+from common.transport.ports import shifted
 from common.transport.security import Credentials, refusal, secured
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-"""Where the learner listens unless told otherwise: on this machine only."""
-_ENDPOINT = re.compile(r"(?P<address>[a-z]+/[^/]+):(?P<port>\d{1,5})(?P<rest>[?#].*)?")
 _LEASE_MS: dict[Flow, int] = {"control": 2500, "bulk": 10000, "log": 10000, "policy": 2500}
 _BLOCK_US: dict[Flow, int] = {"control": 2_000_000, "bulk": 5_000_000, "log": 1_000_000, "policy": 2_000_000}
 _OVERHEAD = 64 << 10  # bytes that Zenoh may add to a message
@@ -70,7 +68,7 @@ class ZenohTransport:
 
         Raises:
           CongraspError: an endpoint or key is malformed, a port is in use, or the certificates are not accepted.
-          TransportError: nobody answers.
+          TransportError: there is no response.
         """
         if bool(connect) == bool(listen):
             raise CongraspError("A transport needs endpoints either to connect to or to listen on.")
@@ -103,12 +101,12 @@ class ZenohTransport:
         workers: int = 1,
         depth: int = 4,
         on_damage: Damage | None = None,
-        turnstile: Turnstile | None = None,
+        admission: Admission | None = None,
     ) -> None:
         """See `Transport.serve`."""
         queryable = self._session(key).declare_queryable(key, FifoChannel(depth))
         self._declared.append(queryable)
-        hooks = on_damage or (lambda *_: None), turnstile or (lambda _: None)
+        hooks = on_damage or (lambda *_: None), admission or (lambda _: None)
         for _ in range(workers):
             self._work.start(_serve, queryable.handler, handler, *hooks, self._max_message)
 
@@ -136,7 +134,7 @@ class ZenohTransport:
             raise TransportError(f"No answer for {key} within {timeout:g} s.")
         if refusal is not None:
             raise RefusedError(refusal.decode(errors="replace"))
-        raise TransportError(f"Nobody answers {key}.", "The process that serves it may have ended.")
+        raise TransportError(f"No response for {key}.", "The process that serves it may have ended.")
 
     def publish(self, key: str, message: Message) -> None:
         """See `Transport.publish`; once closed it does nothing."""
@@ -192,6 +190,7 @@ class ZenohTransport:
         self.close()
 
     def _session(self, key: str) -> zenoh.Session:
+        """The session of the flow that a key belongs to."""
         name = flow(key)
         session = self._work.sessions.get(name)
         if session is None:
@@ -201,6 +200,7 @@ class ZenohTransport:
         return session
 
     def _encode(self, message: Message) -> bytes:
+        """A message as bytes; a CongraspError if it is too long."""
         payload = encode(message)
         if len(payload) > self._max_message:
             raise CongraspError(
@@ -255,17 +255,10 @@ class _Work:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
 
-def shifted(endpoint: str, offset: int) -> str:
-    """The endpoint with a port `offset` above; a CongraspError if it is none."""
-    match = _ENDPOINT.fullmatch(endpoint)
-    if not match or not 0 < int(match["port"]) + offset < 1 << 16:
-        raise CongraspError(f"'{endpoint}' is not an endpoint.", f"Write it like {DEFAULT_ENDPOINT}.")
-    return f"{match['address']}:{int(match['port']) + offset}{match['rest'] or ''}"
-
-
 def _config(
     name: Flow, endpoints: list[str], listens: bool, max_message: int, extra: Mapping[str, Any]
 ) -> zenoh.Config:
+    """Zenoh's configuration of one flow's session."""
     settings = {
         "mode": "peer" if listens else "client",
         "listen/endpoints": endpoints if listens else [],
@@ -291,6 +284,7 @@ def _config(
 
 
 def _listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
+    """A session that listens; a CongraspError if its port is in use."""
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
@@ -306,6 +300,7 @@ def _listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
 def _connect(
     config: zenoh.Config, endpoints: list[str], deadline: float, credentials: Credentials | None
 ) -> zenoh.Session:
+    """A session that is connected; a TransportError if nobody listens until the deadline."""
     while True:
         try:
             return zenoh.open(config)
@@ -317,7 +312,7 @@ def _connect(
                 where = ", ".join(endpoints)
                 remedy = "Start the learner or the server there, or correct the address."
                 if "Unable to connect" in str(error):
-                    raise TransportError(f"Nobody answers at {where}.", remedy) from None
+                    raise TransportError(f"No response from {where}.", remedy) from None
                 raise TransportError(f"Cannot connect to {where}: {_first_line(error)}.", remedy) from None
 
 
@@ -333,16 +328,18 @@ def _received(channel: Any) -> Iterator[Any]:
             yield channel.recv()
 
 
-def _serve(queries: Any, handler: Answerer, on_damage: Damage, turnstile: Turnstile, max_message: int) -> None:
+def _serve(queries: Any, handler: Answerer, on_damage: Damage, admission: Admission, max_message: int) -> None:
+    """Answers queries, in a thread of its own, until the session closes."""
     for query in _received(queries):
         key = str(query.key_expr)
-        _reply(query, key, functools.partial(_ask, query, key, handler, on_damage, turnstile, max_message))
+        _reply(query, key, functools.partial(_ask, query, key, handler, on_damage, admission, max_message))
 
 
 def _ask(
-    query: Any, key: str, handler: Answerer, on_damage: Damage, turnstile: Turnstile, max_message: int
+    query: Any, key: str, handler: Answerer, on_damage: Damage, admission: Admission, max_message: int
 ) -> Message | Future[Message]:
-    if (turned_away := turnstile(key)) is not None:
+    """The handler's answer to a query, unless admission or damage keeps it from the handler."""
+    if (turned_away := admission(key)) is not None:
         return turned_away
     try:
         request = decode(query.payload.to_bytes() if query.payload else b"", max_bytes=max_message)
@@ -353,7 +350,7 @@ def _ask(
 
 
 def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]]) -> None:
-    """Answers a query with what a function returns, once it is there, or in words with what it raises."""
+    """Answers a query with what a function returns, once it is there, or with the message of what it raises."""
     payload, words = b"", ""
     try:
         result = outcome()
@@ -374,6 +371,7 @@ def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]
 
 
 def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:
+    """Moves samples to a subscription, with the number of those lost before each."""
     last: dict[str, tuple[bytes, int]] = {}
     for sample in _received(samples):
         key, lost = str(sample.key_expr), 0
@@ -387,10 +385,12 @@ def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> No
 
 
 def _decoded(payload: zenoh.ZBytes, max_message: int) -> Message:
+    """A message of a payload."""
     return decode(payload.to_bytes(), max_bytes=max_message)
 
 
 def _watch(samples: Any, on_change: Callable[[str, bool], None]) -> None:
+    """Reports liveliness tokens, in a thread of its own, until the session closes."""
     for sample in _received(samples):
         try:
             on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)

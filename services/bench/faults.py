@@ -1,4 +1,4 @@
-"""How long a small run takes to get over deaths: its processes are killed and stopped, one after another."""
+"""How long a small run takes to recover: its processes are killed and stopped, one after another."""
 
 import contextlib
 import pathlib
@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from common.errors import CongraspError, TransportError
+from common.transport import urls
 from common.transport.keys import Keys
-from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 from services.ops.audit import audit
 
@@ -33,16 +33,17 @@ Measure = Callable[[str, float, Callable[[], Any]], None]
 """Given a name, a time of `time.monotonic`, and what is true once that which is waited for has happened."""
 
 
-class Victim:
+class RunUnderTest:
     """A run of `congrasp train` and a look at it from outside."""
 
     def __init__(self, process: psutil.Process):
         """Waits until the run's learner listens."""
         self._process = process
         endpoint = _until(lambda: self._argument("learner", "--listen"))
-        self._transport = ZenohTransport(connect=[endpoint], wait=_DEADLINE)
+        self._transport = urls.connect(endpoint, "observer", wait=_DEADLINE)
 
     def _argument(self, role: str, name: str) -> str | None:
+        """An option's value in the command line of the oldest process of a role."""
         return next((c.cmdline()[c.cmdline().index(name) + 1] for c in self.children(role)), None)
 
     def children(self, role: str) -> list[psutil.Process]:
@@ -77,11 +78,12 @@ class Victim:
 
 
 @contextlib.contextmanager
-def _running(run_dir: pathlib.Path, actors: int) -> Iterator[Victim]:
+def _running(run_dir: pathlib.Path, actors: int) -> Iterator[RunUnderTest]:
+    """A run with so many actors that all contribute, while the block runs."""
     command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(run_dir), "--actors", str(actors)]
     process = subprocess.Popen([*command, *_SMALL], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        victim = Victim(psutil.Process(process.pid))
+        victim = RunUnderTest(psutil.Process(process.pid))
         with contextlib.closing(victim):
             _until(lambda: len(victim.actors()) == actors and min(victim.actors().values()) > 2)
             yield victim
@@ -98,13 +100,13 @@ def _until(look: Callable[[], Any]) -> Any:
     deadline = time.monotonic() + _DEADLINE
     while not (seen := look()):
         if time.monotonic() > deadline:
-            raise CongraspError(f"The run did not get on within {_DEADLINE:g} s.", "Is the machine busy otherwise?")
+            raise CongraspError(f"Nothing happened within {_DEADLINE:g} s.", "Is the machine busy otherwise?")
         time.sleep(0.02)
     return seen
 
 
 def bench_faults(actors: int, repeats: int) -> None:
-    """Prints seconds from a fault until it is noticed and until it is overcome, each time, and the run's audit."""
+    """Prints seconds from each fault until it is noticed and until the run has recovered, and the run's audit."""
     seconds: dict[str, list[float]] = {}
     shares: list[float] = []
     starts: list[float] = []
@@ -139,7 +141,7 @@ def bench_faults(actors: int, repeats: int) -> None:
         console.print(f"Lag: mean {report.lag_mean:.2f}, at most {report.lag_max} of {report.max_staleness}.")
 
 
-def _kill_actor(run: Victim, actors: int, measure: Measure) -> tuple[float, float]:
+def _kill_actor(run: RunUnderTest, actors: int, measure: Measure) -> tuple[float, float]:
     """Kills the oldest actor; returns the throughput of the next seconds as a share of that before, and the processor
     seconds that its replacement took until it contributed."""
     before, known = run.rate(), run.actors()
@@ -155,7 +157,7 @@ def _kill_actor(run: Victim, actors: int, measure: Measure) -> tuple[float, floa
     return share, times.user + times.system
 
 
-def _stop_actor(run: Victim, actors: int, measure: Measure) -> None:
+def _stop_actor(run: RunUnderTest, actors: int, measure: Measure) -> None:
     """Stops the oldest actor, whose links then stay open and silent, until that is noticed."""
     victim, known = run.children("actor")[0], run.actors()
     victim.suspend()
@@ -165,19 +167,22 @@ def _stop_actor(run: Victim, actors: int, measure: Measure) -> None:
     measure("actor goes on: contributes", time.monotonic(), lambda: _all_contribute(run, known))
 
 
-def _kill_learner(run: Victim, measure: Measure) -> None:
+def _kill_learner(run: RunUnderTest, measure: Measure) -> None:
+    """Kills the learner, whose actors must survive it."""
     pids, version = {child.pid for child in run.children("actor")}, _until(run.status)["version"]
     run.children("learner")[0].kill()
-    # The first version of the new life is the checkpoint's policy, the second is new.
+    # The first version of the new session is the checkpoint's policy, the second is new.
     measure("learner killed: an update later", time.monotonic(), lambda: run.status().get("version", -1) > version + 2)
     if {child.pid for child in run.children("actor")} != pids:
         raise CongraspError("An actor did not survive the learner's restart.")
 
 
-def _new_contributes(run: Victim, known: Collection[str]) -> bool:
+def _new_contributes(run: RunUnderTest, known: Collection[str]) -> bool:
+    """Whether an actor that was not known has made a rollout."""
     return any(count for name, count in run.actors().items() if name not in known)
 
 
-def _all_contribute(run: Victim, before: dict[str, int]) -> bool:
+def _all_contribute(run: RunUnderTest, before: dict[str, int]) -> bool:
+    """Whether every actor has made rollouts since."""
     now = run.actors()
     return bool(now) and all(now.get(name, 0) > count for name, count in before.items())

@@ -1,4 +1,4 @@
-"""Benchmarks that print ratios against a reference measured in the same run."""
+"""Actors' control steps a second beside the bare engine's, measured in turns."""
 
 import concurrent.futures
 import functools
@@ -41,7 +41,7 @@ def engines() -> list[PhysicsName]:
 
 
 class Recorder(NativePhysics):
-    """A native engine that keeps what it is told, so that another can go through the same states."""
+    """A native engine that keeps its commands, so that another can go through the same states."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         """As `NativePhysics`."""
@@ -128,17 +128,20 @@ def _row(steps: int, actor: np.ndarray, bare: np.ndarray) -> list[str]:
 
 
 def _timed(run: Callable[[], object]) -> float:
+    """Seconds of a call."""
     began = time.perf_counter()
     run()
     return time.perf_counter() - began
 
 
 def _collect(worker: RolloutWorker, policy: PolicyBundle) -> None:
+    """One episode of every environment."""
     jax.block_until_ready(worker.collect(policy.acting, _STEPS).reward)
 
 
 @functools.lru_cache(maxsize=1)
 def _compiled_loop(worker: RolloutWorker) -> Callable[[], object]:
+    """Control steps with nothing but the engine, compiled."""
     physics = worker.physics
 
     def loop(state: object, target: jax.Array, table: jax.Array) -> object:

@@ -11,14 +11,14 @@ import psutil
 from rich.console import Console
 
 from common.errors import CongraspError
+from common.transport import urls
 from common.transport.keys import Keys
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
+from common.transport.ports import local_url
 from learner.process import run_learner
 from learner.run_directory import create_run
 from services.record.recorder import Recorder
 from services.train.presets import get_preset
-from services.train.train import Child, end_all
+from services.train.processes import Child, end_all
 
 _PATIENCE = 300.0
 
@@ -29,20 +29,20 @@ def bench_recording(actors: int, seconds: float, turns: int) -> None:
     The run is quickstart's, with the logs that it publishes by default.
     """
     config = dataclasses.replace(get_preset("quickstart"), updates=10**6, collapse_patience=0)
-    marks: list[tuple[float, float]] = []  # time and transitions of every update
+    updates: list[tuple[float, float]] = []  # time and transitions of every update
     stop = threading.Event()
     paces: dict[bool, list[float]] = {False: [], True: []}
     busy = recorded = size = 0.0
-    with tempfile.TemporaryDirectory() as folder, ZenohTransport(listen=[endpoint := _endpoint()]) as transport:
+    with tempfile.TemporaryDirectory() as folder, urls.listen(endpoint := local_url(), "learner") as transport:
         run_dir = pathlib.Path(folder, "run")
         create_run(run_dir, config)
-        said = transport.subscribe(Keys(config.name).actor_metrics, depth=10**6)
+        actor_metrics = transport.subscribe(Keys(config.name).actor_metrics, depth=10**6)
         learner = threading.Thread(
             target=run_learner,
             args=(run_dir, config, transport),
             kwargs={
                 "stop_event": stop,
-                "on_update": lambda values: marks.append((time.monotonic(), values["transitions"])),
+                "on_update": lambda values: updates.append((time.monotonic(), values["transitions"])),
             },
         )
         arguments = ["actor", "--connect", endpoint, "--run", config.name, "--physics", "native", "--threads", "1"]
@@ -51,26 +51,26 @@ def bench_recording(actors: int, seconds: float, turns: int) -> None:
             learner.start()
             for child in children:
                 child.start()
-            _wait_for(marks, 5)
-            while said.receive(0.0):
+            _wait_for(updates, 5)
+            while actor_metrics.receive(0.0):
                 pass  # of actors that were alone, or began
             for turn in range(2 * turns):
                 recording = turn % 2 == 1
                 recorder = Recorder(transport, config.name, run_dir / "logs", name=f"bench{turn}")
                 if recording:
                     recorder.start()
-                _wait_for(marks, len(marks) + 1)
-                first, began, worked = len(marks) - 1, time.monotonic(), _thread_seconds(recorder)
+                _wait_for(updates, len(updates) + 1)
+                first, began, worked = len(updates) - 1, time.monotonic(), _thread_seconds(recorder)
                 time.sleep(seconds)
-                _wait_for(marks, len(marks) + 1)
+                _wait_for(updates, len(updates) + 1)
                 if recording:
                     busy += _thread_seconds(recorder) - worked
                     recorded += time.monotonic() - began
-                (start, before), (end, after) = marks[first], marks[-1]
+                (start, before), (end, after) = updates[first], updates[-1]
                 paces[recording].append((after - before) / (end - start))
                 recorder.close()
                 size += sum(file.stat().st_size for file in recorder.files)
-            shares = [message.meta["values"] for _, message in iter(lambda: said.receive(0.0), None)]
+            shares = [message.meta["values"] for _, message in iter(lambda: actor_metrics.receive(0.0), None)]
         finally:
             stop.set()
             end_all(children)
@@ -93,13 +93,10 @@ def bench_recording(actors: int, seconds: float, turns: int) -> None:
     )
 
 
-def _endpoint() -> str:
-    return f"tcp/127.0.0.1:{free_port()}"
-
-
-def _wait_for(marks: list[tuple[float, float]], count: int) -> None:
+def _wait_for(updates: list[tuple[float, float]], count: int) -> None:
+    """Until so many updates are done."""
     deadline = time.monotonic() + _PATIENCE
-    while len(marks) < count:
+    while len(updates) < count:
         if time.monotonic() > deadline:
             raise CongraspError(f"There was no update within {_PATIENCE:g} s.", "Is the machine busy otherwise?")
         time.sleep(0.01)

@@ -19,7 +19,7 @@ from rich.table import Table
 from common.config import RunConfig
 from common.errors import CongraspError, TransportError
 from learner.run_directory import create_run
-from services.train.train import engine_of, leave_gpus_to, train
+from services.train.processes import engine_of, leave_gpus_to, train
 
 _WARM_UPDATES = 5
 """Updates before the measurement: the first ones compile, and begin with fresh episodes everywhere."""
@@ -50,11 +50,11 @@ class Stage:
 class _Meter:
     """Watches a run's metrics, and stops it when enough was seen."""
 
-    def __init__(self, seconds: float, deadline: float, stop: threading.Event, say: Callable[[str], None]):
+    def __init__(self, seconds: float, deadline: float, stop: threading.Event, notify: Callable[[str], None]):
         self.metrics: list[dict[str, Any]] = []
         self.late = False
-        self._seconds, self._stop, self._say = seconds, stop, say
-        self._began = self._said = time.monotonic()
+        self._seconds, self._stop, self._notify = seconds, stop, notify
+        self._began = self._notified = time.monotonic()
         self._deadline = self._began + deadline
         self.start_seconds = float("nan")
 
@@ -72,12 +72,12 @@ class _Meter:
         elif now > self._deadline:
             self.late = True
             self._stop.set()
-        if now - self._said > 10.0:
-            self._said = now
-            self._say(f"{now - self._began:.0f} s, " + (f"measured {span:.0f} s" if span else "starting"))
+        if now - self._notified > 10.0:
+            self._notified = now
+            self._notify(f"{now - self._began:.0f} s, " + (f"measured {span:.0f} s" if span else "starting"))
 
     def stage(self, ranks: int, first: Stage | None) -> Stage:
-        """The figures."""
+        """The result."""
         begin, end = self.metrics[0], self.metrics[-1]
         seconds = end["time"] - begin["time"]
         rate = (end["values"]["transitions"] - begin["values"]["transitions"]) / seconds
@@ -150,6 +150,7 @@ def _measure(
     first: Stage | None,
     console: Console,
 ) -> Stage:
+    """Trains with one number of ranks until enough was measured."""
     run_dir = pathlib.Path(tempfile.mkdtemp(prefix=f"congrasp-scaling-{ranks}-"))
     stop = threading.Event()
     meter = _Meter(seconds, deadline, stop, lambda text: console.print(f"  {text}"))
@@ -182,6 +183,7 @@ def _measure(
 
 
 def _print(console: Console, config: RunConfig, stages: Sequence[Stage]) -> None:
+    """The table so far."""
     steps = config.environments * config.rollout_steps * config.ppo.rollouts_per_update
     table = Table(title=f"{config.environments} environments, {steps} steps an update of each rank, '{config.physics}'")
     for column in ("ranks", "steps/s", "efficiency", "wait, s", "update, s", "updates", "start, s"):

@@ -1,4 +1,4 @@
-"""What the wire carries: rollouts into one learner beside bare Zenoh and bare PUSH/PULL sockets, and weights out of it.
+"""Throughput of the wire: rollouts into one learner beside bare Zenoh and bare PUSH/PULL sockets, weights out of it.
 
 Everything but the policy and the physics is the real thing: the hub with its checks, admission and journals, and links
 with theirs, in processes of their own over the loopback interface.
@@ -23,8 +23,8 @@ from zenoh.handlers import FifoChannel
 from actors.link import ActorLink, RunFinished
 from common.errors import CongraspError
 from common.journal import AUDIT, Journal
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
+from common.transport import urls
+from common.transport.ports import free_port, local_url
 from common.wire.codec import Message, encode
 from common.wire.schema import RolloutForm
 from learner.audit import AuditLog
@@ -38,6 +38,23 @@ _BATCH = 4
 _WARM_UP = 1.0  # seconds that are not counted
 _START = 30.0  # seconds that processes may take to start
 _INTERVAL = 0.25  # seconds between two versions of the weights
+_WEIGHTS_MB = 4.0
+
+
+def bench_transport(senders: int, seconds: float, repeats: int, actors: int, versions: int) -> None:
+    """Prints the throughput of rollouts beside both references, and the delays of weights."""
+    ours, queries, bare = measure_ingest(senders, seconds, repeats)
+    print(
+        f"rollouts of 8 MB: {ours:.0f} MB/s into the learner, {queries:.0f} MB/s as bare Zenoh queries, "
+        f"{bare:.0f} MB/s by PUSH/PULL (ratios {ours / queries:.2f} and {ours / bare:.2f})",
+        flush=True,
+    )
+    delays = measure_weights(actors, versions, _WEIGHTS_MB)
+    p50, p99 = (1e3 * delays[int(share * (len(delays) - 1))] for share in (0.5, 0.99))
+    print(
+        f"weights of {_WEIGHTS_MB:g} MB to {actors} actors: "
+        f"p50 {p50:.0f} ms, p99 {p99:.0f} ms, longest {1e3 * delays[-1]:.0f} ms"
+    )
 
 
 def measure_ingest(senders: int, seconds: float, repeats: int) -> list[float]:
@@ -82,8 +99,9 @@ def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]
 
 @contextlib.contextmanager
 def _learner(folder: pathlib.Path) -> Iterator[tuple[LearnerHub, str]]:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with ZenohTransport(listen=[endpoint]) as transport:
+    """A learner's hub without a learner, and where it listens."""
+    endpoint = local_url()
+    with urls.listen(endpoint, "learner") as transport:
         hub = LearnerHub(
             transport,
             run=_RUN,
@@ -99,6 +117,7 @@ def _learner(folder: pathlib.Path) -> Iterator[tuple[LearnerHub, str]]:
 
 
 def _bundle(version: int, parameters: np.ndarray) -> Message:
+    """Weights that pass the checks."""
     sizes = {"observation": (_FORM.observation,), "value": ()}
     arrays: dict[str, Any] = {f"{kind}/{m}": np.zeros(size) for kind, size in sizes.items() for m in ("mean", "m2")}
     arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": parameters}
@@ -107,12 +126,14 @@ def _bundle(version: int, parameters: np.ndarray) -> Message:
 
 
 def _rollout() -> Message:
+    """A rollout that passes the checks."""
     rng = np.random.default_rng(0)
     arrays = {name: rng.normal(size=zeros.shape).astype(zeros.dtype) for name, zeros in _FORM.zeros().items()}
     return Message(arrays, {"version": 0, "schema": _SCHEMA, "steps": _FORM.steps * _FORM.worlds})
 
 
 def _through_the_hub(senders: int, seconds: float) -> float:
+    """MB/s through the learner's hub."""
     size, weights = len(encode(_rollout())), np.zeros(1000, np.float32)
     with tempfile.TemporaryDirectory() as name, _learner(folder := pathlib.Path(name)) as (hub, endpoint):
         hub.publish_weights(_bundle(0, weights), 0)
@@ -134,6 +155,7 @@ def _through_the_hub(senders: int, seconds: float) -> float:
 
 
 def _through_queries(senders: int, seconds: float) -> float:
+    """MB/s through bare Zenoh queries."""
     endpoint = f"tcp/127.0.0.1:{free_port(1)}"
     with _session("peer", listen=endpoint) as session:
         queryable = session.declare_queryable(_RUN, FifoChannel(8))
@@ -153,6 +175,7 @@ def _through_queries(senders: int, seconds: float) -> float:
 
 
 def _through_sockets(senders: int, seconds: float) -> float:
+    """MB/s through bare PUSH/PULL sockets."""
     zmq = _zmq()
     with zmq.Context() as context, context.socket(zmq.PULL) as socket:
         socket.rcvhwm, socket.rcvtimeo = 8, 500
@@ -178,11 +201,12 @@ def _rate(receive: Callable[[], int], seconds: float) -> float:
     return received / (time.monotonic() - began) / 1e6
 
 
-def _until(condition: Callable[[], bool], complaint: str) -> None:
+def _until(condition: Callable[[], bool], message: str) -> None:
+    """Waits for a condition; a CongraspError if it takes too long."""
     deadline = time.monotonic() + _START
     while not condition():
         if time.monotonic() > deadline:
-            raise CongraspError(f"{complaint[:-1]} within {_START:g} s.", "Is the machine busy otherwise?")
+            raise CongraspError(f"{message[:-1]} within {_START:g} s.", "Is the machine busy otherwise?")
         time.sleep(0.01)
 
 
@@ -203,9 +227,10 @@ def _processes(count: int, role: Callable[[str, pathlib.Path, int], None], *argu
 
 @contextlib.contextmanager
 def _link(endpoint: str, folder: pathlib.Path, number: int) -> Iterator[ActorLink]:
+    """An actor's link to the learner."""
     journal = Journal(folder / AUDIT / f"a{number}.jsonl")
     with (
-        ZenohTransport(connect=[endpoint], flows=("control", "bulk", "log")) as transport,
+        urls.connect(endpoint, "actor") as transport,
         ActorLink(transport, _RUN, f"a{number}", window=2, journal=journal) as link,
         contextlib.suppress(RunFinished),
     ):
@@ -237,6 +262,7 @@ def _ask(endpoint: str, _: pathlib.Path, number: int) -> None:
 
 
 def _session(mode: str, **endpoints: str) -> zenoh.Session:
+    """A bare Zenoh session."""
     settings: dict[str, Any] = {f"{way}/endpoints": [endpoint] for way, endpoint in endpoints.items()}
     settings |= {"mode": mode, "scouting/multicast/enabled": False, "transport/shared_memory/enabled": False}
     config = zenoh.Config()
@@ -246,6 +272,7 @@ def _session(mode: str, **endpoints: str) -> zenoh.Session:
 
 
 def _push(address: str, _: pathlib.Path, number: int) -> None:
+    """Sends the same rollout again and again through a socket."""
     zmq = _zmq()
     data = encode(_rollout())
     with zmq.Context() as context, context.socket(zmq.PUSH) as socket:
@@ -270,16 +297,19 @@ def _pull(endpoint: str, folder: pathlib.Path, number: int) -> None:
 
 
 def _held(folder: pathlib.Path, number: int) -> list[tuple[int, float]]:
+    """Versions that an actor held, and since when."""
     path = _file(folder, number)
     lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     return [tuple(json.loads(line)) for line in lines if line.endswith("\n")]
 
 
 def _file(folder: pathlib.Path, number: int) -> pathlib.Path:
+    """Where an actor writes them down."""
     return folder / f"weights.{number}.jsonl"
 
 
 def _zmq() -> Any:
+    """The package of the reference; a CongraspError if it is absent."""
     try:
         import zmq
     except ImportError:

@@ -6,11 +6,12 @@ from typing import Annotated
 import tyro
 
 from common.config import PhysicsName
+from common.transport.ports import LEARNER_URL
 from services.cli.watch import Watch, Watched
 
 
 def actor(
-    connect: str = "tcp/127.0.0.1:7447",
+    connect: str = LEARNER_URL,
     run: str = "quickstart",
     id: Annotated[str, tyro.conf.arg(name="id")] = "",
     physics: PhysicsName = "auto",
@@ -37,26 +38,25 @@ def actor(
 
     from actors.process import run_actor
     from common.journal import Journal
+    from common.transport import urls
     from common.transport.keys import process_name
-    from common.transport.zenoh_transport import ZenohTransport
-    from services.ops.access import acting
-    from services.ops.logs import say
+    from services.ops.logs import log
     from services.ops.metrics import ActorMetrics
     from services.ops.shutdown import on_signal
 
-    credentials, name = acting(certs, id or process_name("actor"))
+    name = urls.name_on_wire(id or process_name("actor"), certs)
     metrics = ActorMetrics()
 
-    def made(values: dict[str, float]) -> None:
+    def report(values: dict[str, float]) -> None:
         metrics.rollout(values)
-        say("info", f"Rollout {values['rollouts']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
+        log("info", f"Rollout {values['rollouts']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
 
     with (
         watch.watched("actor", name, run, metrics),
         on_signal() as stop,
-        ZenohTransport(connect=[connect], wait=patience, credentials=credentials) as transport,
+        urls.connect(connect, "actor", certs=certs, wait=patience) as transport,
     ):
-        say("info", f"Acts for {connect}.")
+        log("info", f"Connected to the learner at {connect}.")
         run_actor(
             transport,
             run=run,
@@ -65,8 +65,8 @@ def actor(
             physics=physics,
             threads=threads or os.cpu_count() or 1,
             patience=patience,
-            on_rollout=made,
-            journal=Journal(audit, lambda text: say("error", text)) if audit else None,
+            on_rollout=report,
+            journal=Journal(audit, lambda text: log("error", text)) if audit else None,
         )
         return stop.exit_code
 

@@ -1,4 +1,4 @@
-"""`congrasp audit`: what became of every rollout of a run."""
+"""`congrasp audit`: the outcome of every rollout of a run."""
 
 import pathlib
 from typing import Annotated
@@ -9,7 +9,7 @@ import tyro
 def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tuple[pathlib.Path, ...] = ()) -> int:
     """Compares the journals of a run's actors and of its learner: was every accepted rollout used once, and whole?
 
-    Exits with 1 if one was lost, duplicated, torn or invented.
+    Exits with 1 if one was lost, duplicated, corrupted or unmatched.
 
     Args:
       run_dir: Directory of the run.

@@ -1,4 +1,4 @@
-"""Benchmarks, as ratios against a reference in the same run, and what a run does when it is told to end."""
+"""Benchmarks, as ratios against a reference in the same run, and how a run ends on a signal."""
 
 import pathlib
 
@@ -11,7 +11,7 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
     The bare `native` engine goes through the states that the actor has just gone through, with nothing but `mj_step`.
 
     Args:
-      environments: Worlds that run side by side.
+      environments: Environments that run side by side.
       threads: Threads of the native engine; 0 takes all cores.
       repeats: Measurements of each, alternating; medians and their ratio are printed, and the ratio of the best.
       engines: Engines to measure; those that the machine is made for if none is named.
@@ -32,53 +32,26 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
       concurrency: Clients at the same time.
       states: States in one query, up to 64; each gets an answer.
     """
-    import tempfile
+    from services.bench.query import bench_query
 
-    from common.policy import bundle as bundles
-    from services.serve.client import PolicyClient
-    from services.serve.load import example_episode, measure, processor_seconds, serving, wait_until_ready
-    from services.train.command import untrained
-    from services.train.presets import get_preset
-
-    with tempfile.TemporaryDirectory() as folder:
-        policy = pathlib.Path(folder, "policy.safetensors")
-        bundles.save(untrained(get_preset("quickstart")), policy)
-        with serving(policy, pathlib.Path(folder, "serve.log")) as (endpoint, server):
-            episode = example_episode(1_000_000)
-            with PolicyClient(endpoint, wait=60.0) as client:
-                wait_until_ready(client)
-            before = processor_seconds(server)
-            result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0, states=states)
-            result["server_cpu_ms"] = 1e3 * (processor_seconds(server) - before) / repeat / states
-    print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
+    bench_query(repeat, concurrency, states)
     return 0
 
 
 def shutdown(tries: int = 100, within: float = 45.0, seed: int = 0) -> int:
     """Whether a run with a learner and two actors ends within 5 s of a signal, and leaves no process behind.
 
-    Starts one again and again, and sends SIGINT and SIGTERM in turn at random moments, also while it starts. The exit
+    Starts one again and again, and sends SIGINT and SIGTERM in turn at random times, also while it starts. The exit
     code is 1 if any took longer or left something.
 
     Args:
       tries: How often.
-      within: Seconds in which the moments lie; after some 30 it trains.
-      seed: Seed of the moments.
+      within: Seconds in which the times lie; after some 30 it trains.
+      seed: Seed of the times.
     """
-    from rich.progress import track
+    from services.bench.shutdown import bench_shutdown
 
-    from services.bench.drain import Try, attempts, summary
-
-    results: list[Try] = []
-    try:
-        for one in track(attempts(tries, within, seed), "shutting down", total=tries):
-            results.append(one)
-            if not one.fine:
-                left = f", left behind: {'; '.join(one.orphans)}" if one.orphans else ""
-                print(f"{one.signal} after {one.after:.1f} s: took {one.seconds:.1f} s{left}", flush=True)
-    finally:
-        print(summary(results), flush=True)
-    return 0 if all(one.fine for one in results) else 1
+    return 0 if bench_shutdown(tries, within, seed) else 1
 
 
 def security(repeats: int = 5) -> int:
@@ -90,17 +63,9 @@ def security(repeats: int = 5) -> int:
     Args:
       repeats: Measurements of each, alternating; medians are printed.
     """
-    from services.bench.security import measure
+    from services.bench.security import bench_security
 
-    found = measure(repeats)
-    plain, secure, flooded = (found[f"{name}_mb_per_s"] for name in ("plain", "secure", "flood"))
-    print(
-        f"a request of 100 bytes: {found['secure_query_ms']:.2f} ms secured, {found['plain_query_ms']:.2f} ms plain\n"
-        f"a rollout of 8 MB:      {secure:.0f} MB/s secured, {plain:.0f} MB/s plain (ratio {secure / plain:.2f})\n"
-        f"the same in a flood:    {flooded:.0f} MB/s (ratio {flooded / secure:.2f}), while "
-        f"{found['flood_turned_away']:.0f} requests were turned away\n"
-        f"opening the learner:    {found['secure_open_ms']:.0f} ms secured, {found['plain_open_ms']:.0f} ms plain"
-    )
+    bench_security(repeats)
     return 0
 
 
@@ -114,17 +79,9 @@ def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: 
       actors: Actor processes that wait for weights.
       versions: Publications of weights, four a second.
     """
-    from services.bench.transport import measure_ingest, measure_weights
+    from services.bench.transport import bench_transport
 
-    ours, queries, bare = measure_ingest(senders, seconds, repeats)
-    print(
-        f"rollouts of 8 MB: {ours:.0f} MB/s into the learner, {queries:.0f} MB/s as bare Zenoh queries, "
-        f"{bare:.0f} MB/s by PUSH/PULL (ratios {ours / queries:.2f} and {ours / bare:.2f})",
-        flush=True,
-    )
-    delays = measure_weights(actors, versions, 4.0)
-    p50, p99 = (1e3 * delays[int(share * (len(delays) - 1))] for share in (0.5, 0.99))
-    print(f"weights of 4 MB to {actors} actors: p50 {p50:.0f} ms, p99 {p99:.0f} ms, longest {1e3 * delays[-1]:.0f} ms")
+    bench_transport(senders, seconds, repeats, actors, versions)
     return 0
 
 

@@ -43,7 +43,8 @@ def issue(
 
     Args:
       folder: Folder of the authority.
-      role: Learner, actor, server (of a policy), client (of a policy server) or observer (status, recorder).
+      role: Certificate role: learner, actor, server (of a policy), client (of a policy server) or observer (status,
+        recorder).
       number: Tells the certificates of a role apart; the lowest that is free by default.
       host: Names and addresses under which others will connect to it (learner and server).
       days: Days until it expires.

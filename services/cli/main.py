@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
 from common.errors import CongraspError
-from services.ops.logs import say_error
+from services.ops.logs import log_error
 from services.ops.shutdown import follow_parent, on_signal
 
 COMMANDS = {
@@ -37,7 +37,7 @@ COMMANDS = {
     "render": "draw the hand, or an episode of a run",
     "view": "the constraint studio and a window on a training, in the browser",
     "status": "who works on a run, and how it goes",
-    "audit": "what became of every rollout of a run",
+    "audit": "the outcome of every rollout of a run",
     "bench": "benchmarks, as ratios against a reference",
     "certs": "certificates for mutual TLS between the processes of a run",
     "doctor": "what is wrong with this machine or installation",
@@ -130,7 +130,8 @@ def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
         return lambda rest: tyro.extras.subcommand_cli_from_dict(
             commands, prog=prog, description=description, args=rest
         )
-    return lambda rest: tyro.cli(_deferred(module.COMMAND), prog=prog, args=rest)
+    defaults: Callable[[list[str]], dict[str, Any]] = getattr(module, "defaults", lambda rest: {})
+    return lambda rest: tyro.cli(functools.partial(_deferred(module.COMMAND), **defaults(rest)), prog=prog, args=rest)
 
 
 def _deferred(command: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
@@ -188,7 +189,7 @@ def _prepare_environment() -> None:
 def _complain(text: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    if say_error(text):
+    if log_error(text):
         return code
     _last_words(sys.stderr, f"congrasp: error: {text}\n")
     return code

@@ -5,9 +5,11 @@ from typing import Annotated
 
 import tyro
 
+from common.transport.ports import SERVER_URL
+
 
 def query(
-    connect: str = "tcp/127.0.0.1:7457",
+    connect: str = SERVER_URL,
     name: str = "policy",
     object_seed: int = 1_000_000,
     repeat: int = 1,
@@ -35,15 +37,12 @@ def query(
     import json as json_module
 
     from common.errors import CongraspError
-    from services.ops.access import credentials
     from services.serve.client import PolicyClient
     from services.serve.load import example_episode, measure, one_answer
 
     for name_, value in (("repeat", repeat), ("concurrency", concurrency), ("states", states)):
         if value < 1:
             raise CongraspError(f"--{name_} {value} must be at least 1.")
-    mine = credentials(certs, "client")
-    certs = mine.folder if mine else None
     if health:
         with PolicyClient(connect, name, timeout=timeout, wait=timeout, certs=certs) as client:
             print(json_module.dumps(client.health()))

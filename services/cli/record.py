@@ -1,12 +1,13 @@
-"""`congrasp record`."""
+"""`congrasp record`: a run as MCAP."""
 
 import pathlib
 
+from common.transport.ports import LEARNER_URL
 from services.ops.logs import LogFormat
 
 
 def record(
-    connect: str = "tcp/127.0.0.1:7447",
+    connect: str = LEARNER_URL,
     run: str = "run",
     out: pathlib.Path = pathlib.Path("recordings"),
     live: int | None = None,
@@ -29,13 +30,12 @@ def record(
       certs: Folder of an observer's certificate (congrasp certs).
     """
     from common.transport.keys import process_name
-    from services.ops.access import credentials
     from services.ops.logs import logging_as
     from services.record.process import record_run
 
-    structured, mine = log_format == "json", credentials(certs, "observer")
+    structured = log_format == "json"
     with logging_as(log_format, role="recorder", id=process_name("recorder"), run=run):
-        return record_run(connect, run, out, live=live, duration=duration, structured=structured, credentials=mine)
+        return record_run(connect, run, out, live=live, duration=duration, structured=structured, certs=certs)
 
 
 COMMAND = record

@@ -2,6 +2,7 @@
 
 import pathlib
 
+from common.transport.ports import SERVER_URL
 from services.cli.watch import Watch, Watched
 
 
@@ -10,7 +11,7 @@ def serve(
     hand: str = "human",
     connect: str = "",
     run: str = "quickstart",
-    listen: str = "tcp/127.0.0.1:7457",
+    listen: str = SERVER_URL,
     name: str = "policy",
     watch: Watched = Watch(),  # noqa: B008
     certs: pathlib.Path | None = None,
@@ -29,6 +30,7 @@ def serve(
       certs: Folder of a server's certificate (congrasp certs), for its clients and for the learner.
       insecure: Listen beyond loopback without certificates.
     """
+    import contextlib
     import os
     import secrets
 
@@ -39,10 +41,9 @@ def serve(
 
     from common.errors import CongraspError
     from common.policy.pretrained import policy_file
+    from common.transport import urls
     from common.transport.keys import Keys
-    from common.transport.zenoh_transport import ZenohTransport
-    from services.ops.access import listening
-    from services.ops.logs import say
+    from services.ops.logs import log
     from services.ops.metrics import ServerMetrics
     from services.ops.shutdown import on_signal
     from services.serve.server import PolicyServer, follow_file, follow_run
@@ -52,22 +53,26 @@ def serve(
             f"The server can follow either {policy} or {connect}.", "Give one of --policy and --connect."
         )
     jax.config.update("jax_cpu_enable_async_dispatch", False)  # ... and no handing over
-    metrics, credentials = ServerMetrics(), listening(listen, certs, "server", insecure=insecure)
-    with watch.watched("server", name, run if connect else "", metrics), on_signal() as stop:
-        upstream = ZenohTransport(connect=[connect], credentials=credentials) if connect else None
-        if upstream:
+    metrics = ServerMetrics()
+    with (
+        watch.watched("server", name, run if connect else "", metrics),
+        on_signal() as stop,
+        contextlib.ExitStack() as stack,
+    ):
+        if connect:
+            upstream = stack.enter_context(urls.connect(connect, "server", certs=certs))
             upstream.declare_alive(Keys(run).alive("server", name, secrets.token_hex(4)))
-        source = follow_run(upstream, run) if upstream else follow_file(policy_file(policy, hand))
-        with ZenohTransport(listen=[listen], flows=("policy",), credentials=credentials) as transport:
-            server = PolicyServer(transport, name, source, on_answer=metrics.answer, on_batch=metrics.batch)
-            metrics.health = server.health
-            health = server.health()
-            say("info", f"Serving '{name}' at {listen}: hand {health['hand']}, version {health['version']}.")
-            stop.wait()
-            server.close()
-        if upstream:
-            upstream.close()
-        return stop.exit_code
+            source = follow_run(upstream, run)
+        else:
+            source = follow_file(policy_file(policy, hand))
+        transport = stack.enter_context(urls.listen(listen, "server", certs=certs, insecure=insecure))
+        server = PolicyServer(transport, name, source, on_answer=metrics.answer, on_batch=metrics.batch)
+        metrics.health = server.health
+        health = server.health()
+        log("info", f"Serving '{name}' at {listen}: hand {health['hand']}, version {health['version']}.")
+        stop.wait()
+        server.close()
+    return stop.exit_code
 
 
 COMMAND = serve

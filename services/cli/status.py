@@ -5,37 +5,38 @@ from typing import Annotated
 
 import tyro
 
+from common.transport.ports import LEARNER_URL
+
 
 def status(
-    connect: str = "tcp/127.0.0.1:7447",
+    connect: str = LEARNER_URL,
     run: str = "quickstart",
     watch: bool = False,
     every: float = 1.0,
     certs: pathlib.Path | None = None,
     json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Who works on a run, and how it goes: versions, lag, rates, and what became of tickets and rollouts.
+    """Who works on a run, and how it goes: versions, lag, rates, and the outcomes of tickets and rollouts.
 
-    The exit code is 1 where the ledger does not add up.
+    The exit code is 1 where the counters do not add up.
 
     Args:
       connect: The learner's endpoint.
       run: Name of the run.
-      watch: Go on until Ctrl-C, also while the learner is away.
+      watch: Go on until Ctrl-C, also while the learner is disconnected.
       every: Seconds between two looks with --watch.
       certs: Folder of an observer's certificate (congrasp certs).
-      json: Print JSON instead of tables; with --watch one object a line, and null while the learner is away.
+      json: Print JSON instead of tables; with --watch one object a line, and null while the learner is disconnected.
     """
     import json as json_module
 
     from rich.console import Console
     from rich.live import Live
 
-    from common.transport.zenoh_transport import ZenohTransport
-    from services.ops.access import credentials
+    from common.transport import urls
     from services.ops.status import ask, follow, tables
 
-    with ZenohTransport(connect=[connect], credentials=credentials(certs, "observer")) as transport:
+    with urls.connect(connect, "observer", certs=certs) as transport:
         found = ask(transport, run)
         if not watch:
             if json:
@@ -48,7 +49,7 @@ def status(
         else:
             with Live(tables(found), auto_refresh=False) as live:
                 for now in follow(transport, run, every):
-                    live.update(tables(now) if now else f"The learner of '{run}' is away …", refresh=True)
+                    live.update(tables(now) if now else f"The learner of '{run}' is disconnected …", refresh=True)
         return 1 if found["warnings"] else 0
 
 

@@ -1,7 +1,7 @@
-"""Compares what actors were told with what the learner did: was every accepted rollout used once, and as it was sent?
+"""Compares the answers that actors got with what the learner did: was every accepted rollout used once, as sent?
 
-Actors write down what they made, with a checksum, and every answer to it; the learner writes down what it used, with a
-checksum taken when the update began, what it dropped, and where its lives began and ended. Neither reads the other's
+Actors note what they made, with a checksum, and every answer to it; the learner notes what it used, with a
+checksum taken when the update began, what it dropped, and where its sessions began and ended. Neither reads the other's
 journal; nothing here uses the code that decided.
 """
 
@@ -16,7 +16,7 @@ from learner.audit import Used, replay
 
 Identity = tuple[str, str, int]
 """Actor, incarnation and sequence number."""
-FAULTS = ("lost", "duplicated", "torn", "invented")
+FAULTS = ("lost", "duplicated", "corrupted", "unmatched")
 
 
 class Made(NamedTuple):
@@ -25,16 +25,16 @@ class Made(NamedTuple):
     version: int
     checksum: str
     answers: list[tuple[str, str]]
-    """(outcome, life of the learner that gave it)."""
+    """(outcome, session of the learner that gave it)."""
 
 
 class Report(NamedTuple):
-    """What became of the rollouts."""
+    """Outcome of every rollout of a run."""
 
     counts: dict[str, int]
-    """How many were made and accepted, and what became of those that were accepted; the last ones are faults."""
+    """How many were made and accepted, and the outcomes of those that were accepted; the last ones are faults."""
     faults: list[str]
-    """A line for each rollout that was lost, duplicated, torn or invented."""
+    """A line for each rollout that was lost, duplicated, corrupted or unmatched."""
     lag_mean: float
     lag_max: int
     max_staleness: int
@@ -68,7 +68,7 @@ def audit(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
 
 
 def _made(paths: Iterable[pathlib.Path]) -> tuple[dict[Identity, Made], int]:
-    """What actors made and were told, and the holes in their journals."""
+    """What actors made, the answers that they got, and the holes in their journals."""
     made: dict[Identity, Made] = {}
     holes = 0
     for path in paths:
@@ -85,12 +85,13 @@ def _made(paths: Iterable[pathlib.Path]) -> tuple[dict[Identity, Made], int]:
 
 
 def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], holes: int) -> Report:
+    """Judges every rollout by what its actor was told and by what the learner's sessions did with it."""
     standing: dict[Identity, list[Used]] = collections.defaultdict(list)
     undone: set[Identity] = set()
     dropped: set[Identity] = set()
     waiting: set[Identity] = set()
-    lives = [entry for book in books for entry in book if "life" in entry]
-    open_lives = {[entry["life"] for entry in book if "life" in entry][-1] for book in books if "end" not in book[-1]}
+    sessions = [entry for book in books for entry in book if "life" in entry]
+    running = {[entry["life"] for entry in book if "life" in entry][-1] for book in books if "end" not in book[-1]}
     for book in books:
         stands, lost = replay(book)
         for use in stands:
@@ -104,6 +105,7 @@ def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], 
     faults: list[str] = []
 
     def fault(kind: str, identity: Identity, text: str) -> None:
+        """Counts a fault, and notes which rollout has it."""
         counts[kind] += 1
         faults.append(f"{'/'.join(map(str, identity))}: {text}")
 
@@ -113,9 +115,9 @@ def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], 
             counts["of actors without a journal"] += 1
             continue
         if identity not in made:
-            fault("invented", identity, "used, but never made")
+            fault("unmatched", identity, "used, but never made")
         elif any(use.checksum != made[identity].checksum for use in uses):
-            fault("torn", identity, "used with another content than it was made with")
+            fault("corrupted", identity, "used with another content than it was made with")
         if len(uses) > 1:
             fault("duplicated", identity, f"used {len(uses)} times")
     for identity, rollout in made.items():
@@ -128,11 +130,11 @@ def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], 
             counts["used"] += 1
         elif identity in dropped:
             counts["dropped as too old"] += 1
-        elif outcomes[-1] == "stale" or _too_old_to_return(rollout, lives):
+        elif outcomes[-1] == "stale" or _too_old_to_return(rollout, sessions):
             counts["undone" if identity in undone else "too old after a restart"] += 1
         elif identity in undone:
             counts["undone"] += 1
-        elif identity in waiting or rollout.answers[-1][1] in open_lives:
+        elif identity in waiting or rollout.answers[-1][1] in running:
             counts["waiting"] += 1
         elif holes:
             counts["not in the journals"] += 1
@@ -144,13 +146,15 @@ def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], 
         faults,
         sum(lags) / max(1, len(lags)),
         max(lags, default=0),
-        max((life["max_staleness"] for life in lives), default=0),
+        max((session["max_staleness"] for session in sessions), default=0),
         holes,
     )
 
 
-def _too_old_to_return(rollout: Made, lives: Sequence[dict[str, Any]]) -> bool:
-    """Whether the checkpoint that followed the life which accepted a rollout is too far from the rollout's policy."""
-    order = [life["life"] for life in lives]
-    after = order.index(rollout.answers[-1][1]) + 1 if rollout.answers[-1][1] in order else len(lives)
-    return any(abs(rollout.version - life["version"]) > life["max_staleness"] for life in lives[after : after + 1])
+def _too_old_to_return(rollout: Made, sessions: Sequence[dict[str, Any]]) -> bool:
+    """Whether the checkpoint after the session that accepted a rollout is too far from the rollout's policy."""
+    order = [session["life"] for session in sessions]
+    after = order.index(rollout.answers[-1][1]) + 1 if rollout.answers[-1][1] in order else len(sessions)
+    return any(
+        abs(rollout.version - session["version"]) > session["max_staleness"] for session in sessions[after : after + 1]
+    )

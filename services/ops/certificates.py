@@ -11,9 +11,7 @@ import os
 import pathlib
 import secrets
 import shutil
-import ssl
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -21,36 +19,14 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from common.errors import CongraspError
-from common.transport.security import CA_FILE, CERTIFICATE_FILE, KEY_FILE, LISTENERS, NUMBERS, ROLES, Credentials
+from common.transport.certificates import Certificate, load, read
+from common.transport.security import CA_FILE, CERTIFICATE_FILE, KEY_FILE, LISTENERS, NUMBERS, ROLES
 
 CA_KEY_FILE = "ca.key"
 CA_DAYS, DAYS = 3650, 365
 _ORGANIZATION = "congrasp"
 _LOOPBACK = ("localhost", "127.0.0.1")
 _CLOCKS = datetime.timedelta(minutes=5)  # by which the clocks of two machines may differ
-
-
-class Certificate(NamedTuple):
-    """What a certificate says."""
-
-    role: str
-    """One of `ROLES`; `ca` for the authority."""
-    number: int
-    """Tells the certificates of a role apart."""
-    hosts: tuple[str, ...]
-    """Names and addresses under which its owner may listen."""
-    expires: datetime.datetime
-    """In UTC."""
-
-    @property
-    def name(self) -> str:
-        """The common name."""
-        return f"{self.role}.{self.number}" if self.role != "ca" else "ca"
-
-    @property
-    def days(self) -> float:
-        """Days that are left; negative once it has expired."""
-        return (self.expires - datetime.datetime.now(datetime.UTC)).total_seconds() / 86400
 
 
 def create_authority(folder: pathlib.Path, *, days: float = CA_DAYS, force: bool = False) -> Certificate:
@@ -117,9 +93,9 @@ def issue(
       CongraspError: there is no authority, the certificate is there already, or a value makes no sense.
     """
     if role not in ROLES:
-        raise CongraspError(f"There is no role {ascii(role)[:40]}.", f"Choose one of: {', '.join(ROLES)}.")
+        raise CongraspError(f"There is no certificate role {ascii(role)[:40]}.", f"Choose one of: {', '.join(ROLES)}.")
     if hosts and role not in LISTENERS:
-        raise CongraspError(f"A certificate for the role {role} names no hosts.", f"Only {' and '.join(LISTENERS)} do.")
+        raise CongraspError(f"A certificate of the role {role} names no hosts.", f"Only {' and '.join(LISTENERS)} do.")
     if number is None:
         number = next((i for i in range(NUMBERS) if not (folder / f"{role}.{i}").exists()), NUMBERS)
     if not 0 <= number < NUMBERS:
@@ -156,29 +132,6 @@ def issue(
     return target
 
 
-def read(path: pathlib.Path) -> Certificate:
-    """What a certificate's file says.
-
-    Raises:
-      CongraspError: it cannot be read, or is no certificate of this project.
-    """
-    made = _load(path)
-    names = made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-    if not names:
-        return Certificate("ca", 0, (), made.not_valid_after_utc)
-    role, _, number = str(names[0].value).partition(".")
-    if role not in ROLES or not number.isascii() or not number.isdigit() or int(number) >= NUMBERS:
-        raise CongraspError(
-            f"{path} is a certificate for {ascii(names[0].value)[:60]}, which is no role and number.",
-            "Issue one with 'congrasp certs issue'.",
-        )
-    hosts: list[str] = []
-    for extension in made.extensions:
-        if isinstance(extension.value, x509.SubjectAlternativeName):
-            hosts = [str(name.value) for name in extension.value]
-    return Certificate(role, int(number), tuple(hosts), made.not_valid_after_utc)
-
-
 def certificates(folder: pathlib.Path) -> list[Certificate]:
     """All certificates in a folder, the authority's first.
 
@@ -192,47 +145,6 @@ def certificates(folder: pathlib.Path) -> list[Certificate]:
     return sorted(found, key=lambda one: (one.role != "ca", one.role, one.number))
 
 
-def find_credentials(folder: pathlib.Path, role: str) -> tuple[Credentials, Certificate]:
-    """The credentials with which a command runs.
-
-    Args:
-      folder: one that was issued for the role, or the authority's, whose number 0 is then taken.
-      role: what the command runs as.
-
-    Raises:
-      CongraspError: they are missing, damaged, expired, or another role's.
-    """
-    if not (folder / CERTIFICATE_FILE).exists() and (folder / f"{role}.0").exists():
-        folder = folder / f"{role}.0"
-    credentials = Credentials(folder, role)
-    for path in (credentials.ca, credentials.certificate, credentials.key):
-        if not os.access(path, os.R_OK):
-            raise CongraspError(f"{path} is missing or cannot be read.", f"Run: {_hint(folder, role)}")
-    certificate = read(credentials.certificate)
-    if certificate.role != role:
-        raise CongraspError(
-            f"{credentials.certificate} is for the role {certificate.role}, not {role}.", f"Run: {_hint(folder, role)}"
-        )
-    for expires, path in (
-        (certificate.expires, credentials.certificate),
-        (read(credentials.ca).expires, credentials.ca),
-    ):
-        if expires <= datetime.datetime.now(datetime.UTC):
-            raise CongraspError(f"{path} expired on {expires:%Y-%m-%d %H:%M} UTC.", f"Run: {_hint(folder, role)}")
-    try:
-        ssl.create_default_context().load_cert_chain(credentials.certificate, credentials.key)
-    except (ssl.SSLError, OSError):
-        raise CongraspError(
-            f"{credentials.key} is not the key of {credentials.certificate}.", f"Run: {_hint(folder, role)}"
-        ) from None
-    return credentials, certificate
-
-
-def _hint(folder: pathlib.Path, role: str) -> str:
-    where = folder.parent if folder.name.partition(".")[0] in ROLES else folder
-    return f"congrasp certs issue {where} --role {role}"
-
-
 def _builder(
     subject: x509.Name,
     issuer: x509.Name,
@@ -240,6 +152,7 @@ def _builder(
     days: float,
     at_most: datetime.datetime | None = None,
 ) -> x509.CertificateBuilder:
+    """What all certificates have: names, key, serial number and the time for which they are good."""
     now = datetime.datetime.now(datetime.UTC)
     if not -CA_DAYS <= days <= 2 * CA_DAYS:
         raise CongraspError(f"A certificate cannot be good for {days:g} days.", f"Choose at most {2 * CA_DAYS}.")
@@ -257,6 +170,7 @@ def _builder(
 
 
 def _host(name: str) -> x509.GeneralName:
+    """A host's name or address as certificates hold it."""
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:
@@ -270,24 +184,17 @@ def _host(name: str) -> x509.GeneralName:
 
 
 def _authority(folder: pathlib.Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """Certificate and key of the authority in a folder."""
     try:
         key = serialization.load_pem_private_key((folder / CA_KEY_FILE).read_bytes(), None)
     except (OSError, ValueError):
         raise CongraspError(f"{folder} holds no authority.", f"Make one: congrasp certs init {folder}") from None
     assert isinstance(key, ec.EllipticCurvePrivateKey)
-    return _load(folder / CA_FILE), key
-
-
-def _load(path: pathlib.Path) -> x509.Certificate:
-    try:
-        return x509.load_pem_x509_certificate(path.read_bytes())
-    except (OSError, ValueError):
-        raise CongraspError(
-            f"{path} is missing or is no certificate.", "Make it with 'congrasp certs', or correct the path."
-        ) from None
+    return load(folder / CA_FILE), key
 
 
 def _write_secret(path: pathlib.Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """Writes a key that its owner alone can read."""
     path.unlink(missing_ok=True)
     text = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()

@@ -1,4 +1,4 @@
-"""What can be wrong with a machine or an installation, in words."""
+"""Checks of a machine and an installation, each with what to do where it fails."""
 
 import importlib.metadata
 import os
@@ -16,16 +16,16 @@ from typing import NamedTuple
 from packaging.requirements import Requirement
 
 from common.errors import CongraspError
+from common.transport import urls
 from common.transport.keys import FLOWS
-from common.transport.zenoh_transport import ZenohTransport
-from services.ops.access import credentials
+from common.transport.ports import LEARNER_URL
 from services.ops.certificates import certificates
 from services.ops.status import ask
 
 _PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "flax", "eclipse-zenoh")
 _PAIRS = (("mujoco", "mujoco-mjx"), ("jax", "jaxlib"))
 """Packages whose versions must be the same."""
-_PORT = 7447
+_PORT = int(LEARNER_URL.rpartition(":")[2])
 _LEAST_GIB = 2.0
 _LEAST_MB_S, _SAMPLE = 5.0, 16 << 20
 _DRIVER = 580
@@ -48,7 +48,7 @@ def examine(
     folder: pathlib.Path = pathlib.Path(),
     certs: pathlib.Path | None = None,
 ) -> list[Finding]:
-    """Looks at everything; nothing is left changed.
+    """Runs all checks; nothing is left changed.
 
     Args:
       connect: a learner's endpoint that should be reachable, if any.
@@ -75,6 +75,7 @@ def _tried(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
 
 
 def _python() -> Iterator[Finding]:
+    """The version of Python."""
     fine = (3, 11) <= sys.version_info[:2] < (3, 14)
     yield Finding("python", fine, platform.python_version() + ("" if fine else ": 3.11, 3.12 or 3.13 is needed"))
 
@@ -117,7 +118,7 @@ def _gpu() -> Iterator[Finding]:
     try:
         lines = subprocess.run(query, capture_output=True, text=True, timeout=30, check=True).stdout.splitlines()
     except (OSError, subprocess.SubprocessError):
-        yield Finding("gpu", False, "nvidia-smi does not answer: install the NVIDIA driver")
+        yield Finding("gpu", False, "nvidia-smi does not respond: install the NVIDIA driver")
         return
     for number, line in enumerate(lines):
         name, memory, used, driver = (part.strip() for part in line.split(","))
@@ -127,6 +128,7 @@ def _gpu() -> Iterator[Finding]:
 
 
 def _jax() -> Iterator[Finding]:
+    """That JAX sees the machine's devices, and that a small program runs."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a learner may be at work on this GPU
     import jax
     import jax.numpy as jnp
@@ -141,6 +143,7 @@ def _jax() -> Iterator[Finding]:
 
 
 def _warp() -> Iterator[Finding]:
+    """That Warp sees the GPU, and that a small kernel runs."""
     if not os.path.exists(_NVIDIA):
         return
     import warp as wp
@@ -166,6 +169,7 @@ def _warp() -> Iterator[Finding]:
 
 
 def _ports() -> Iterator[Finding]:
+    """Those that a learner takes by default."""
     last = _PORT + len(FLOWS) - 1
     for port in range(_PORT, last + 1):
         with socket.socket() as probe:
@@ -230,8 +234,7 @@ def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
 def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Iterator[Finding]:
     """Whether a learner answers, and how far its clock is from this one."""
     try:
-        mine = credentials(certs, "observer")
-        with ZenohTransport(connect=[connect], wait=5.0, credentials=mine) as transport:
+        with urls.connect(connect, "observer", certs=certs, wait=5.0) as transport:
             ask(transport, run)
             began = time.time()
             status = ask(transport, run)

@@ -1,4 +1,4 @@
-"""What a role says of itself while it runs: lines for people, or one JSON object a line for a log collector."""
+"""Logs of a role: lines for people, or one JSON object a line for a log collector."""
 
 import contextlib
 import datetime
@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 LogFormat = Literal["text", "json"]
-_log = logging.getLogger("congrasp")
+_logger = logging.getLogger("congrasp")
 
 
 class JsonLines(logging.Formatter):
@@ -44,7 +44,7 @@ class Lines(logging.Formatter):
 
 @contextlib.contextmanager
 def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[None]:
-    """Writes what this process says to the standard output while the block runs, libraries' warnings among it.
+    """Writes the log of this process to the standard output while the block runs, libraries' warnings among it.
 
     A full disk under the output costs the lines, and not the process.
     """
@@ -54,21 +54,21 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
     )
     handler.handleError = lambda record: None  # type: ignore[method-assign]
     root.addHandler(handler)
-    _log.setLevel(logging.INFO)
+    _logger.setLevel(logging.INFO)
     yield
-    # After an exception the handler stays: `say_error` has the last words.
+    # After an exception the handler stays: `log_error` may still write why.
     root.removeHandler(handler)
 
 
-def say(level: str, text: str, fields: Mapping[str, float] | None = None) -> None:
-    """Says a line; levels: info, warning, error, fatal. Numbers that are not finite are left out of the fields."""
+def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> None:
+    """Writes a line; levels: info, warning, error, fatal. Numbers that are not finite are left out of the fields."""
     finite = {name: value for name, value in (fields or {}).items() if abs(value) < float("inf")}
-    _log.log(logging.getLevelNamesMapping()[level.upper()], text, extra={"fields": finite})
+    _logger.log(logging.getLevelNamesMapping()[level.upper()], text, extra={"fields": finite})
 
 
-def say_error(text: str) -> bool:
-    """Says why the process ends if its lines are JSON; whether they are."""
+def log_error(text: str) -> bool:
+    """Writes why the process ends if its lines are JSON; whether they are."""
     structured = any(isinstance(handler.formatter, JsonLines) for handler in logging.getLogger().handlers)
     if structured:
-        say("error", text)
+        log("error", text)
     return structured

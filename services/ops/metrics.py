@@ -50,16 +50,16 @@ def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
 
 
 class LearnerMetrics:
-    """A learner's status at the moment of the scrape, and the figures of its last update."""
+    """A learner's status at the moment of the scrape, and the metrics of its last update."""
 
     def __init__(self, ask: Callable[[], Mapping[str, Any]]):
         """The function returns what `services.ops.status.ask` does."""
         self._ask = ask
-        self._figures: Mapping[str, float] = {}
+        self._values: Mapping[str, float] = {}
 
-    def update(self, figures: Mapping[str, float]) -> None:
-        """Takes the figures of an update."""
-        self._figures = figures
+    def update(self, values: Mapping[str, float]) -> None:
+        """Takes the metrics of an update."""
+        self._values = values
 
     def describe(self) -> Iterable[Metric]:
         """Nothing: what there is depends on the run."""
@@ -75,24 +75,23 @@ class LearnerMetrics:
         yield GaugeMetricFamily("congrasp_learner_ready", "Whether it takes rollouts.", float(status["version"] >= 0))
         yield _gauge("version", "Newest policy version.", status["version"])
         yield _gauge("finished", "Whether the run is over.", status["finished"])
-        yield _gauge("ledger_balanced", "Whether the ledger adds up.", not status["warnings"])
+        yield _gauge("ledger_balanced", "Whether the counters add up.", not status["warnings"])
         yield _gauge("queue_length", "Rollouts that wait.", status["queue"]["length"])
         yield _gauge("queue_limit", "Rollouts that may wait.", status["queue"]["limit"])
         for name, value in status["rates"].items():
             yield _gauge(name, "Over the last ten seconds.", value)
         yield from self._ledger(status["ledger"])
         yield from self._roles(status["roles"])
-        update = _gauge("update", "Figures of the last update, by the names of the log.", labels=["figure"])
-        for name, value in self._figures.items():
+        update = _gauge("update", "Metrics of the last update, by the names of the log.", labels=["figure"])
+        for name, value in self._values.items():
             update.add_metric([name], value)
         yield update
 
     @staticmethod
     def _ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:
-        tickets = CounterMetricFamily("congrasp_learner_tickets", "Tickets by what became of them.", labels=["outcome"])
-        rollouts = CounterMetricFamily(
-            "congrasp_learner_rollouts", "Rollouts by what became of them.", labels=["outcome"]
-        )
+        """Counters of tickets and rollouts."""
+        tickets = CounterMetricFamily("congrasp_learner_tickets", "Tickets by outcome.", labels=["outcome"])
+        rollouts = CounterMetricFamily("congrasp_learner_rollouts", "Rollouts by outcome.", labels=["outcome"])
         for name, value in ledger.items():
             if name in _GAUGES:
                 yield _gauge(*_GAUGES[name], value)
@@ -102,6 +101,7 @@ class LearnerMetrics:
 
     @staticmethod
     def _roles(roles: Iterable[Mapping[str, Any]]) -> Iterator[Metric]:
+        """Processes of the run, and the pace of its actors."""
         alive = _gauge("roles", "Processes of the run.", labels=["role"])
         for role, number in collections.Counter(role["role"] for role in roles).items():
             alive.add_metric([role], number)
@@ -120,6 +120,7 @@ class LearnerMetrics:
 
 
 def _gauge(name: str, help: str, value: float | None = None, labels: Sequence[str] | None = None) -> GaugeMetricFamily:
+    """A gauge of the learner, with its prefix."""
     return GaugeMetricFamily(f"congrasp_learner_{name}", help, None if value is None else float(value), labels)
 
 
@@ -129,9 +130,9 @@ class ActorMetrics:
     def __init__(self) -> None:
         self._last: Mapping[str, float] = {}
 
-    def rollout(self, figures: Mapping[str, float]) -> None:
-        """Takes the figures of a rollout; `rollouts` and `version` among them."""
-        self._last = figures
+    def rollout(self, values: Mapping[str, float]) -> None:
+        """Takes the metrics of a rollout; `rollouts` and `version` among them."""
+        self._last = values
 
     def describe(self) -> Iterable[Metric]:
         """Nothing before the first rollout."""
@@ -152,7 +153,7 @@ class ServerMetrics:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.outcomes: collections.Counter[str] = collections.Counter()
-        """Queries by what was said to them."""
+        """Queries by outcome."""
         self._seconds = Histogram(
             "congrasp_policy_seconds",
             "From the arrival of a query to its answer.",

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 GRACE = 3.5
 """Seconds between a signal and the end of the process at the latest."""
 PARENT_VARIABLE = "CONGRASP_PARENT"
-"""Environment variable by which a process tells its children that they must not outlive it."""
+"""Environment variable by which a process makes its children end with it."""
 _REAP = 0.5  # seconds for all children to be gone
 _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 
@@ -83,8 +83,8 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
         writer.close()
 
 
-def take_along(child: subprocess.Popen[bytes]) -> None:
-    """Names a child that a forced end of this process ends, too."""
+def register_child(child: subprocess.Popen[bytes]) -> None:
+    """Registers a child, which a forced end of this process ends, too."""
     _children.add(child)
 
 

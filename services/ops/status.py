@@ -1,4 +1,4 @@
-"""How a run stands: asks its learner, checks the ledger's sums, and shows the answer as a table."""
+"""The status of a run: asks its learner, checks that its counters add up, and shows them as tables."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -18,22 +18,22 @@ _SUMS = {
     "granted": ("running", "redeemed", "returned", "expired"),
     "accepted": ("consumed", "dropped", "queued"),
 }
-"""Counts of the ledger that are the sums of others: no ticket and no accepted rollout is lost."""
+"""Counters that are the sums of others: no ticket and no accepted rollout is lost."""
 _ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/s", "steps/s")
 
 
 def ask(transport: Transport, run: str) -> dict[str, Any]:
-    """What the learner of a run says, with `warnings` in words.
+    """The status of a run by its learner, with `warnings`: a line for each counter that is wrong.
 
     Raises:
-      TransportError: nobody answers for this run.
+      TransportError: there is no response for this run.
     """
     found = dict(transport.query(Keys(run).status, Message({}, {}), timeout=_TIMEOUT).meta)
     return {**found, "warnings": warnings(found)}
 
 
 def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, Any] | None]:
-    """What the learner says, again and again; None while it is away."""
+    """The status, again and again; None while the learner is disconnected."""
     while True:
         began = time.monotonic()
         try:
@@ -49,20 +49,21 @@ def warnings(status: Mapping[str, Any]) -> list[str]:
     found = []
     for total, parts in _SUMS.items():
         if ledger[total] != sum(ledger[part] for part in parts):
-            found.append(f"The ledger does not add up: {total} {ledger[total]} is not {_sum(ledger, parts)}.")
+            found.append(f"The counters do not add up: {total} {ledger[total]} is not {_sum(ledger, parts)}.")
     if ledger["queued"] != queue["length"]:
-        found.append(f"The ledger says that {ledger['queued']} rollouts wait; in the queue are {queue['length']}.")
+        found.append(f"{ledger['queued']} rollouts are counted as queued; the queue holds {queue['length']}.")
     return found
 
 
 def _sum(ledger: Mapping[str, int], parts: tuple[str, ...]) -> str:
+    """A sum of counters as a formula."""
     return " + ".join(f"{part} {ledger[part]}" for part in parts)
 
 
 def tables(status: Mapping[str, Any]) -> Group:
     """The status for a terminal."""
     ended = ", finished" if status["finished"] else ""
-    roles = Table(title=f"{status['run']}, version {status['version']}, epoch {status['epoch']}{ended}")
+    roles = Table(title=f"{status['run']}, version {status['version']}, run id {status['epoch']}{ended}")
     for column in _ROLE:
         roles.add_column(column, justify="left" if column in _ROLE[:3] else "right")
     for role in status["roles"]:
@@ -70,7 +71,7 @@ def tables(status: Mapping[str, Any]) -> Group:
         rates = (f"{role[rate]:.2f}" if rate in role else "" for rate in ("rollouts_per_second", "steps_per_second"))
         counts = (version, role.get("lag", ""), role.get("rollouts", ""))
         roles.add_row(role["role"], role["id"], role["incarnation"], *map(str, counts), *rates)
-    ledger = Table(title="Ledger: tickets and rollouts")
+    ledger = Table(title="Counters: tickets and rollouts")
     ledger.add_column("count")
     ledger.add_column("number", justify="right")
     ledger.add_column("which is")

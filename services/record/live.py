@@ -84,6 +84,7 @@ class LiveServer:
         self.close()
 
     def _work(self) -> None:
+        """Sends entries when their time comes, and latched ones to new subscribers."""
         while True:
             wait = max(0.0, (self._waiting[0][0] - time.time_ns()) / 1e9) if self._waiting else None
             try:
@@ -102,6 +103,7 @@ class LiveServer:
                 self.left_out[item.channel.topic] += 1
 
     def _send(self, entry: Entry) -> None:
+        """Sends an entry on its channel."""
         if entry.channel not in self._channels:
             self._advertise(entry.channel)
         if entry.channel.latched:

@@ -9,10 +9,9 @@ import time
 from rich.console import Console
 
 from common.errors import CongraspError
+from common.transport import urls
 from common.transport.keys import Keys, process_name
-from common.transport.security import Credentials
-from common.transport.zenoh_transport import ZenohTransport
-from services.ops.logs import say
+from services.ops.logs import log
 from services.record.live import LiveServer
 from services.record.recorder import Recorder
 
@@ -27,7 +26,7 @@ def record_run(
     live: int | None = None,
     duration: float | None = None,
     structured: bool = False,
-    credentials: Credentials | None = None,
+    certs: urls.Certs = None,
 ) -> int:
     """Records until `duration` seconds have passed, Ctrl-C, or, without a live view, the disk refuses.
 
@@ -37,8 +36,8 @@ def record_run(
       out: folder for the files.
       live: port of the live view, or None.
       duration: seconds, or None.
-      structured: speak through the log alone, without a progress line.
-      credentials: of an observer, or None.
+      structured: write to the log alone, without a progress line.
+      certs: folder of an observer's certificate, or None.
 
     Returns:
       Zero.
@@ -47,15 +46,15 @@ def record_run(
       CongraspError: recording stopped, or nothing could be recorded at all.
     """
     console = Console(stderr=True, quiet=structured)
-    complain = functools.partial(say, "warning") if structured else lambda text: console.print(f"congrasp: {text}")
+    warn = functools.partial(log, "warning") if structured else lambda text: console.print(f"congrasp: {text}")
     end = time.monotonic() + duration if duration is not None else None
     with contextlib.ExitStack() as stack:
-        transport = stack.enter_context(ZenohTransport(connect=[connect], credentials=credentials))
+        transport = stack.enter_context(urls.connect(connect, "observer", certs=certs))
         server = stack.enter_context(LiveServer(live)) if live is not None else None
         if server is not None:
             console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")
         sinks = [server] if server else []
-        recorder = stack.enter_context(Recorder(transport, run, out, name="record", sinks=sinks, complain=complain))
+        recorder = stack.enter_context(Recorder(transport, run, out, name="record", sinks=sinks, complain=warn))
         transport.declare_alive(Keys(run).alive("recorder", process_name("recorder"), secrets.token_hex(4)))
         try:
             with console.status(_state(recorder)) as status:
@@ -66,7 +65,7 @@ def record_run(
             recorder.close(_CLOSE)
             for file in recorder.files:
                 if structured:
-                    say("info", f"Wrote {file}.")
+                    log("info", f"Wrote {file}.")
                 else:
                     print(file)
             console.print(_state(recorder))
@@ -78,6 +77,7 @@ def record_run(
 
 
 def _state(recorder: Recorder) -> str:
+    """One line about what was recorded so far."""
     size = sum(file.stat().st_size for file in recorder.files if file.exists())
     return (
         f"{recorder.messages} messages recorded, {size / 1e6:.1f} MB; "

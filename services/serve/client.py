@@ -2,7 +2,6 @@
 
 import math
 import os
-import pathlib
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,10 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from common.errors import CongraspError
+from common.transport import urls
 from common.transport.base import RefusedError
 from common.transport.keys import Keys
-from common.transport.security import Credentials
-from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 
 
@@ -104,8 +102,7 @@ class PolicyClient:
         Raises:
           TransportError: nobody is there.
         """
-        credentials = None if certs is None else Credentials(pathlib.Path(certs), "client")
-        self._transport = ZenohTransport(connect=[connect], flows=("policy",), wait=wait, credentials=credentials)
+        self._transport = urls.connect(connect, "client", certs=certs, wait=wait)
         self._keys, self._hand, self._timeout = Keys(run), hand, timeout
         self._episode: dict[str, np.ndarray] = {}
         self._constraints: list[str] = []

@@ -14,8 +14,8 @@ import numpy as np
 import psutil
 
 from common.errors import CongraspError, TransportError
-from common.transport.ports import free_port
-from services.ops.shutdown import PARENT_VARIABLE, take_along
+from common.transport.ports import local_url
+from services.ops.shutdown import PARENT_VARIABLE, register_child
 from services.serve.client import PolicyClient
 
 
@@ -29,7 +29,7 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]
       policy: the file.
       log: takes what the server prints.
     """
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = local_url()
     command = [sys.executable, "-m", "services.cli.main", "serve", "--policy", str(policy), "--listen", endpoint]
     with log.open("wb") as output:
         server = subprocess.Popen(
@@ -40,7 +40,7 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]
             env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
             start_new_session=True,
         )
-    take_along(server)
+    register_child(server)
     try:
         yield endpoint, server.pid
     finally:
@@ -148,7 +148,7 @@ def measure(
 
 
 def one_answer(client: PolicyClient, episode: dict[str, Any]) -> str:
-    """Asks for the first action of an episode; the answer in words."""
+    """Asks for the first action of an episode; the answer as text."""
     client.reset(**episode["reset"])
     answer = client.act(episode["state"])
     with np.printoptions(precision=3, suppress=True):

@@ -17,7 +17,7 @@ from common.policy.bundle import Acting, PolicyBundle, content_hash
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode
-from services.ops.logs import say
+from services.ops.logs import log
 from services.serve.batching import Batcher, Late, Overloaded
 from services.serve.inference import BATCH_SIZES, Answer, PolicyFunction
 from services.serve.requests import PACKED, STATES_LIMIT, Query
@@ -112,6 +112,7 @@ class PolicyServer:
         self._follower.join(2 * _FOLLOW_SECONDS)
 
     def _act(self, key: str, request: Message) -> "Future[Message]":
+        """Queues a query; the answer comes later."""
         began = time.monotonic()
         try:
             query = self._function.layout.parse(request)
@@ -124,6 +125,7 @@ class PolicyServer:
         return answer
 
     def _finish(self, request: Message, began: float, answer: "Future[Message]", done: "Future[_Answered]") -> None:
+        """Gives a query the outcome of its batch."""
         error = done.exception()
         self._count(error, began)
         if error is None:
@@ -132,11 +134,13 @@ class PolicyServer:
             answer.set_exception(error)
 
     def _count(self, error: BaseException | None, began: float) -> None:
+        """Notes the outcome of a query."""
         outcome = type(error).__name__.lower() if isinstance(error, Overloaded | Late) else "refused"
         self._answered += error is None
         self._on_answer("answered" if error is None else outcome, time.monotonic() - began)
 
     def _message(self, request: Message, answered: "_Answered", seconds: float) -> Message:
+        """The reply: targets in the query's own form, version, times."""
         (vectors, words), held, queued, inferred = answered
         layout = self._function.layout
         meta: dict[str, Any] = {
@@ -157,6 +161,7 @@ class PolicyServer:
 
     @staticmethod
     def _deadline(seconds: Any) -> float:
+        """A query's own deadline in seconds, checked."""
         if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT:
             raise CongraspError(
                 f"The query's 'timeout' is {ascii(seconds)[:40]}.", f"It must be seconds, at most {_MAX_TIMEOUT:g}."
@@ -164,6 +169,7 @@ class PolicyServer:
         return float(seconds)
 
     def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[_Answered | Exception]:
+        """Answers a batch."""
         held, began = self._held, time.monotonic()
         self._on_batch(sum(len(query.vectors) for query in queries))
         answers = self._function(held.acting, queries)
@@ -184,10 +190,11 @@ class PolicyServer:
                 continue  # the learner is away; it may come back
             except CongraspError as error:
                 if str(error) != self._trouble:
-                    say("warning", str(error))
+                    log("warning", str(error))
                 self._trouble = str(error)
 
     def _swap(self, newer: PolicyBundle) -> None:
+        """Takes a newer policy into use; a CongraspError if it is of another kind."""
         old = self._held.bundle
         old.spec.require(newer.spec, "that the server was to change to")
         if newer.task != old.task:
@@ -197,6 +204,7 @@ class PolicyServer:
 
 
 def _hold(bundle: PolicyBundle) -> _Held:
+    """A policy ready for use."""
     return _Held(bundle, content_hash(encode(bundle.to_message())), bundle.acting)
 
 

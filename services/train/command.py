@@ -1,4 +1,4 @@
-"""What `congrasp train` does around training: evaluations, progress, a picture, what to look at next."""
+"""The flow of `congrasp train`: evaluate, train, evaluate again, show the result and what to look at next."""
 
 import contextlib
 import dataclasses
@@ -8,29 +8,31 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from rich.console import Console
 
-from common.config import Board, ObjectsConfig, RunConfig
+from common.config import MetricWriter, ObjectsConfig, PhysicsName, RunConfig
 from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.pretrained import shipped
-from common.transport.zenoh_transport import DEFAULT_ENDPOINT
+from common.transport import urls
+from common.transport.ports import LEARNER_URL
+from common.transport.security import CERTIFICATE_FILE, check_exposure
 from learner.algorithms import make_algorithm
-from learner.run_directory import LOGS, POLICY_FILE, continue_run, create_run
+from learner.run_directory import CONFIG_FILE, LOGS, POLICY_FILE, continue_run, create_run
 from services.evaluate.evaluator import Evaluator
 from services.evaluate.scores import Row
 from services.evaluate.showcase import CONSTRAINTS, showcase
-from services.ops.access import check_training
 from services.ops.shutdown import on_signal
 from services.serve.client import PolicyClient
 from services.serve.load import example_episode, one_answer, serving, wait_until_ready
+from services.train.in_process import train_in_process
 from services.train.presets import PRESETS, easier
-from services.train.train import engine_of, leave_gpus_to, train, train_in_process
+from services.train.processes import engine_of, leave_gpus_to, train
 from services.viz.render import episode_sheet
 from services.viz.sheets import save_png
 
@@ -42,6 +44,22 @@ _SPACE = 64 << 10  # bytes without which a disk is as good as full
 console = Console(highlight=False)
 
 
+class _Plan(NamedTuple):
+    """What the options come to on this machine."""
+
+    ranks: int
+    actors: int
+    """Actor processes of each rank; with none, an actor lives in each learner's process."""
+    physics: PhysicsName
+    gpus: bool
+    """Whether each of several ranks has a GPU of its own."""
+
+    @property
+    def in_process(self) -> bool:
+        """Whether learner and actor live in this process."""
+        return self.actors == 0 and self.ranks == 1
+
+
 def run_training(
     config: RunConfig,
     run_dir: pathlib.Path,
@@ -50,79 +68,51 @@ def run_training(
     resume: bool,
     evaluation: int,
     initial: pathlib.Path | None = None,
-    boards: Sequence[Board] = ("tensorboard",),
+    writers: Sequence[MetricWriter] = ("tensorboard",),
     metrics_port: int = 0,
     listen: str | None = None,
     certs: pathlib.Path | None = None,
     insecure: bool = False,
     ranks: int = 1,
 ) -> int:
-    """Trains, evaluates and shows; returns the exit code. With no actor processes everything is in this one.
+    """Evaluates, trains, evaluates again and shows the result; `services.cli.train` describes the arguments.
 
-    With several ranks each of them has so many actors.
+    Returns:
+      The exit code.
+
+    Raises:
+      CongraspError: the arguments contradict each other, the configuration cannot run, or a process failed for good.
     """
-    if actors is not None and actors < 0:
-        raise CongraspError(f"--actors is {actors}.", "Name a number of actor processes, or 0 for none of their own.")
-    if listen is not None or certs is not None:
-        check_training(listen or DEFAULT_ENDPOINT, certs, insecure=insecure)
-        if actors == 0:
-            raise CongraspError("With --actors 0 nothing listens.", "Leave out --listen and --certs, or --actors.")
-        actors = actors or 2
-    if ranks < 1:
-        raise CongraspError(f"--ranks is {ranks}.", "Name a number of learners from 1 on.")
-    gpus = ranks > 1 and leave_gpus_to(ranks)
-    physics = engine_of(config.physics, gpus)
-    if actors is None:
-        actors = 0 if physics == "warp" else 2
-    if resume:
-        continue_run(run_dir, config)
-        if not (run_dir / "checkpoints" / "latest").exists():
-            raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start it anew in another --run-dir.")
-    else:
-        if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / "config.json").exists():
-            raise CongraspError(f"{run_dir} is not empty and is no run.", "Choose another --run-dir.")
-        _check(config)
-        start = None if initial is None else bundles.load(initial)
-        create_run(run_dir, config, start)
-    console.print(
-        f"[bold]{config.name}[/]: {config.updates} updates of {ranks * _steps_per_update(config)} steps, "
-        f"{ranks * (actors or 1)} actor(s) with {config.environments} hands each on '{physics}' in {run_dir}",
-        soft_wrap=True,
-    )
-    if words := easier(config):
-        preset = f"--preset {config.task.hand if config.task.hand in PRESETS else 'human'}"
-        console.print(
-            f"Easier than the full task: {'; '.join(words)}.\nThe full task is {preset}, for a GPU.",
-            soft_wrap=True,
-        )
+    _check_connections(actors, listen, certs, insecure=insecure)
+    plan = _plan(config, actors, ranks, listens=listen is not None or certs is not None)
+    _prepare(run_dir, config, initial, resume=resume)
+    easier_task = _announce(config, run_dir, plan)
     with on_signal() as stop:
         before = _evaluate(untrained(config), config, evaluation, "before training") if evaluation else []
         began = time.monotonic()
         with _Progress(config, ranks) as progress:
-            if actors == 0 and ranks == 1:
+            if plan.in_process:
                 train_in_process(
                     run_dir,
                     config,
-                    physics=physics,
+                    physics=plan.physics,
                     stop=stop,
                     resume=resume,
-                    boards=boards,
+                    writers=writers,
                     metrics_port=metrics_port,
-                    on_update=lambda values: progress.show(
-                        {"values": values, "actors": 1, "version": int(values["version"])}
-                    ),
+                    on_update=progress.update,
                 )
             else:
-                with _full_disk_said(run_dir):
+                with _full_disk_named(run_dir):
                     train(
                         run_dir,
                         config,
-                        actors=actors,
-                        physics=physics,
+                        actors=plan.actors,
+                        physics=plan.physics,
                         stop=stop,
                         ranks=ranks,
-                        gpus=gpus,
-                        boards=boards,
+                        gpus=plan.gpus,
+                        writers=writers,
                         metrics_port=metrics_port,
                         endpoint=listen,
                         certs=certs,
@@ -134,16 +124,77 @@ def run_training(
             console.print(f"Stopped. Go on with: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
             return stop.exit_code
         console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
-        policy = bundles.load(run_dir / POLICY_FILE)
         if evaluation:
-            after = _evaluate(policy, config, evaluation, "after training")
-            _compare(before, after)
-            _live_query(run_dir, config.task.hand)
-            _picture(policy, config, run_dir)
-            if words and (best := shipped(config.task.hand)):
-                _shipped_picture(best, run_dir)
+            _show(run_dir, config, evaluation, before, pretrained=easier_task)
         _next_steps(run_dir)
     return 0
+
+
+def _check_connections(actors: int | None, listen: str | None, certs: pathlib.Path | None, *, insecure: bool) -> None:
+    """Raises `CongraspError` unless the learner may listen as asked, and all roles have certificates if any has."""
+    if listen is None and certs is None:
+        return
+    if certs is not None and (certs / CERTIFICATE_FILE).exists():
+        raise CongraspError(f"{certs} belongs to one role.", "Name the authority's folder, which holds all of them.")
+    check_exposure(listen or LEARNER_URL, urls.find_credentials(certs, "learner"), insecure=insecure)
+    for role in ("actor", "observer"):
+        urls.find_credentials(certs, role)
+    if actors == 0:
+        raise CongraspError("With --actors 0 nothing listens.", "Leave out --listen and --certs, or --actors.")
+
+
+def _plan(config: RunConfig, actors: int | None, ranks: int, *, listens: bool) -> _Plan:
+    """Engine and numbers of processes; on a GPU one process does everything unless others may connect."""
+    if actors is not None and actors < 0:
+        raise CongraspError(f"--actors is {actors}.", "Name a number of actor processes, or 0 for none of their own.")
+    if ranks < 1:
+        raise CongraspError(f"--ranks is {ranks}.", "Name a number of learners from 1 on.")
+    gpus = ranks > 1 and leave_gpus_to(ranks)
+    physics = engine_of(config.physics, gpus)
+    if actors is None:
+        actors = 0 if physics == "warp" and not listens else 2
+    return _Plan(ranks, actors, physics, gpus)
+
+
+def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None, *, resume: bool) -> None:
+    """Makes the run's directory, or takes up the one that is there."""
+    if resume:
+        continue_run(run_dir, config)
+        if not (run_dir / "checkpoints" / "latest").exists():
+            raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start it anew in another --run-dir.")
+        return
+    if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / CONFIG_FILE).exists():
+        raise CongraspError(f"{run_dir} is not empty and is no run.", "Choose another --run-dir.")
+    _check(config)
+    create_run(run_dir, config, None if initial is None else bundles.load(initial))
+
+
+def _announce(config: RunConfig, run_dir: pathlib.Path, plan: _Plan) -> bool:
+    """Prints what is about to run; returns whether it is easier than the full task."""
+    console.print(
+        f"[bold]{config.name}[/]: {config.updates} updates of {plan.ranks * _steps_per_update(config)} steps, "
+        f"{plan.ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on '{plan.physics}' in "
+        f"{run_dir}",
+        soft_wrap=True,
+    )
+    simplifications = easier(config)
+    if simplifications:
+        preset = f"--preset {config.task.hand if config.task.hand in PRESETS else 'human'}"
+        console.print(
+            f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is {preset}, for a GPU.",
+            soft_wrap=True,
+        )
+    return bool(simplifications)
+
+
+def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int, before: list[Row], *, pretrained: bool) -> None:
+    """What the training achieved: the comparison, a live query, pictures; of the pretrained policy, too, if wanted."""
+    policy = bundles.load(run_dir / POLICY_FILE)
+    _compare(before, _evaluate(policy, config, episodes, "after training"))
+    _live_query(run_dir, config.task.hand)
+    _picture(policy, config, run_dir)
+    if pretrained and (best := shipped(config.task.hand)):
+        _pretrained_picture(best, run_dir)
 
 
 def _check(config: RunConfig) -> None:
@@ -155,8 +206,8 @@ def _check(config: RunConfig) -> None:
 
 
 @contextlib.contextmanager
-def _full_disk_said(run_dir: pathlib.Path) -> Iterator[None]:
-    """A process that dies of a full disk cannot write its last words into its log: this says them."""
+def _full_disk_named(run_dir: pathlib.Path) -> Iterator[None]:
+    """A process that dies of a full disk cannot write its error into its log: this names it."""
     try:
         yield
     except CongraspError:
@@ -196,6 +247,10 @@ class _Progress:
             self._live.stop()
         self._print()
 
+    def update(self, values: dict[str, float]) -> None:
+        """Shows the metrics of an update of this process's own learner."""
+        self.show({"values": values, "actors": 1, "version": int(values["version"])})
+
     def show(self, status: dict[str, Any]) -> None:
         """Shows the learner's newest metrics, if there are any yet, and the number of actors."""
         now = time.monotonic()
@@ -212,6 +267,7 @@ class _Progress:
             self._print()
 
     def _print(self) -> None:
+        """Prints the line if it has changed."""
         if self._line != self._printed:
             console.print(f"  {self._line}", soft_wrap=True)
             self._printed = self._line
@@ -234,14 +290,17 @@ class _Progress:
 
 
 def _steps_per_update(config: RunConfig) -> int:
+    """Environment steps of one update of one rank."""
     return config.rollout_steps * config.environments * config.ppo.rollouts_per_update
 
 
 def _minutes(seconds: float) -> str:
+    """A duration as minutes and seconds; `?` if it is not known."""
     return "?" if not np.isfinite(seconds) else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
 def _evaluator(policy: PolicyBundle, config: RunConfig, seed: int, batch: int) -> Evaluator:
+    """An evaluator on objects that training never sees."""
     objects = load_pool(
         ObjectsConfig(families=config.objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
         if not config.objects.folder
@@ -259,6 +318,7 @@ def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, when: str)
 
 
 def _compare(before: list[Row], after: list[Row]) -> None:
+    """Prints metrics before and after, and whether their difference exceeds the noise."""
     console.print(f"Before and after, mean ± standard deviation over {_SEEDS} draws of episodes:")
     for name, label, factor in (
         ("episode_return", "return", 1.0),
@@ -285,12 +345,12 @@ def _live_query(run_dir: pathlib.Path, hand: str) -> None:
 
 
 def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> None:
-    """A successful episode if a few tries find one."""
+    """A successful episode if a few attempts find one."""
     evaluator = _evaluator(policy, config, 0, 1)
     save_png(run_dir / EPISODE, episode_sheet(evaluator.episode("heading", tries=12)))
 
 
-def _shipped_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
+def _pretrained_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
     """What the same kind of policy does after training on the full task."""
     with console.status("The policy that comes with congrasp …") as status:
         grasps = showcase(bundles.load(policy), run_dir / SHIPPED, lambda text: status.update(f"{text} …"))
@@ -302,6 +362,7 @@ def _shipped_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
 
 
 def _next_steps(run_dir: pathlib.Path) -> None:
+    """Prints where the results are and which commands show more."""
     congrasp = _command()
     pictures = (
         (EPISODE, "an episode of the trained policy"),

@@ -1,4 +1,4 @@
-"""A learner's figures on TensorBoard and Weights & Biases: sinks beside the recording, which never hold it up."""
+"""A learner's metrics on TensorBoard and Weights & Biases: written beside the recording, which they never delay."""
 
 import contextlib
 import dataclasses
@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
-from common.config import Board, RunConfig
+from common.config import MetricWriter, RunConfig
 from common.transport.base import Transport
 from learner.run_directory import LOGS
 from services.record.channels import Entry, flatten
@@ -18,44 +18,44 @@ from services.record.recorder import Recorder
 _TOPIC = "/metrics/learner/"
 
 
-class _Sheet(Protocol):
-    """Where figures are written."""
+class _Writer(Protocol):
+    """Where scalars are written."""
 
-    def figures(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """Takes the figures of an update."""
+    def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
+        """Takes the scalars of an update."""
 
     def close(self) -> None:
         """Finishes."""
 
 
-class Boards:
-    """A sink of `services.record.recorder.Recorder` for the figures of learners; a board that fails is left alone."""
+class MetricWriters:
+    """A sink of `services.record.recorder.Recorder` for learners' metrics; one that fails is left out from then on."""
 
-    def __init__(self, sheets: Mapping[str, _Sheet]):
-        """Boards by name."""
-        self._sheets = dict(sheets)
+    def __init__(self, writers: Mapping[str, _Writer]):
+        """Writers by name."""
+        self._writers = dict(writers)
 
     def write(self, entry: Entry) -> None:
-        """Takes an entry; those that are no figures of a learner are passed over."""
+        """Takes an entry; those that are not metrics of a learner are passed over."""
         if not entry.channel.topic.startswith(_TOPIC):
             return
         message = json.loads(entry.data)
         values = {name: float(value) for name, value in flatten(message["values"]).items()}
         step = int(message.get("update", message.get("version", 0)))
         learner = entry.channel.topic.removeprefix(_TOPIC)
-        self._each(lambda sheet: sheet.figures(learner, 1e-9 * entry.time, step, values))
+        self._each(lambda writer: writer.write(learner, 1e-9 * entry.time, step, values))
 
     def close(self) -> None:
-        """Finishes every board."""
-        self._each(lambda sheet: sheet.close())
+        """Finishes every writer."""
+        self._each(lambda writer: writer.close())
 
-    def _each(self, action: Callable[[_Sheet], None]) -> None:
-        for name, sheet in list(self._sheets.items()):
+    def _each(self, action: Callable[[_Writer], None]) -> None:
+        for name, writer in list(self._writers.items()):
             try:
-                action(sheet)
-            except Exception as error:  # training does not end because a picture of it cannot be drawn
-                del self._sheets[name]
-                text = f"congrasp: {name} gets no more figures ({type(error).__name__}: {error}); the run goes on."
+                action(writer)
+            except Exception as error:  # training does not end because its metrics cannot be shown
+                del self._writers[name]
+                text = f"congrasp: {name} gets no more metrics ({type(error).__name__}: {error}); the run goes on."
                 print(text, file=sys.stderr, flush=True)
 
 
@@ -66,8 +66,8 @@ class _TensorBoard:
         self._folder = folder
         self._files: dict[str, Any] = {}
 
-    def figures(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """See `_Sheet`."""
+    def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
+        """See `_Writer`."""
         from tensorboardX.proto.event_pb2 import Event, SessionLog
         from tensorboardX.proto.summary_pb2 import Summary
 
@@ -88,7 +88,7 @@ class _TensorBoard:
         return EventsWriter(str(folder / "events"), f".{secrets.token_hex(4)}")
 
     def close(self) -> None:
-        """See `_Sheet`."""
+        """See `_Writer`."""
         for file in self._files.values():
             file.close()
 
@@ -111,13 +111,13 @@ class _WeightsAndBiases:
         )
         self._run.define_metric("*", step_metric="update")
 
-    def figures(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """See `_Sheet`."""
+    def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
+        """See `_Writer`."""
         prefix = "" if learner == "0" else f"learner-{learner}/"
         self._run.log({**{f"{prefix}{name}": value for name, value in values.items()}, "update": step})
 
     def close(self) -> None:
-        """See `_Sheet`."""
+        """See `_Writer`."""
         import wandb
 
         self._run.finish()
@@ -126,26 +126,26 @@ class _WeightsAndBiases:
 
 @contextlib.contextmanager
 def recorded(
-    transport: Transport, config: RunConfig, run_dir: pathlib.Path, names: Sequence[Board]
+    transport: Transport, config: RunConfig, run_dir: pathlib.Path, names: Sequence[MetricWriter]
 ) -> Iterator[Recorder]:
-    """Records a run in its folder, and shows it on boards, while the block lasts.
+    """Records a run in its folder, and writes its metrics elsewhere, too, while the block lasts.
 
     Args:
       transport: an endpoint of the run.
       config: the run's configuration.
       run_dir: the run's folder; TensorBoard's files go to `tensorboard` in it, those of Weights & Biases to `wandb`.
-      names: which boards.
+      names: which writers.
 
     Raises:
-      ModuleNotFoundError: a board's package is not installed.
+      ModuleNotFoundError: a writer's package is not installed.
     """
-    sheets: dict[str, _Sheet] = {}
+    writers: dict[str, _Writer] = {}
     for name in dict.fromkeys(names):
         if name == "tensorboard":
-            sheets[name] = _TensorBoard(run_dir / name)
+            writers[name] = _TensorBoard(run_dir / name)
         else:
             offline = name == "wandb-offline"
-            sheets[name] = _WeightsAndBiases(run_dir, config.name, dataclasses.asdict(config), offline=offline)
-    boards = Boards(sheets)
-    with contextlib.closing(boards), Recorder(transport, config.name, run_dir / LOGS, sinks=[boards]) as recorder:
+            writers[name] = _WeightsAndBiases(run_dir, config.name, dataclasses.asdict(config), offline=offline)
+    combined = MetricWriters(writers)
+    with contextlib.closing(combined), Recorder(transport, config.name, run_dir / LOGS, sinks=[combined]) as recorder:
         yield recorder

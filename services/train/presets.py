@@ -22,7 +22,7 @@ SMOOTH_FAMILIES = ("ellipsoid", "teapot", "mug", "cylinder")
 """Families that Allegro fails most often to hold by a part, likewise."""
 
 PRESETS = {
-    # Minutes on two CPU cores; `easier` says what that takes.
+    # Minutes on two CPU cores; `easier` lists what that takes.
     "quickstart": RunConfig(
         name="quickstart",
         environments=64,
@@ -104,7 +104,7 @@ PRESETS |= {
 
 
 def easier(config: RunConfig) -> list[str]:
-    """What makes a run easier than the full task, in words; empty if nothing does."""
+    """What makes a run easier than the full task, as phrases; empty if nothing does."""
     task, full = config.task, PRESETS["human"]
     words = []
     if task.headings == "above" and full.task.headings != "above":

@@ -1,4 +1,4 @@
-"""Both transports behave alike; Zenoh's ends refuse what they should and always let their process end."""
+"""All transports behave alike, one from outside among them; Zenoh's ends refuse what they should, and end."""
 
 import contextlib
 import signal
@@ -19,6 +19,7 @@ from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message, encode
+from tests.socket_transport import SocketListener, SocketTransport
 
 pytestmark = pytest.mark.timeout(60)
 KEYS = Keys("test")
@@ -31,15 +32,18 @@ def wait_for(condition, timeout=5.0):
         time.sleep(0.01)
 
 
-@pytest.fixture(params=["memory", "zenoh"])
-def pair(request):
+@pytest.fixture(params=["memory", "zenoh", "from outside"])
+def pair(request, tmp_path):
     """Two endpoints that see each other; the first is the one that listens."""
     if request.param == "memory":
         hub = MemoryHub()
         ends = MemoryTransport(hub), MemoryTransport(hub)
-    else:
+    elif request.param == "zenoh":
         endpoint = f"tcp/127.0.0.1:{free_port()}"
         ends = ZenohTransport(listen=[endpoint]), ZenohTransport(connect=[endpoint])
+    else:
+        path = str(tmp_path / "s")
+        ends = SocketListener(path), SocketTransport(path, 5.0)
     yield ends
     for end in ends:
         end.close()
@@ -132,7 +136,7 @@ def test_silence_has_a_deadline(pair):
         client.query(KEYS.act, Message(), timeout=0.3)
     assert not isinstance(caught.value, RefusedError)
     assert 0.25 < time.monotonic() - start < 3
-    with pytest.raises(TransportError, match="Nobody"):
+    with pytest.raises(TransportError, match="No response"):
         client.query(KEYS.health, Message(), timeout=5)
     release.set()
 
@@ -301,7 +305,7 @@ def test_malformed_endpoint_is_named(endpoint):
 def test_absent_peer_is_an_error_with_a_deadline():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     start = time.monotonic()
-    with pytest.raises(TransportError, match=f"Nobody answers at {endpoint}"):
+    with pytest.raises(TransportError, match=f"No response from {endpoint}"):
         ZenohTransport(connect=[endpoint], wait=0.2)
     assert time.monotonic() - start < 5
 
@@ -404,12 +408,12 @@ def test_process_always_ends(end, code):
         process.communicate()
 
 
-def test_a_turnstile_sends_requests_away_unread(pair):
+def test_admission_sends_requests_away_unread(pair):
     server, client = pair
     server.serve(
         "congrasp/test/ticket/*",
         lambda key, request: Message(meta={"read": True}),
-        turnstile=lambda key: Message(meta={"later": key}) if key.endswith("/b") else None,
+        admission=lambda key: Message(meta={"later": key}) if key.endswith("/b") else None,
     )
     assert client.query(KEYS.ticket("a"), Message(), timeout=5).meta == {"read": True}
     assert client.query(KEYS.ticket("b"), Message(), timeout=5).meta == {"later": KEYS.ticket("b")}

@@ -186,6 +186,6 @@ def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
     subprocess.run(script, env={**environment, "PATH": f"{tmp_path}:/usr/bin:/bin"}, timeout=60, check=True)
     for rank in range(2):
         arguments = (tmp_path / str(rank)).read_text().splitlines()
-        learner = load(arguments[0])(arguments[1:]).__self__
-        assert (learner.rank, learner.ranks, learner.coordinator) == (rank, 2, "node-7:7440")
-        assert learner.run_dir == tmp_path / "a run" and learner.config.updates == 9 and learner.inside
+        given = load(arguments[0])(arguments[1:]).keywords
+        assert (given["rank"], given["ranks"], given["coordinator"]) == (rank, 2, "node-7:7440")
+        assert given["run_dir"] == tmp_path / "a run" and given["config"].updates == 9 and given["inside"]

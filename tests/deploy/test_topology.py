@@ -14,7 +14,7 @@ import time
 import pytest
 import yaml
 
-from services.bench.drain import SMALL
+from services.bench.shutdown import SMALL
 from services.record.reader import read_metrics
 from tests.conftest import ROOT
 

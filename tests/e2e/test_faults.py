@@ -1,7 +1,7 @@
-"""What becomes of accepted rollouts when processes are killed and stopped, links fail, and clocks jump.
+"""Outcomes of accepted rollouts when processes are killed and stopped, links fail, and clocks jump.
 
-Every test ends with the audit of `Cluster.stop`: nothing that was accepted is lost, duplicated or torn, and nothing was
-learnt from that is older than the cap.
+Every test ends with the audit of `Cluster.stop`: nothing that was accepted is lost, duplicated or corrupted, and
+nothing was learnt from that is older than the cap.
 """
 
 import signal

@@ -143,9 +143,9 @@ def test_hostile_messages_harm_nobody_else(cluster):
         list(cluster.observer._session(key).get(key, payload=os.urandom(100), timeout=5.0))
     with pytest.raises(CongraspError, match="ticket request"):
         cluster.observer.query(KEYS.ticket("evil"), Message(meta={"actor": 1}), timeout=5)
-    with pytest.raises(TransportError, match="Nobody"):
+    with pytest.raises(TransportError, match="No response"):
         cluster.observer.query("congrasp/other/rollout", evil(), timeout=5)
-    with pytest.raises(TransportError, match="Nobody"):
+    with pytest.raises(TransportError, match="No response"):
         cluster.observer.query("congrasp/chaos/shutdown", Message(), timeout=5)
     replayed = cluster.observer.query(KEYS.rollout("evil"), evil(version=10**6), timeout=5).meta
     assert replayed["outcome"] == "stale"

@@ -17,6 +17,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from actors.link import ActorLink
 from common.errors import CongraspError, TransportError
+from common.transport.certificates import read
 from common.transport.keys import Keys
 from common.transport.ports import free_port
 from common.transport.security import RIGHTS, Credentials
@@ -25,7 +26,7 @@ from common.wire.codec import Message, encode
 from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
-from services.ops.certificates import create_authority, issue, read
+from services.ops.certificates import create_authority, issue
 from services.serve.client import PolicyClient
 from tests.cluster import A, B, D, T, bundle, rollout
 
@@ -112,7 +113,7 @@ def answers(transport, key, message=None):
     try:
         return transport.query(key, message or Message(), timeout=5)
     except TransportError as error:
-        assert "Nobody answers" in str(error)
+        assert "No response" in str(error)
         return None
 
 

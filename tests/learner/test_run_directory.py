@@ -6,7 +6,7 @@ import pytest
 
 from common.errors import CongraspError
 from learner.run_directory import continue_run, create_run, open_run
-from services.cli.train import begun
+from services.cli.train import defaults
 from services.train.presets import get_preset
 
 
@@ -34,7 +34,7 @@ def test_what_actors_use_may_not(run, change):
 
 def test_a_command_line_that_resumes_starts_from_the_runs_own_configuration(run):
     folder, config = run
-    assert begun(["--resume", "--run-dir", str(folder)]) == ("quickstart", config)
-    assert begun([f"--run-dir={folder}", "--or-resume", "--preset", "human"]) == ("human", config)
-    assert begun(["--run-dir", str(folder), "--preset=human"]) == ("human", get_preset("human"))
-    assert begun(["--or-resume", "--run-dir", str(folder / "none")]) == ("quickstart", get_preset("quickstart"))
+    assert defaults(["--resume", "--run-dir", str(folder)]) == {"preset": "quickstart", "config": config}
+    assert defaults([f"--run-dir={folder}", "--or-resume", "--preset", "human"])["config"] == config
+    assert defaults(["--run-dir", str(folder), "--preset=human"]) == {"preset": "human", "config": get_preset("human")}
+    assert defaults(["--or-resume", "--run-dir", str(folder / "none")])["config"] == get_preset("quickstart")

@@ -11,12 +11,12 @@ from common.objects import procedural, store
 from common.objects.pool import HELD_OUT_SEED
 from common.objects.spec import GraspObject
 from common.policy.pretrained import policy_file, shipped_hands
+from common.transport import urls
+from common.transport.base import Transport
 from common.transport.security import check_exposure
-from common.transport.zenoh_transport import ZenohTransport
 from services.assets.objects.meshes import ImportOptions, import_source
 from services.assets.objects.sources import find_sources
-from services.ops.access import credentials
-from services.ops.logs import say
+from services.ops.logs import log
 from services.serve.server import follow_file, follow_run
 from services.viz.studio.grasping import PolicyGrasping
 from services.viz.studio.recordings import Recordings
@@ -57,9 +57,7 @@ def open_view(
         if recordings is not None and window is not None:
             _read(window, recordings)
         if connect and window is not None:
-            watching = stack.enter_context(
-                ZenohTransport(connect=[connect], credentials=credentials(certs, "observer"))
-            )
+            watching = stack.enter_context(urls.connect(connect, "observer", certs=certs))
             stack.callback(Follower(watching, window).close)
             hands = _of_run(connect, run, certs, watching, stack)
         elif policy is not None:
@@ -74,17 +72,16 @@ def open_view(
 
 
 def _of_run(
-    connect: str, run: str, certs: pathlib.Path | None, watching: ZenohTransport, stack: contextlib.ExitStack
+    connect: str, run: str, certs: pathlib.Path | None, watching: Transport, stack: contextlib.ExitStack
 ) -> dict[str, Callable[[], PolicyGrasping]]:
     """The policy of a run; who may only watch it gets those that come with the package."""
     pulling = watching
     if certs is not None:
         try:
-            mine = credentials(certs, "server")
+            pulling = stack.enter_context(urls.connect(connect, "server", certs=certs))
         except CongraspError as error:
-            say("warning", f"{error} Until then the studio grasps with the policies that come with congrasp.")
+            log("warning", f"{error} Until then the studio grasps with the policies that come with congrasp.")
             return _shipped()
-        pulling = stack.enter_context(ZenohTransport(connect=[connect], credentials=mine))
     return {"of the run": functools.partial(PolicyGrasping, follow_run(pulling, run), f"the run '{run}'")}
 
 
@@ -125,6 +122,6 @@ def _read(window: TrainingWindow, recordings: pathlib.Path) -> None:
         try:
             window.load(recordings)
         except CongraspError as error:
-            say("warning", str(error))
+            log("warning", str(error))
 
     threading.Thread(target=work, daemon=True, name="curves").start()

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from common.errors import CongraspError
-from services.ops.logs import say
+from services.ops.logs import log
 
 Progress = Callable[[str, float], None]
 """(what is being done, how much of it is done from 0 to 1)."""
@@ -53,7 +53,7 @@ class Jobs:
             error = str(found)
         except Exception as found:  # whatever goes wrong in a job, the page is told and the studio goes on
             error = f"This went wrong and is a fault of congrasp: {type(found).__name__}: {found}."
-            say("error", error)
+            log("error", error)
         with self._lock:
             self._state |= {"running": False, "share": 1.0, "error": error, "made": made}
 

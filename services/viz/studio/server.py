@@ -11,7 +11,7 @@ from typing import Any
 
 from common.errors import CongraspError, TransportError
 from common.wire.codec import Message, encode
-from services.ops.logs import say
+from services.ops.logs import log
 
 STATIC = pathlib.Path(__file__).with_name("static")
 MOST_BYTES = 128 << 20
@@ -174,7 +174,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
             return
         except Exception as error:  # whatever a page asks for, the server goes on
-            say("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
+            log("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
             words = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
             self._send(500, "application/json", json.dumps({"error": words}).encode())
             return

@@ -50,12 +50,12 @@ def test_all_is_well(run_dir):
     assert not report.faults and command(run_dir) == 0
 
 
-def test_lost_duplicated_torn_and_invented(run_dir, capsys):
+def test_lost_duplicated_corrupted_and_unmatched(run_dir, capsys):
     learner(
         run_dir, life(), used(0), used(1), used(1, version=2), used(2, checksum="c9"), used(4),
         {"version": 4, "used": [["a", "1", 77, 0, "c"]]}, {"end": [["a", "1", 5]]},
     )  # fmt: skip
-    assert faults(run_dir) == {"lost": 1, "duplicated": 1, "torn": 1, "invented": 1, "waiting": 1}
+    assert faults(run_dir) == {"lost": 1, "duplicated": 1, "corrupted": 1, "unmatched": 1, "waiting": 1}
     assert "a/1/3: accepted, and never seen again" in audit(run_dir).faults
     assert command(run_dir) == 1 and "a/1/3" in capsys.readouterr().out
 

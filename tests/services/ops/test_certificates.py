@@ -8,8 +8,9 @@ import subprocess
 import pytest
 
 from common.errors import CongraspError
+from common.transport.certificates import find, read
 from common.transport.security import NUMBERS, Credentials, check_exposure, secured
-from services.ops.certificates import certificates, create_authority, find_credentials, issue, read
+from services.ops.certificates import certificates, create_authority, issue
 
 
 @pytest.fixture
@@ -62,7 +63,7 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
 @pytest.mark.parametrize(
     ("role", "options", "words"),
     [
-        ("boss", {}, "no role 'boss'"),
+        ("boss", {}, "no certificate role 'boss'"),
         ("actor", {"hosts": ["gpu"]}, "names no hosts"),
         ("server", {"hosts": ["a b"]}, "neither a host name nor an address"),
         ("server", {"hosts": [""]}, "neither a host name nor an address"),
@@ -82,23 +83,23 @@ def test_what_makes_no_sense_is_not_issued(folder, role, options, words):
 def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
     issue(folder, "actor")
     other = issue(folder, "actor")
-    assert find_credentials(folder, "actor")[0] == Credentials(folder / "actor.0", "actor")
-    assert find_credentials(other, "actor")[1].number == 1
+    assert find(folder, "actor")[0] == Credentials(folder / "actor.0", "actor")
+    assert find(other, "actor")[1].number == 1
     with pytest.raises(CongraspError, match=r"for the role actor, not learner.*--role learner"):
-        find_credentials(other, "learner")
+        find(other, "learner")
     with pytest.raises(CongraspError, match="missing"):
-        find_credentials(folder, "client")
+        find(folder, "client")
     with pytest.raises(CongraspError, match=r"expired on .* UTC"):
-        find_credentials(issue(folder, "actor", number=7, days=-1), "actor")
+        find(issue(folder, "actor", number=7, days=-1), "actor")
     (other / "tls.key").write_bytes((folder / "actor.0" / "tls.key").read_bytes())
     with pytest.raises(CongraspError, match="is not the key of"):
-        find_credentials(other, "actor")
+        find(other, "actor")
     (other / "tls.crt").write_text("nonsense")
     with pytest.raises(CongraspError, match="is no certificate"):
-        find_credentials(other, "actor")
+        find(other, "actor")
     (other / "tls.crt").write_bytes((folder / "ca.crt").read_bytes())
     with pytest.raises(CongraspError, match="for the role ca"):
-        find_credentials(other, "actor")
+        find(other, "actor")
 
 
 def test_with_credentials_every_endpoint_is_tls(tmp_path):

@@ -142,6 +142,6 @@ def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
         _, clock = doctor._learner(endpoint, "r")
         assert not clock.fine and clock.text.startswith(("+7.0", "+6.9"))
         (other,) = doctor._learner(endpoint, "other")
-        assert not other.fine and "Nobody answers congrasp/other/status" in other.text
+        assert not other.fine and "No response for congrasp/other/status" in other.text
     (unreached,) = doctor._learner(endpoint, "r")
     assert not unreached.fine and "Start the learner" in unreached.text

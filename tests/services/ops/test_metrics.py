@@ -16,7 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from common.errors import CongraspError, TransportError
 from common.transport.ports import free_port
-from services.ops.logs import logging_as, say
+from services.ops.logs import log, logging_as
 from services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
 
 STATUS = {
@@ -56,7 +56,7 @@ def test_a_learner_shows_its_status_and_its_last_update():
 
 def test_a_learner_that_starts_is_not_ready():
     def ask():
-        raise TransportError("Nobody answers.")
+        raise TransportError("No response.")
 
     port = free_port()
     with exposed(port, "127.0.0.1", LearnerMetrics(ask)):
@@ -138,7 +138,10 @@ def test_a_learner_and_an_actor_are_scraped(tmp_path):
         assert ("congrasp_actor_rollouts_total",) in scrape(ports[1])
     assert all(line.keys() == {"time", "level", "role", "id", "run", "text", "fields"} for line in said)
     assert datetime.datetime.fromisoformat(said[0]["time"]).tzinfo is datetime.UTC
-    assert said[0]["text"] == f"Acts for {endpoint}." and (said[0]["role"], said[0]["id"]) == ("actor", "worker")
+    assert said[0]["text"] == f"Connected to the learner at {endpoint}." and (said[0]["role"], said[0]["id"]) == (
+        "actor",
+        "worker",
+    )
 
 
 def test_an_error_is_the_last_line_of_a_log_in_json(tmp_path):
@@ -156,7 +159,7 @@ def test_a_full_disk_under_a_log_costs_lines_and_not_the_process(monkeypatch):
 
     monkeypatch.setattr(sys, "stdout", Full())
     with logging_as("text", role="learner", id="0", run="r"):
-        say("warning", "lost", {"figure": 1.0})
+        log("warning", "lost", {"figure": 1.0})
 
 
 def test_a_port_in_use_is_an_error_in_words():

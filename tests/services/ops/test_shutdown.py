@@ -76,9 +76,9 @@ def test_a_second_signal_ends_a_process_that_drains_for_long():
 def test_a_forced_end_takes_the_children_along():
     child = "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'], start_new_session=True)"
     code = STUCK.replace("import threading", "import subprocess, sys, threading").replace(
-        "    print(", f"    child = {child}\n    take_along(child)\n    print(child.pid, end=' ')\n    print("
+        "    print(", f"    child = {child}\n    register_child(child)\n    print(child.pid, end=' ')\n    print("
     )
-    with start(code.replace("import on_signal", "import on_signal, take_along")) as process:
+    with start(code.replace("import on_signal", "import on_signal, register_child")) as process:
         pid, ready = process.stdout.readline().split()
         child = psutil.Process(int(pid))
         process.send_signal(signal.SIGTERM)

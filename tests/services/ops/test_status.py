@@ -61,17 +61,17 @@ def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
 
 
 @pytest.mark.timeout(30)
-def test_a_ledger_that_does_not_add_up_is_said(endpoint):
+def test_counters_that_do_not_add_up_are_named(endpoint):
     with ZenohTransport(connect=[endpoint]) as transport:
         found = ask(transport, "r")
     assert found["warnings"] == []
     lost = copy.deepcopy(found)
     lost["ledger"]["accepted"] += 1
     (words,) = warnings(lost)
-    assert words == "The ledger does not add up: accepted 2 is not consumed 0 + dropped 0 + queued 1."
+    assert words == "The counters do not add up: accepted 2 is not consumed 0 + dropped 0 + queued 1."
     lost["ledger"]["queued"] += 1
     (words,) = warnings(lost)
-    assert words == "The ledger says that 2 rollouts wait; in the queue are 1."
+    assert words == "2 rollouts are counted as queued; the queue holds 1."
 
 
 @pytest.mark.timeout(60)

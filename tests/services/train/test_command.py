@@ -1,4 +1,4 @@
-"""What `congrasp train` says around training."""
+"""What `congrasp train` checks before training, and prints around it."""
 
 import dataclasses
 import io
@@ -9,8 +9,9 @@ from rich.console import Console
 
 from common.config import NetworkConfig, ObjectsConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
-from services.train import command as quickstart
-from services.train.command import EPISODE, SHIPPED, _compare, _minutes, _next_steps, _Progress
+from services.ops.certificates import create_authority, issue
+from services.train import command
+from services.train.command import EPISODE, SHIPPED, _check_connections, _compare, _minutes, _next_steps, _Progress
 from services.train.presets import get_preset
 
 CONFIG = RunConfig(updates=10, environments=4, rollout_steps=5)  # 40 steps an update
@@ -20,7 +21,7 @@ CONFIG = RunConfig(updates=10, environments=4, rollout_steps=5)  # 40 steps an u
 def said(monkeypatch):
     """What was printed so far, as lines."""
     output = io.StringIO()
-    monkeypatch.setattr(quickstart, "console", Console(file=output, width=200))
+    monkeypatch.setattr(command, "console", Console(file=output, width=200))
     return lambda: output.getvalue().splitlines()
 
 
@@ -28,7 +29,7 @@ def said(monkeypatch):
 def clock(monkeypatch):
     """A clock that only the test moves."""
     now = types.SimpleNamespace(seconds=100.0)
-    monkeypatch.setattr(quickstart.time, "monotonic", lambda: now.seconds)
+    monkeypatch.setattr(command.time, "monotonic", lambda: now.seconds)
     return now
 
 
@@ -114,15 +115,15 @@ def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, t
     assert any(line.strip() == str(tmp_path / SHIPPED) for line in said())
 
 
-@pytest.mark.parametrize(("free", "words"), [(1000, "disk of .* is full.*--resume"), (10**9, "it said nothing")])
-def test_a_run_that_dies_of_a_full_disk_says_so(said, monkeypatch, tmp_path, free, words):
+@pytest.mark.parametrize(("free", "words"), [(1000, "disk of .* is full.*--resume"), (10**9, "its log is empty")])
+def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, free, words):
     def die(*args, **options):
-        raise CongraspError("The learner failed: it said nothing")  # its log is on the same disk
+        raise CongraspError("The learner failed: its log is empty")  # its log is on the same disk
 
-    monkeypatch.setattr(quickstart, "train", die)
-    monkeypatch.setattr(quickstart.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
+    monkeypatch.setattr(command, "train", die)
+    monkeypatch.setattr(command.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
     with pytest.raises(CongraspError, match=words):
-        quickstart.run_training(CONFIG, tmp_path, actors=1, resume=False, evaluation=0)
+        command.run_training(CONFIG, tmp_path, actors=1, resume=False, evaluation=0)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +137,7 @@ def test_a_run_that_dies_of_a_full_disk_says_so(said, monkeypatch, tmp_path, fre
 )
 def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, change, words):
     with pytest.raises(CongraspError, match=words):
-        quickstart.run_training(
+        command.run_training(
             dataclasses.replace(CONFIG, **change),
             tmp_path / "run",
             actors=1,
@@ -150,11 +151,26 @@ def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_pat
     def stop(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(quickstart, "train", stop)
+    monkeypatch.setattr(command, "train", stop)
     config = RunConfig(objects=ObjectsConfig(count=8), network=NetworkConfig(hidden=(32,)), physics="native")
     with pytest.raises(KeyboardInterrupt):
-        quickstart.run_training(config, tmp_path, actors=1, resume=False, evaluation=0)
+        command.run_training(config, tmp_path, actors=1, resume=False, evaluation=0)
     full = get_preset("human").objects.count
     assert (
         f"Easier than the full task: an actor has 8 objects, not {full}; networks have layers of 32 units" in said()[1]
     )
+
+
+def test_a_training_that_others_may_join_has_all_certificates_before_it_starts(tmp_path):
+    create_authority(tmp_path)
+    for role in ("learner", "actor", "observer"):
+        issue(tmp_path, role)
+    _check_connections(None, "tls/0.0.0.0:7447", tmp_path, insecure=False)
+    _check_connections(None, "tcp/0.0.0.0:7447", None, insecure=True)
+    with pytest.raises(CongraspError, match="belongs to one role"):
+        _check_connections(None, "tls/0.0.0.0:7447", tmp_path / "learner.0", insecure=False)
+    with pytest.raises(CongraspError, match="With --actors 0 nothing listens"):
+        _check_connections(0, "tls/0.0.0.0:7447", tmp_path, insecure=False)
+    (tmp_path / "observer.0" / "tls.key").unlink()
+    with pytest.raises(CongraspError, match=r"observer.0/tls.key is missing.*--role observer"):
+        _check_connections(None, "tls/0.0.0.0:7447", tmp_path, insecure=False)

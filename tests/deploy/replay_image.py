@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Replays a target of the Dockerfile where no container engine runs: its steps in clean Debian roots, by chroot.
+"""Builds a target of the Dockerfile where no container engine runs: its steps in clean Debian roots, by chroot.
 
-Then it starts the image's command as the image's user, asks its health check until it is well, and ends it. Needs root
+Then it starts the image's command as the image's user, runs its health check until it passes, and ends it. Needs root
 on Linux, `debootstrap`, and network; Debian's Python stands in for the one of the official image.
 
-    sudo python3 deploy/replay.py cpu
+    sudo python3 tests/deploy/replay_image.py cpu
 """
 
 import argparse
@@ -21,7 +21,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 
-HERE = pathlib.Path(__file__).resolve().parent
+DOCKERFILE = pathlib.Path(__file__).resolve().parents[2] / "deploy" / "Dockerfile"
 RELEASE = "bookworm"
 PACKAGES = "python3,python3-venv,ca-certificates"
 CHROOT = shutil.which("chroot") or "/usr/sbin/chroot"
@@ -50,7 +50,7 @@ class Stage:
         return other
 
     def start(self, command: list[str], extra: dict[str, str] | None = None) -> subprocess.Popen:
-        """A process in the root, by the stage's user and in its folder."""
+        """A process in the root, as the stage's user and in its folder."""
         inside = [CHROOT, f"--userspec={self.user}", str(self.root), "sh", "-c", 'cd "$0" && exec "$@"', self.cwd]
         return subprocess.Popen([*inside, *command], env={**self.env, **(extra or {})})
 
@@ -153,7 +153,7 @@ def carry_out(name: str, rest: str, stage: Stage, stages: dict[str, Stage], cont
 
 
 def exercise(stage: Stage) -> None:
-    """Starts the image's command, waits until it is well, and ends it."""
+    """Starts the image's command, waits until it is healthy, and ends it."""
     command = [*stage.entrypoint, *stage.command]
     print(f"start: {shlex.join(command)}", flush=True)
     server = stage.start(command)
@@ -161,7 +161,7 @@ def exercise(stage: Stage) -> None:
     while (code := stage.start(stage.health).wait()) != 0:
         if server.poll() is not None or time.monotonic() - began > HEALTHY_SECONDS:
             server.kill()
-            sys.exit(f"It is not well: the health check ended with {code}.")
+            sys.exit(f"It is not healthy: the health check ended with {code}.")
         time.sleep(1.0)
     print(f"healthy after {time.monotonic() - began:.1f} s", flush=True)
     began = time.monotonic()
@@ -170,7 +170,7 @@ def exercise(stage: Stage) -> None:
 
 
 def main() -> None:
-    """Replays a target."""
+    """Builds a target and tries its command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("target", nargs="?", default="cpu")
     parser.add_argument("--mounted", action="store_true", help=argparse.SUPPRESS)
@@ -180,7 +180,7 @@ def main() -> None:
     if not options.mounted:  # mounts of its own, which end with it
         os.execvp("unshare", ["unshare", "--mount", sys.executable, __file__, options.target, "--mounted"])
     with tempfile.TemporaryDirectory(dir="/var/tmp") as work:
-        stage = build(HERE / "Dockerfile", options.target, pathlib.Path(work))
+        stage = build(DOCKERFILE, options.target, pathlib.Path(work))
         with running(stage):
             exercise(stage)
 

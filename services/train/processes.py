@@ -1,8 +1,7 @@
-"""A learner and its actors on this machine: starts them, keeps them alive, and ends them together."""
+"""A learner and its actors as processes of this machine: starts them, restarts those that die, and ends all."""
 
 import contextlib
 import dataclasses
-import functools
 import os
 import pathlib
 import subprocess
@@ -10,32 +9,25 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 
 from actors.physics import resolve_physics
-from common.config import Board, PhysicsName, RunConfig
+from common.config import MetricWriter, PhysicsName, RunConfig
 from common.errors import CongraspError, TransportError
 from common.journal import AUDIT
+from common.transport import urls
 from common.transport.base import Transport
-from common.transport.keys import FLOWS, Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.transport.pair import PairTransport
-from common.transport.ports import free_port
-from common.transport.security import Credentials
-from common.transport.zenoh_transport import ZenohTransport, shifted
-from services.ops.access import credentials, nearby
-from services.ops.shutdown import GRACE, PARENT_VARIABLE, take_along
-
-if TYPE_CHECKING:
-    from learner.ranks import Ranks
+from common.transport.keys import Keys
+from common.transport.ports import local_url, rank_url, reachable_url
+from services.ops.shutdown import PARENT_VARIABLE, register_child
 
 MAX_RESTARTS = 5
 CHILD_GRACE = 2.0
 """Seconds in which a child may drain; then this process has time to end it before it must end itself (`GRACE`)."""
 _BAD_INPUT = 2
-_POLL = 0.25
+_START_SECONDS, _POLL = 120.0, 0.25
 Report = Callable[[dict[str, Any]], None]
 """Given the learner's newest metrics, where there are any, and the number of actors alive, some times a second."""
 
@@ -64,12 +56,12 @@ class Child:
                 env=environment,
                 start_new_session=True,
             )
-        take_along(self.process)
+        register_child(self.process)
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """The last line of its log."""
         lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
-        return lines[-1].removeprefix("congrasp: error: ") if lines else "it said nothing"
+        return lines[-1].removeprefix("congrasp: error: ") if lines else "its log is empty"
 
 
 def train(
@@ -86,7 +78,7 @@ def train(
     insecure: bool = False,
     report: Report = lambda status: None,
     notify: Callable[[str], None] = lambda text: None,
-    boards: Sequence[Board] = (),
+    writers: Sequence[MetricWriter] = (),
     metrics_port: int = 0,
 ) -> None:
     """Runs a prepared run directory to its end with one learner and `actors` actor processes, or several of both.
@@ -95,7 +87,7 @@ def train(
     one of several ranks dies, the others end, too, and all are started again.
 
     Args:
-      run_dir: made by `learner.run_directory.create_run`; with checkpoints, the run goes on from the latest.
+      run_dir: made by `learner.run_directory.create_run`; with checkpoints, the run resumes from the latest.
       config: the run's configuration.
       actors: number of actor processes of each rank; with none, an actor lives in each rank's process.
       physics: engine of the actors.
@@ -107,51 +99,66 @@ def train(
       certs: an authority's folder, for mutual TLS.
       insecure: listen beyond loopback without certificates.
       report: shows progress.
-      notify: told in words when something is restarted.
-      boards: where rank 0's figures are shown, too.
+      notify: given a message when something is restarted.
+      writers: which metric writers get rank 0's metrics.
       metrics_port: port of rank 0's Prometheus endpoint on the loopback interface; 0 for none.
 
     Raises:
-      CongraspError: a process failed for good; its last words are in the message.
+      CongraspError: a process failed for good; the last line of its log is in the message.
     """
-    # Those of the ranks, and one pair by which they find each other.
-    endpoint = endpoint or f"tcp/127.0.0.1:{free_port(ranks * len(FLOWS) + 2)}"
-    connect, secure = nearby(endpoint), [] if certs is None else ["--certs", str(certs)]
-    listen = [endpoint, *secure, *(["--insecure"] if insecure else [])]
-    coordinator = shifted(connect, ranks * len(FLOWS)).partition("/")[2]
+    # One more for the ports by which the ranks find each other.
+    endpoint = endpoint or local_url(ranks + 1)
+    certificates = [] if certs is None else ["--certs", str(certs)]
+    listen = [endpoint, *certificates, *(["--insecure"] if insecure else [])]
+    connect = [reachable_url(endpoint), *certificates]
     logs = run_dir / "logs"
     logs.mkdir(exist_ok=True)
-    threads = max(1, (os.cpu_count() or 1) // max(1, ranks * actors))
-    learners, children = [], []
-    for rank in range(ranks):
-        environment = {"CUDA_VISIBLE_DEVICES": _gpu(rank)} if gpus else {}
-        name = f"rank-{rank}" if ranks > 1 else "learner"
-        arguments = ["learner", "--run-dir", str(run_dir), "--resume", "--listen", *listen]
-        if ranks > 1 or not actors:
-            arguments += ["--rank", str(rank), "--ranks", str(ranks), "--coordinator", coordinator]
-            arguments += [] if actors else ["--inside"]
-        if rank == 0:
-            arguments += ["--metrics-port", str(metrics_port), "--boards", *boards]
-        learners.append(Child(name, arguments, logs / f"{name}.log", environment))
-        where = shifted(connect, rank * len(FLOWS))
-        for number in range(rank * actors, (rank + 1) * actors):
-            name = f"actor-{number}"
-            arguments = ["actor", "--connect", where, "--run", config.name, "--id", name, "--physics", physics]
-            arguments += secure
-            arguments += ["--audit", str(run_dir / AUDIT / f"{name}.jsonl")]
-            arguments += ["--threads", str(threads), "--patience", "60" if ranks == 1 else "300"]
-            children.append(Child(name, arguments, logs / f"{name}.log", environment))
+    learners = _learners(run_dir, listen, connect[0], ranks=ranks, inside=not actors, gpus=gpus)
+    learners[0].arguments += ["--metrics-port", str(metrics_port), "--boards", *writers]
+    children = _actors(run_dir, config.name, connect, ranks=ranks, actors=actors, physics=physics)
     try:
         for child in (*learners, *children):
             child.start()
-        transport = _connected(connect, learners[0], stop, credentials(certs, "observer"))
+        transport = _connect(connect[0], learners[0], stop, certs)
         if transport is not None:
-            watch = [f"congrasp view --connect {connect} --run {config.name} --recordings {run_dir}", *secure]
-            notify(f"Watch it in the browser with: {' '.join(watch)}")
+            watch = f"congrasp view --connect {connect[0]} --run {config.name} --recordings {run_dir}"
+            notify(" ".join([f"Watch it in the browser with: {watch}", *certificates]))
             with transport:
                 _supervise(learners, children, transport, config.name, stop, report, notify)
     finally:
         end_all([*learners, *children])
+
+
+def _learners(
+    run_dir: pathlib.Path, listen: Sequence[str], connect: str, *, ranks: int, inside: bool, gpus: bool
+) -> list[Child]:
+    """The learner processes; `listen` is --listen and what goes with it, `connect` the URL by which rank 0 is found."""
+    coordinator = rank_url(connect, ranks).partition("/")[2]
+    found = []
+    for rank in range(ranks):
+        name = f"rank-{rank}" if ranks > 1 else "learner"
+        arguments = ["learner", "--run-dir", str(run_dir), "--resume", "--listen", *listen]
+        if ranks > 1 or inside:
+            arguments += ["--rank", str(rank), "--ranks", str(ranks), "--coordinator", coordinator]
+            arguments += ["--inside"] if inside else []
+        environment = {"CUDA_VISIBLE_DEVICES": _gpu(rank)} if gpus else {}
+        found.append(Child(name, arguments, run_dir / "logs" / f"{name}.log", environment))
+    return found
+
+
+def _actors(
+    run_dir: pathlib.Path, run: str, connect: Sequence[str], *, ranks: int, actors: int, physics: PhysicsName
+) -> list[Child]:
+    """The actor processes of all ranks; `connect` is rank 0's URL and the options that go with it."""
+    threads = max(1, (os.cpu_count() or 1) // max(1, ranks * actors))
+    found = []
+    for number in range(ranks * actors):
+        name = f"actor-{number}"
+        arguments = ["actor", "--connect", rank_url(connect[0], number // actors), *connect[1:], "--run", run]
+        arguments += ["--id", name, "--physics", physics, "--audit", str(run_dir / AUDIT / f"{name}.jsonl")]
+        arguments += ["--threads", str(threads), "--patience", "60" if ranks == 1 else "300"]
+        found.append(Child(name, arguments, run_dir / "logs" / f"{name}.log"))
+    return found
 
 
 def leave_gpus_to(ranks: int) -> bool:
@@ -192,32 +199,31 @@ def _gpu(rank: int) -> str:
     return visible[rank] if visible else str(rank)
 
 
-def _connected(
-    endpoint: str, learner: Child, stop: threading.Event, secrets: Credentials | None
-) -> ZenohTransport | None:
+def _connect(url: str, learner: Child, stop: threading.Event, certs: pathlib.Path | None) -> Transport | None:
     """A connection to the learner once it listens; None if the run is stopped before."""
-    deadline = time.monotonic() + 120.0
+    deadline = time.monotonic() + _START_SECONDS
     while time.monotonic() < deadline and not stop.is_set():
         try:
-            return ZenohTransport(connect=[endpoint], wait=_POLL, credentials=secrets)
+            return urls.connect(url, "observer", certs=certs, wait=_POLL)
         except TransportError:
             assert learner.process is not None
             if learner.process.poll() not in (None, 0):
                 break
     if stop.is_set():
         return None
-    raise CongraspError(f"The learner did not start: {learner.last_words()}", f"Its log is {learner.log}.")
+    raise CongraspError(f"The learner did not start: {learner.last_line()}", f"Its log is {learner.log}.")
 
 
 def _supervise(
     learners: Sequence[Child],
     actors: Sequence[Child],
-    transport: ZenohTransport,
+    transport: Transport,
     run: str,
     stop: threading.Event,
     report: Report,
     notify: Callable[[str], None],
 ) -> None:
+    """Restarts what dies and reports, until rank 0 has finished or the run is stopped."""
     metrics = transport.subscribe(Keys(run).learner_metrics, depth=16)
     while not stop.is_set():
         codes = {child.name: child.process.poll() for child in learners if child.process}
@@ -228,7 +234,7 @@ def _supervise(
         for child in actors:
             assert child.process is not None
             if code := child.process.poll():
-                _check_can_go_on(child, code)
+                _check_can_restart(child, code)
                 if child.again_at == 0.0:
                     notify(f"The {child.name} died (exit code {code}); starting it again.")
                     child.again_at = time.monotonic() + min(2.0**child.restarts, 15.0) - 1.0
@@ -250,7 +256,7 @@ def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: 
     end_all(learners)
     for child in learners:
         assert child.process is not None
-        _check_can_go_on(child, child.process.poll() or 0)
+        _check_can_restart(child, child.process.poll() or 0)
     notify(f"{died}; starting it again." if len(learners) == 1 else f"{died}; starting all ranks again.")
     stop.wait(min(2.0 ** learners[0].restarts, 15.0) - 1.0)
     for child in learners:
@@ -259,12 +265,14 @@ def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: 
             child.start()
 
 
-def _check_can_go_on(child: Child, code: int) -> None:
+def _check_can_restart(child: Child, code: int) -> None:
+    """Raises `CongraspError` if another start would end in the same way."""
     if code == _BAD_INPUT or child.restarts >= MAX_RESTARTS:
-        raise CongraspError(f"The {child.name} failed: {child.last_words()}", f"Its log is {child.log}.")
+        raise CongraspError(f"The {child.name} failed: {child.last_line()}", f"Its log is {child.log}.")
 
 
 def _wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    """Until all have ended, or the time is over."""
     deadline = time.monotonic() + seconds
     for process in processes:
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -281,94 +289,3 @@ def end_all(children: Sequence[Child]) -> None:
         if process.poll() is None:
             process.kill()
             process.wait()
-
-
-def train_in_process(
-    run_dir: pathlib.Path,
-    config: RunConfig,
-    *,
-    physics: PhysicsName,
-    stop: threading.Event,
-    resume: bool,
-    ranks: "Ranks | None" = None,
-    wire: Transport | None = None,
-    on_update: Callable[[dict[str, float]], None] = lambda values: None,
-    on_event: Callable[[str, str], None] = lambda level, text: None,
-    boards: Sequence[Board] = (),
-    metrics_port: int = 0,
-) -> None:
-    """The same learner and one actor in this process, over the in-memory transport.
-
-    The two share their processors: to act under old weights while the learner updates would gain nothing. So updates
-    are on-policy, whatever `max_staleness` says.
-
-    Args:
-      run_dir: see `run_learner`, as `config`, `resume`, `ranks`, `on_update` and `on_event`.
-      physics: engine of the actor.
-      stop: ends training.
-      wire: a transport that listens, where others may ask how things stand, and send rollouts, too.
-      boards: where the figures are shown, too.
-      metrics_port: port of a Prometheus endpoint on the loopback interface; 0 for none.
-    """
-    from actors.process import run_actor
-    from learner.process import run_learner
-    from learner.ranks import ROUND_SECONDS
-    from services.ops.metrics import LearnerMetrics, exposed
-    from services.ops.status import ask
-    from services.train.metric_writers import recorded
-
-    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, max_staleness=0))
-    broker = MemoryHub()
-    failures: list[BaseException] = []
-    ended = threading.Event()
-    rank = 0 if ranks is None else ranks.rank
-
-    def act() -> None:
-        try:
-            with MemoryTransport(broker) as transport:
-                run_actor(
-                    transport,
-                    run=config.name,
-                    actor=f"actor-{rank}",
-                    stop=ended,
-                    physics=physics,
-                    threads=os.cpu_count() or 1,
-                    patience=ROUND_SECONDS,
-                    keep=False,
-                )
-        except BaseException as error:
-            failures.append(error)
-            stop.set()
-
-    actor = threading.Thread(target=act, name="actor", daemon=True)
-    with MemoryTransport(broker) as memory:
-        recorder = recorded(memory, config, run_dir, boards) if rank == 0 else None
-        metrics = LearnerMetrics(functools.partial(ask, memory, config.name))
-
-        def updated(values: dict[str, float]) -> None:
-            metrics.update(values)
-            on_update(values)
-
-        actor_started = threading.Timer(0.5, actor.start)
-        actor_started.start()
-        try:
-            with exposed(metrics_port, "127.0.0.1", metrics) if metrics_port else contextlib.nullcontext():
-                run_learner(
-                    run_dir,
-                    config,
-                    memory if wire is None else PairTransport(memory, wire),
-                    stop_event=stop,
-                    resume=resume,
-                    ranks=ranks,
-                    audit=False,
-                    recorder=recorder,
-                    on_update=updated,
-                    on_event=on_event,
-                )
-        finally:
-            ended.set()
-            actor_started.cancel()
-            if actor.ident is not None:
-                actor.join(GRACE)
-    if failures:
-        raise failures[0]

@@ -1,4 +1,4 @@
-"""Figures of a learner on boards, as their own readers find them."""
+"""Metrics of a learner on TensorBoard and Weights & Biases, as their own readers find them."""
 
 import pathlib
 import struct
@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
-from common.config import Board, RunConfig
+from common.config import MetricWriter, RunConfig
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
 from services.record.reader import read_metrics
-from services.train import metric_writers as boards
+from services.train import metric_writers
 from services.train.metric_writers import recorded
 from tests.episodes import episode
 
 
-def publish(folder: pathlib.Path, names: Sequence[Board], updates: Sequence[int]) -> None:
+def publish(folder: pathlib.Path, names: Sequence[MetricWriter], updates: Sequence[int]) -> None:
     """A run of which a learner, an actor and an episode are recorded."""
     keys = Keys("r")
     with MemoryTransport(MemoryHub()) as transport, recorded(transport, RunConfig(name="r"), folder, names) as recorder:
@@ -45,7 +45,7 @@ def events(folder: pathlib.Path) -> list[list[Event]]:
     return found
 
 
-def test_tensorboard_has_the_learners_figures_and_a_resumed_run_replaces_them(tmp_path: pathlib.Path) -> None:
+def test_tensorboard_has_the_learners_metrics_and_a_resumed_run_replaces_them(tmp_path: pathlib.Path) -> None:
     publish(tmp_path, ["tensorboard"], range(5))
     assert [path.name for path in (tmp_path / "tensorboard").iterdir()] == ["learner-0"]
     (first,) = events(tmp_path / "tensorboard" / "learner-0")
@@ -57,7 +57,7 @@ def test_tensorboard_has_the_learners_figures_and_a_resumed_run_replaces_them(tm
     publish(tmp_path, ["tensorboard"], range(3, 6))
     second = [found for found in events(tmp_path / "tensorboard" / "learner-0") if found[1].step == 3]
     assert len(second) == 1 and second[0][1].session_log.status == SessionLog.START
-    # The MCAP has the same, whatever the board does.
+    # The MCAP has the same, whatever the writer does.
     np.testing.assert_array_equal(read_metrics(tmp_path / "logs")["learner/0/kl"][0], range(6))
 
 
@@ -72,13 +72,13 @@ def test_weights_and_biases_offline(tmp_path: pathlib.Path, monkeypatch: pytest.
     assert not (tmp_path / "tensorboard").exists()
 
 
-def test_a_board_that_fails_is_left_alone_and_the_recording_goes_on(
+def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refuse(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(boards._TensorBoard, "figures", refuse)
+    monkeypatch.setattr(metric_writers._TensorBoard, "write", refuse)
     publish(tmp_path, ["tensorboard"], range(4))
     assert len(read_metrics(tmp_path / "logs")["learner/0/kl"][0]) == 4
-    assert capsys.readouterr().err.count("tensorboard gets no more figures") == 1
+    assert capsys.readouterr().err.count("tensorboard gets no more metrics") == 1

@@ -9,8 +9,8 @@ import pytest
 
 from common.errors import CongraspError
 from common.transport.memory import MemoryHub, MemoryTransport
-from services.train import train
-from services.train.train import Child
+from services.train import processes
+from services.train.processes import Child
 
 WAITS = "import time; time.sleep(60)"
 
@@ -34,11 +34,11 @@ def supervise(tmp_path: pathlib.Path):
         for child in children:
             child.start()
         with MemoryTransport(MemoryHub()) as transport:
-            train._supervise(children, [], transport, "run", threading.Event(), lambda status: None, notes.append)
+            processes._supervise(children, [], transport, "run", threading.Event(), lambda status: None, notes.append)
         return notes
 
     yield run
-    train.end_all(children)
+    processes.end_all(children)
     assert all(child.process.poll() is not None for child in children)
 
 
@@ -63,4 +63,4 @@ def test_bad_input_of_any_rank_ends_the_run_with_its_last_words(supervise):
 @pytest.mark.parametrize(("visible", "names"), [("", ["0", "1"]), ("4,GPU-7", ["4", "GPU-7"])])
 def test_each_rank_sees_one_of_the_visible_gpus(monkeypatch, visible, names):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    assert [train._gpu(rank) for rank in range(2)] == names
+    assert [processes._gpu(rank) for rank in range(2)] == names

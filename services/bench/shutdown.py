@@ -1,4 +1,4 @@
-"""How a run ends when it is told to: signals a small real one at random moments, and looks for what lives on."""
+"""How a run ends on a signal: sends one to a small real run at random times, and looks for processes left behind."""
 
 import os
 import pathlib
@@ -14,23 +14,24 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import psutil
+from rich.progress import track
 
 LIMIT = 5.0
 """Seconds that a run may take to end."""
-_MARK = "CONGRASP_TRY"  # environment variable by which all processes of a try are found
+_MARK = "CONGRASP_ATTEMPT"  # environment variable by which all processes of an attempt are found
 PATIENCE = 3 * LIMIT
-"""Seconds after which a try is given up."""
+"""Seconds after which an attempt is given up."""
 _LOOK = 0.02
 SMALL = (
     *("train", "--preset", "quickstart", "--updates", "1000000", "--environments", "4", "--checkpoint-every", "3"),
     *("--objects.count", "2", "--objects.families", "box", "--network.hidden", "32", "--network.encoder", "8"),
     *("--ppo.epochs", "1", "--ppo.minibatches", "2", "--evaluation", "0", "--actors", "2", "--physics", "native"),
 )
-"""A run with a learner and two actors that goes on until it is told to end."""
+"""A run with a learner and two actors that trains until it is signalled."""
 
 
-class Try(NamedTuple):
-    """What came of one signal."""
+class Attempt(NamedTuple):
+    """Outcome of one signal."""
 
     signal: str
     after: float
@@ -49,32 +50,46 @@ class Try(NamedTuple):
         return self.seconds <= LIMIT and not self.orphans
 
 
-def attempts(tries: int, within: float, seed: int = 0) -> Iterator[Try]:
+def bench_shutdown(count: int, within: float, seed: int) -> bool:
+    """Prints every attempt that failed, and a summary; returns whether none did. For the arguments see `attempts`."""
+    results: list[Attempt] = []
+    try:
+        for one in track(attempts(count, within, seed), "shutting down", total=count):
+            results.append(one)
+            if not one.fine:
+                left = f", left behind: {'; '.join(one.orphans)}" if one.orphans else ""
+                print(f"{one.signal} after {one.after:.1f} s: took {one.seconds:.1f} s{left}", flush=True)
+    finally:
+        print(summary(results), flush=True)
+    return all(one.fine for one in results)
+
+
+def attempts(count: int, within: float, seed: int = 0) -> Iterator[Attempt]:
     """Starts a small run again and again, and ends it by SIGINT and SIGTERM in turn.
 
     Args:
-      tries: how often.
-      within: seconds in which the moment of the signal is drawn uniformly; the start of the run is part of them.
-      seed: of the moments.
+      count: how often.
+      within: seconds in which the time of the signal is drawn uniformly; the start of the run is part of them.
+      seed: of the times.
     """
-    moments = random.Random(seed)
-    for number in range(tries):
+    times = random.Random(seed)
+    for number in range(count):
         with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
             command = [sys.executable, "-m", "services.cli.main", *SMALL, "--run-dir", str(pathlib.Path(folder, "run"))]
-            yield attempt(command, moments.uniform(0.0, within), signal.SIGTERM if number % 2 else signal.SIGINT)
+            yield attempt(command, times.uniform(0.0, within), signal.SIGTERM if number % 2 else signal.SIGINT)
 
 
-def summary(tries: Sequence[Try]) -> str:
-    """What came of tries, in a line."""
-    seconds = [one.seconds for one in tries] or [0.0]
+def summary(results: Sequence[Attempt]) -> str:
+    """One line about attempts."""
+    seconds = [one.seconds for one in results] or [0.0]
     return (
-        f"{sum(one.fine for one in tries)} of {len(tries)} ended within {LIMIT:g} s with no orphan; "
+        f"{sum(one.fine for one in results)} of {len(results)} ended within {LIMIT:g} s with no orphan; "
         f"median {statistics.median(seconds):.2f} s, longest {max(seconds):.2f} s, "
-        f"{sum(len(one.orphans) for one in tries)} orphan(s)"
+        f"{sum(len(one.orphans) for one in results)} orphan(s)"
     )
 
 
-def attempt(command: Sequence[str], after: float, number: signal.Signals) -> Try:
+def attempt(command: Sequence[str], after: float, number: signal.Signals) -> Attempt:
     """Starts a command, signals it after some seconds, and waits until it and all that it started have ended."""
     mark = secrets.token_hex(8)
     run = subprocess.Popen(
@@ -97,10 +112,10 @@ def attempt(command: Sequence[str], after: float, number: signal.Signals) -> Try
             if ended and orphans is None:
                 orphans = tuple(map(_command_line, alive))
             if ended and not alive:
-                return Try(number.name, after, processes, time.monotonic() - began, orphans or (), run.returncode)
+                return Attempt(number.name, after, processes, time.monotonic() - began, orphans or (), run.returncode)
             time.sleep(_LOOK)
         left = tuple(map(_command_line, _marked(mark)))
-        return Try(number.name, after, processes, float("inf"), left, run.poll() or 0)
+        return Attempt(number.name, after, processes, float("inf"), left, run.poll() or 0)
     finally:
         for process in _marked(mark):
             process.kill()
@@ -108,7 +123,7 @@ def attempt(command: Sequence[str], after: float, number: signal.Signals) -> Try
 
 
 def _marked(mark: str) -> list[psutil.Process]:
-    """Processes of a try that live, whoever their parent is by now."""
+    """Processes of an attempt that live, whoever their parent is by now."""
     found = []
     for process in psutil.process_iter():
         try:
@@ -120,6 +135,7 @@ def _marked(mark: str) -> list[psutil.Process]:
 
 
 def _command_line(process: psutil.Process) -> str:
+    """How a process was started."""
     try:
         return " ".join(process.cmdline()[2:]) or process.name()
     except psutil.Error:

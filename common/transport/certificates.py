@@ -1,0 +1,111 @@
+"""Reads certificates, and finds the credentials of a role in a folder of them."""
+
+import datetime
+import os
+import pathlib
+import ssl
+from typing import NamedTuple
+
+from cryptography import x509
+from cryptography.x509.oid import NameOID
+
+from common.errors import CongraspError
+from common.transport.security import CERTIFICATE_FILE, NUMBERS, ROLES, Credentials
+
+
+class Certificate(NamedTuple):
+    """Content of a certificate."""
+
+    role: str
+    """One of `ROLES`; `ca` for the authority."""
+    number: int
+    """Tells the certificates of a role apart."""
+    hosts: tuple[str, ...]
+    """Names and addresses under which its owner may listen."""
+    expires: datetime.datetime
+    """In UTC."""
+
+    @property
+    def name(self) -> str:
+        """The common name."""
+        return f"{self.role}.{self.number}" if self.role != "ca" else "ca"
+
+    @property
+    def days(self) -> float:
+        """Days that are left; negative once it has expired."""
+        return (self.expires - datetime.datetime.now(datetime.UTC)).total_seconds() / 86400
+
+
+def load(path: pathlib.Path) -> x509.Certificate:
+    """A certificate's file; a CongraspError if it is none."""
+    try:
+        return x509.load_pem_x509_certificate(path.read_bytes())
+    except (OSError, ValueError):
+        raise CongraspError(
+            f"{path} is missing or is no certificate.", "Make it with 'congrasp certs', or correct the path."
+        ) from None
+
+
+def read(path: pathlib.Path) -> Certificate:
+    """Reads a certificate's file.
+
+    Raises:
+      CongraspError: it cannot be read, or is no certificate of this project.
+    """
+    made = load(path)
+    names = made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    if not names:
+        return Certificate("ca", 0, (), made.not_valid_after_utc)
+    role, _, number = str(names[0].value).partition(".")
+    if role not in ROLES or not number.isascii() or not number.isdigit() or int(number) >= NUMBERS:
+        raise CongraspError(
+            f"{path} is a certificate for {ascii(names[0].value)[:60]}, which is no role and number.",
+            "Issue one with 'congrasp certs issue'.",
+        )
+    hosts: list[str] = []
+    for extension in made.extensions:
+        if isinstance(extension.value, x509.SubjectAlternativeName):
+            hosts = [str(name.value) for name in extension.value]
+    return Certificate(role, int(number), tuple(hosts), made.not_valid_after_utc)
+
+
+def find(folder: pathlib.Path, role: str) -> tuple[Credentials, Certificate]:
+    """The credentials of a role, and its certificate.
+
+    Args:
+      folder: one that was issued for the role, or the authority's, whose number 0 is then taken.
+      role: one of `ROLES`.
+
+    Raises:
+      CongraspError: they are missing, damaged, expired, or another role's.
+    """
+    if not (folder / CERTIFICATE_FILE).exists() and (folder / f"{role}.0").exists():
+        folder = folder / f"{role}.0"
+    credentials = Credentials(folder, role)
+    for path in (credentials.ca, credentials.certificate, credentials.key):
+        if not os.access(path, os.R_OK):
+            raise CongraspError(f"{path} is missing or cannot be read.", f"Run: {_hint(folder, role)}")
+    certificate = read(credentials.certificate)
+    if certificate.role != role:
+        raise CongraspError(
+            f"{credentials.certificate} is for the role {certificate.role}, not {role}.", f"Run: {_hint(folder, role)}"
+        )
+    for expires, path in (
+        (certificate.expires, credentials.certificate),
+        (read(credentials.ca).expires, credentials.ca),
+    ):
+        if expires <= datetime.datetime.now(datetime.UTC):
+            raise CongraspError(f"{path} expired on {expires:%Y-%m-%d %H:%M} UTC.", f"Run: {_hint(folder, role)}")
+    try:
+        ssl.create_default_context().load_cert_chain(credentials.certificate, credentials.key)
+    except (ssl.SSLError, OSError):
+        raise CongraspError(
+            f"{credentials.key} is not the key of {credentials.certificate}.", f"Run: {_hint(folder, role)}"
+        ) from None
+    return credentials, certificate
+
+
+def _hint(folder: pathlib.Path, role: str) -> str:
+    """The command that makes what is missing."""
+    where = folder.parent if folder.name.partition(".")[0] in ROLES else folder
+    return f"congrasp certs issue {where} --role {role}"

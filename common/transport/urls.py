@@ -1,0 +1,149 @@
+"""Opens transports by URL and role; ports, flows and certificates of a role are decided here alone.
+
+A URL is `SCHEME/ADDRESS`: `tcp/HOST:PORT` and `tls/HOST:PORT` over Zenoh, `memory/NAME` within a process. `SCHEMES`
+has their factories; a transport from elsewhere adds a row to it.
+"""
+
+import importlib.util
+import os
+import pathlib
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+from common.errors import CongraspError
+from common.transport.base import Transport
+from common.transport.keys import FLOWS, Flow
+from common.transport.memory import connect_in_memory, listen_in_memory
+from common.transport.ports import LEARNER_URL
+from common.transport.security import Credentials, check_exposure
+
+Listener = Literal["learner", "server"]
+Peer = Literal["actor", "server", "client", "observer"]
+Certs = str | os.PathLike[str] | None
+"""A folder that 'congrasp certs' made: a role's own, or the authority's."""
+
+LISTENER_FLOWS: dict[Listener, tuple[Flow, ...]] = {"learner": FLOWS, "server": ("policy",)}
+"""By role: the flows that it listens on, which take a port each, from the URL's on."""
+PEER_FLOWS: dict[Peer, tuple[Flow, ...]] = {
+    "actor": FLOWS[:3],
+    "server": FLOWS[:2],
+    "observer": FLOWS[:3],
+    "client": ("policy",),
+}
+"""By role: the flows that it needs at its listener (a client's is a policy server, the others' a learner), of whose
+flows they are the first."""
+
+
+class Endpoint(NamedTuple):
+    """What a scheme's factory is told."""
+
+    url: str
+    role: str
+    """One of `common.transport.security.ROLES`."""
+    listens: bool
+    certs: Certs = None
+    insecure: bool = False
+    """May listen where other machines reach it although nothing protects it."""
+    wait: float = 0.0
+    """Seconds to wait for somebody to listen."""
+
+    @property
+    def address(self) -> str:
+        """What follows the scheme."""
+        return self.url.partition("/")[2]
+
+
+def connect(url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0) -> Transport:
+    """Connects to who listens at a URL.
+
+    Args:
+      url: `SCHEME/ADDRESS` of a learner, or for a client of a policy server.
+      role: what this process is to its peer.
+      certs: folder of the role's certificate, for mutual TLS.
+      wait: seconds to wait for somebody to listen.
+
+    Raises:
+      CongraspError: the URL is malformed, or the certificates are missing, expired, another role's or not accepted.
+      TransportError: nobody listens there.
+    """
+    return _open(Endpoint(url, role, listens=False, certs=certs, wait=wait))
+
+
+def listen(url: str, role: Listener, *, certs: Certs = None, insecure: bool = False) -> Transport:
+    """Listens at a URL.
+
+    Args:
+      url: `SCHEME/ADDRESS`.
+      role: a learner, or a policy server.
+      certs: folder of the role's certificate: mutual TLS, and each role may do only what is its own.
+      insecure: listen beyond loopback without certificates.
+
+    Raises:
+      CongraspError: the URL is malformed or in use, other machines could connect and nothing would protect it, or the
+        certificates are missing, expired or another role's.
+    """
+    return _open(Endpoint(url, role, listens=True, certs=certs, insecure=insecure))
+
+
+def find_credentials(certs: Certs, role: str) -> Credentials | None:
+    """The credentials of a role; None without a folder of certificates.
+
+    Where the package cryptography is absent, as beside a client that needs numpy and Zenoh alone, it is only the peer
+    who judges them.
+
+    Raises:
+      CongraspError: they are missing, damaged, expired, or another role's.
+    """
+    if certs is None:
+        return None
+    if importlib.util.find_spec("cryptography") is None:
+        return Credentials(pathlib.Path(certs), role)
+    from common.transport.certificates import find
+
+    return find(pathlib.Path(certs), role)[0]
+
+
+def name_on_wire(name: str, certs: Certs) -> str:
+    """The name under which an actor works: with certificates it begins with its certificate's number."""
+    if certs is None:
+        return name
+    from common.transport.certificates import find
+    from common.transport.security import actor_name
+
+    return actor_name(find(pathlib.Path(certs), "actor")[1].number, name)
+
+
+def _open(endpoint: Endpoint) -> Transport:
+    scheme = endpoint.url.partition("/")[0]
+    if scheme not in SCHEMES:
+        raise CongraspError(
+            f"'{endpoint.url}' is not an endpoint.", f"Write it like {LEARNER_URL}; schemes: {', '.join(SCHEMES)}."
+        )
+    return SCHEMES[scheme](endpoint)
+
+
+def _open_memory(endpoint: Endpoint) -> Transport:
+    """Nothing leaves the process: every role has all flows, and certificates have nothing to protect."""
+    if endpoint.listens:
+        return listen_in_memory(endpoint.address)
+    return connect_in_memory(endpoint.address, endpoint.wait)
+
+
+def _open_zenoh(endpoint: Endpoint) -> Transport:
+    from common.transport.zenoh_transport import ZenohTransport
+
+    credentials = find_credentials(endpoint.certs, endpoint.role)
+    if endpoint.listens:
+        check_exposure(endpoint.url, credentials, insecure=endpoint.insecure)
+        flows = LISTENER_FLOWS[endpoint.role]  # type: ignore[index]
+        return ZenohTransport(listen=[endpoint.url], flows=flows, credentials=credentials)
+    flows = PEER_FLOWS[endpoint.role]  # type: ignore[index]
+    return ZenohTransport(connect=[endpoint.url], flows=flows, wait=endpoint.wait, credentials=credentials)
+
+
+Factory = Callable[[Endpoint], Transport]
+SCHEMES: dict[str, Factory] = {
+    "memory": _open_memory,
+    **dict.fromkeys(("tcp", "tls", "quic", "udp", "ws"), _open_zenoh),
+}
+"""Who opens the URLs of a scheme."""

@@ -1,0 +1,31 @@
+"""Latency of a policy server in a process of its own."""
+
+import pathlib
+import tempfile
+
+from common.policy import bundle as bundles
+from services.serve.client import PolicyClient
+from services.serve.load import example_episode, measure, processor_seconds, serving, wait_until_ready
+from services.train.command import untrained
+from services.train.presets import get_preset
+
+
+def bench_query(repeat: int, concurrency: int, states: int) -> None:
+    """Prints latencies and rates of queries of an untrained policy, and the server's processor time for an answer.
+
+    Args:
+      repeat: queries in all.
+      concurrency: clients at the same time.
+      states: states in one query.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        policy = pathlib.Path(folder, "policy.safetensors")
+        bundles.save(untrained(get_preset("quickstart")), policy)
+        with serving(policy, pathlib.Path(folder, "serve.log")) as (endpoint, server):
+            episode = example_episode(1_000_000)
+            with PolicyClient(endpoint, wait=60.0) as client:
+                wait_until_ready(client)
+            before = processor_seconds(server)
+            result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0, states=states)
+            result["server_cpu_ms"] = 1e3 * (processor_seconds(server) - before) / repeat / states
+    print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
