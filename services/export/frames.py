@@ -12,6 +12,8 @@ from services.export.motion_file import GraspMotion
 
 OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""
+COLOURS = {"hand": (0.70, 0.73, 0.79), OBJECT: (0.95, 0.62, 0.24)}
+"""Red, green and blue from 0 to 1."""
 TOLERANCE_MM = 0.1
 """Files whose kinematics differ by more than this are not kept."""
 _LEVER = 0.1  # m; a point this far from a frame's origin shows its rotation

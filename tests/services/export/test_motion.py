@@ -5,11 +5,10 @@ import json
 import pathlib
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any
 
 import numpy as np
-import pygltflib
 import pytest
+import trimesh
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
@@ -168,12 +167,30 @@ def test_numbers_that_are_no_poses_are_refused_in_words(human: GraspMotion, tmp_
 
 def test_a_glb_is_y_up_for_others_and_names_its_units(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     path, _ = export([human], "glb", tmp_path)
-    file: Any = pygltflib.GLTF2().load(str(path))
-    (root,) = [file.nodes[i] for i in file.scenes[0].nodes]
-    np.testing.assert_allclose(Rotation.from_quat(root.rotation).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
-    assert root.extras["unit"] == "m" and root.extras["quaternion"] == "x, y, z, w"
-    assert root.extras["joints"] == human.joint_names.tolist()
-    assert all(node.matrix is None for node in file.nodes)
+    content = path.read_bytes()
+    assert content[:8] == b"glTF\x02\0\0\0" and int.from_bytes(content[8:12], "little") == len(content)
+    file = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    (root,) = [file["nodes"][i] for i in file["scenes"][0]["nodes"]]
+    np.testing.assert_allclose(Rotation.from_quat(root["rotation"]).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
+    assert root["extras"]["unit"] == "m" and root["extras"]["quaternion"] == "x, y, z, w"
+    assert root["extras"]["joints"] == human.joint_names.tolist()
+    assert all("matrix" not in node for node in file["nodes"])
+    assert [m["pbrMetallicRoughness"]["metallicFactor"] for m in file["materials"]] == [0.0, 0.0]
+
+
+def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    path, _ = export([human], "glb", tmp_path)
+    scene = trimesh.load_scene(path, process=False)
+    for i, name in enumerate(human.link_names):
+        pose = frames.FROM_Y_UP @ scene.graph.get(str(name))[0]
+        np.testing.assert_allclose(pose[:3, 3], human.link_position[0, i], atol=1e-6)
+        turn = Rotation.from_quat(human.link_quaternion[0, i], scalar_first=True)
+        np.testing.assert_allclose(pose[:3, :3], turn.as_matrix(), atol=1e-6)
+    for k in (0, 9):
+        link = str(human.link_names[human.capsule_link[k]])
+        distance = np.linalg.norm(scene.geometry[link].vertices - human.capsule_ends[k].mean(0), axis=1)
+        half = np.linalg.norm(np.diff(human.capsule_ends[k], axis=0)) / 2 + human.capsule_radius[k]
+        assert np.isclose(distance, half, atol=1e-6).any()  # the pole of the capsule is a vertex
 
 
 def test_neighbouring_quaternions_do_not_jump() -> None:
@@ -182,16 +199,24 @@ def test_neighbouring_quaternions_do_not_jump() -> None:
     assert (np.sum(q[1:] * q[:-1], -1) > 0).all()
 
 
-def test_usd_shapes_are_where_the_capsules_are(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_pixars_library_finds_links_and_shapes_in_a_usd(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     path, _ = export([human], "usd", tmp_path)
     stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(1 / human.control_dt)
     assert "w, x, y, z" in json.loads(stage.GetRootLayer().customLayerData["congrasp"])["quaternion"]
-    cache = UsdGeom.XformCache(3.0)
+    prims = {prim.GetName(): prim for prim in stage.Traverse()}
+    for t in range(T):
+        cache = UsdGeom.XformCache(float(t))
+        for i, name in enumerate(human.link_names):
+            pose = np.array(cache.GetLocalToWorldTransform(prims[str(name)])).T  # USD's vectors are rows
+            turn = Rotation.from_quat(human.link_quaternion[t, i], scalar_first=True)
+            np.testing.assert_allclose(pose[:3, 3], human.link_position[t, i], atol=1e-6)
+            np.testing.assert_allclose(pose[:3, :3], turn.as_matrix(), atol=1e-6)
     k = 9
-    link = int(human.capsule_link[k])
-    prim = next(p for p in stage.Traverse() if p.GetName() == f"capsule_{k}")
+    link, prim = int(human.capsule_link[k]), prims[f"capsule_{k}"]
     half = UsdGeom.Capsule(prim).GetHeightAttr().Get() / 2
-    matrix = np.array(cache.GetLocalToWorldTransform(prim)).T
+    matrix = np.array(UsdGeom.XformCache(3.0).GetLocalToWorldTransform(prim)).T
     ends = (matrix @ [[0, 0], [0, 0], [-half, half], [1, 1]])[:3].T
     turn = Rotation.from_quat(human.link_quaternion[3, link], scalar_first=True)
     np.testing.assert_allclose(ends, turn.apply(human.capsule_ends[k]) + human.link_position[3, link], atol=1e-6)
