@@ -22,8 +22,8 @@ from common.hands.mjcf import WRIST_JOINTS
 from common.hands.spec import Capsule, Hand, Link, link_origin
 from common.task.types import MASKS
 from common.wire.codec import Message, encode
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
-from services.record.poses import link_poses
 
 EPISODE_SCHEMA = "congrasp.Episode"
 SPACING = 0.8
@@ -147,7 +147,7 @@ def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mappin
         for axis, colour in zip(wrist.as_matrix().T, _AXES, strict=True):
             _add_arrow(entity, origin, axis, 0.05, 0.003, colour)
         if mask["pose_finger"]:
-            position, quaternion = link_poses(hand, arrays["goal/pose_q"])
+            position, quaternion = mujoco_link_poses(hand, arrays["goal/pose_q"])
             for k, link in enumerate(hand.links):
                 turn = wrist * Rotation.from_quat(quaternion[k], scalar_first=True)
                 for capsule in link.capsules:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand, link_origin
-from services.record.poses import link_poses
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.viz.raycast import Shape
 from services.viz.render import APPROACH, SKIN, WAYPOINT, arrow, beads, fit, hand_shapes, shape_points, upright
 from services.viz.shade import render_scene
@@ -20,7 +20,7 @@ _VIEW = np.array([0.75, 0.65, 0.35])
 def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = ()) -> list[Shape]:
     """The hand upright with finger angles (F,), some of its links in another colour."""
     turn = upright(hand)
-    position, quaternion = link_poses(hand, q)
+    position, quaternion = mujoco_link_poses(hand, q)
     turned = (turn * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
     colours = [MOVED if i in moved else SKIN for i in range(len(hand.links))]
     return hand_shapes(hand, turn.apply(position), turned, colours)

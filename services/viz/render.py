@@ -17,7 +17,7 @@ from common.hands import get_hand
 from common.hands.spec import Hand, link_origin
 from common.task.types import MASKS
 from common.wire.codec import Message
-from services.record.poses import link_poses
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.reader import read_episodes
 from services.viz.raster import Raster
 from services.viz.raycast import Camera, Scene, Shape, between
@@ -75,7 +75,7 @@ def posed_hand(
     alpha: float = 1.0,
 ) -> list[Shape]:
     """The hand with finger angles (F,) and its wrist at a position (3,) and orientation in the world."""
-    links, quaternion = link_poses(hand, q)
+    links, quaternion = mujoco_link_poses(hand, q)
     turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
     return hand_shapes(hand, wrist.apply(links) + position, turned, [colour] * len(hand.links), alpha)
 
@@ -335,7 +335,7 @@ def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
     up = upright(hand)
     placed = {}
     for name, q in poses.items():
-        position, quaternion = link_poses(hand, q)
+        position, quaternion = mujoco_link_poses(hand, q)
         turned = (up * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
         placed[name] = hand_shapes(hand, up.apply(position), turned)
     points = np.concatenate([shape_points(shape) for shapes in placed.values() for shape in shapes])
@@ -355,7 +355,7 @@ def upright(hand: Hand) -> Rotation:
     fingers = hand.keypoints[len(hand.links) + 1 :].mean(0)
     up = fingers / np.linalg.norm(fingers)
     links = list(hand.tip_links[1:])
-    curl = (link_poses(hand, hand.q_closed)[0] - link_poses(hand, hand.q_open)[0])[links].mean(0)
+    curl = (mujoco_link_poses(hand, hand.q_closed)[0] - mujoco_link_poses(hand, hand.q_open)[0])[links].mean(0)
     palm = curl - (curl @ up) * up
     palm = palm / np.linalg.norm(palm)
     return Rotation.from_matrix(np.stack([palm, np.cross(up, palm), up]))

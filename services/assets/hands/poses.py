@@ -7,7 +7,7 @@ import numpy as np
 
 from common.errors import CongraspError
 from common.hands.spec import Hand, Link, chain_of, wrist_gains
-from services.record.poses import link_poses
+from services.assets.hands.kinematics import mujoco_link_poses
 
 _ALIKE = 0.3  # a range is as long on both sides if its middle is nearer to zero than this share of it
 _TOWARDS = 0.5  # a thumb's joint closes if at least this share of its tip's motion leads to the fingers
@@ -67,7 +67,7 @@ def posed(hand: Hand) -> Hand:
 
 def _tips(hand: Hand, q: np.ndarray) -> np.ndarray:
     """(tips, 3) in the wrist frame, thumb first."""
-    position, quaternion = link_poses(hand, q)
+    position, quaternion = mujoco_link_poses(hand, q)
     found = []
     for i in hand.tip_links:
         link, turn = hand.links[i], np.empty(9)

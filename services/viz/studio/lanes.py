@@ -12,7 +12,7 @@ from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand, link_origin
 from common.task.types import MASKS
 from common.wire.codec import Message
-from services.record.poses import link_poses
+from services.assets.hands.kinematics import mujoco_link_poses
 
 HEADING = (0.25, 0.03)
 """Errors (rad, m) up to which the hand keeps to a heading: those of a grasp that may become a reference."""
@@ -166,7 +166,7 @@ def for_page(episode: Message) -> Message:
         arrays |= {f"lane/{name}/{unit}": np.asarray(value, np.float32) for unit, value in lane.errors.items()}
     if "pose" in found:
         hand, turn = get_hand(str(episode.meta["hand"])), _turn(episode.arrays["goal/pose_quaternion"])
-        position, quaternion = link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
+        position, quaternion = mujoco_link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
         arrays["ghost_position"] = (turn.apply(position) + episode.arrays["goal/pose_position"]).astype(np.float32)
         arrays["ghost_quaternion"] = (turn * _turn(quaternion)).as_quat(scalar_first=True).astype(np.float32)
     words = {name: lane.words for name, lane in found.items()}

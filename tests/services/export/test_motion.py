@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands import get_hand
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.cli.main import main
 from services.export import bvh, frames, glb, lerobot, motion, ros2, urdf, usd
 from services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
 from services.record.channels import Entry
 from services.record.entries import Converter
-from services.record.poses import link_poses
 from services.record.writer import LogWriter
 from tests.episodes import episode
 
@@ -54,14 +54,14 @@ def posed(motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np
 @pytest.fixture(scope="module")
 def human() -> GraspMotion:
     hand = get_hand("human")
-    return posed(motion_of_episode(episode(T)), lambda q: link_poses(hand, q), 0)
+    return posed(motion_of_episode(episode(T)), lambda q: mujoco_link_poses(hand, q), 0)
 
 
 @pytest.fixture(scope="module")
 def robot(human: GraspMotion) -> GraspMotion:
     hand = get_hand("sharpa")
     arrays = dataclasses.replace(human, hand=hand.name, **hand_arrays(hand))
-    return posed(arrays, lambda q: link_poses(hand, q), 1)
+    return posed(arrays, lambda q: mujoco_link_poses(hand, q), 1)
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +224,9 @@ def test_pixars_library_finds_links_and_shapes_in_a_usd(human: GraspMotion, tmp_
 
 def test_a_dataset_of_several_motions(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     hand = get_hand("human")
-    other = dataclasses.replace(posed(human, lambda q: link_poses(hand, q), 9), object="mug", constraints=("heading",))
+    other = dataclasses.replace(
+        posed(human, lambda q: mujoco_link_poses(hand, q), 9), object="mug", constraints=("heading",)
+    )
     path, error = export([human, other, human], "lerobot", tmp_path)
     assert error < 0.01
     info = json.loads((path / "meta" / "info.json").read_text())

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands import get_hand
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.export.motion_file import load_motion, motion_of_episode, save_motion
-from services.record.poses import link_poses
 from tests.episodes import CONTROL_DT, episode
 
 
@@ -52,7 +52,7 @@ def test_the_file_alone_suffices_for_the_kinematics():
             turn = turn * own
         turns.append(turn)
         places.append(place)
-    position, quaternion = link_poses(get_hand("human"), q)
+    position, quaternion = mujoco_link_poses(get_hand("human"), q)
     for link in range(len(motion.link_names)):
         joints = np.flatnonzero(motion.joint_link == link)
         origin = motion.joint_anchor[joints[0]] if len(joints) else np.zeros(3)

@@ -15,9 +15,9 @@ from common.errors import CongraspError
 from common.hands import get_hand, kinematics
 from common.hands.spec import link_origin
 from common.wire.codec import Message, decode
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry
 from services.record.entries import Converter
-from services.record.poses import link_poses
 from services.record.scene import SPACING
 from tests.episodes import CONTROL_DT, FORCE, episode
 
@@ -45,7 +45,7 @@ def quaternion(q: object) -> np.ndarray:
 
 def test_poses_without_jax_agree_with_the_product_of_exponentials() -> None:
     q = np.random.default_rng(0).uniform(HAND.lower, HAND.upper)
-    position, turn = link_poses(HAND, q)
+    position, turn = mujoco_link_poses(HAND, q)
     expected_position, expected_turn = kinematics.link_poses(HAND, jnp.array(q))
     np.testing.assert_allclose(position, expected_position, atol=1e-6)
     np.testing.assert_allclose(np.abs((turn * expected_turn).sum(-1)), 1.0, atol=1e-6)
