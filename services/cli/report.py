@@ -50,7 +50,7 @@ def report(
     from common.policy.pretrained import policy_file
     from learner.run_directory import POLICY_FILE
     from services.assets.objects.named import objects_of
-    from services.cli.progress import tracked
+    from services.cli.console import tracked
     from services.evaluate.evaluator import Evaluator
     from services.evaluate.failures import failure_sheets
     from services.evaluate.report import Made, Picture, causes_in_words, template, write_report
@@ -72,7 +72,9 @@ def report(
     names = [name for table in TABLES.values() for name in table]
     with tracked() as track:
         curves = list(curves_of(run_dir)) if run_dir else []
-        given = objects_of(objects, track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
+        given = (
+            objects_of(objects, track=track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
+        )
         track("Making constraints", None)
         evaluator = Evaluator(
             policy,

@@ -29,8 +29,8 @@ from common.policy.bundle import PolicyBundle
 from common.policy.pretrained import policy_file
 from common.task.types import MASKS, Goal, Surface
 from common.wire.codec import Message
-from services.assets.objects.meshes import ImportOptions
 from services.assets.objects.named import one_object
+from services.assets.objects.options import ImportOptions
 from services.export.motion_file import GraspMotion, motion_of_episode
 from services.grasp.asked import Asked, read_asked
 from services.grasp.beginnings import headings, valid_rests

@@ -7,7 +7,10 @@ from PIL import Image
 
 from common.errors import CongraspError
 from common.objects.store import Catalogue, digest
-from services.cli.objects import find_object, parse
+from services.assets.objects.named import find_object
+from services.cli.main import load
+
+parse = load("objects")
 
 
 def test_generate_list_and_show(tmp_path, capsys):

@@ -52,7 +52,7 @@ class Options:
 
 @dataclasses.dataclass
 class Report:
-    """What became of each sequence."""
+    """The outcome of each sequence."""
 
     kept: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     dropped: list[dict[str, str]] = dataclasses.field(default_factory=list)

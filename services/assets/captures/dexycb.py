@@ -20,6 +20,7 @@ from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
 from services.assets.captures.sequence import Dropped, Sequence
 
+HOLDS = "<date>-subject-01/<session>/meta.yml"
 OBJECTS = (
     *("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle"),
     *("007_tuna_fish_can", "008_pudding_box", "009_gelatin_box", "010_potted_meat_can", "011_banana"),

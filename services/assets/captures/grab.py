@@ -21,6 +21,7 @@ from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
 from services.assets.captures.sequence import FINGERS, Dropped, Sequence
 
+HOLDS = "s1/*.npz and the other subjects"
 _LABELS = {"thumb": (53, 55), "index": (41, 43), "middle": (44, 46), "ring": (50, 52), "little": (47, 49)}
 """First and last contact label of each right finger."""
 

@@ -20,6 +20,7 @@ from services.assets.captures.fit import joint_positions
 from services.assets.captures.objects import Meshes
 from services.assets.captures.sequence import Dropped, Sequence
 
+HOLDS = "MyoHand_<object>_<action>.npz"
 _KEYS = {"time": 0, "robot": 29, "object": 7}
 _BASE = np.array([0.1, -0.55, 0.32])
 _ELBOW = np.array([0.002797970, 0.304212085, -0.000513865])

@@ -25,6 +25,7 @@ from services.assets.captures.objects import Meshes
 from services.assets.captures.sequence import Dropped, Part, Sequence
 from services.assets.objects.sources import read_mesh
 
+HOLDS = "anno/seq_all.json"
 _Frames = list[tuple[int, str]]
 
 

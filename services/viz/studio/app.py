@@ -7,14 +7,14 @@ import threading
 from collections.abc import Callable, Iterator
 
 from common.errors import CongraspError
-from common.objects import procedural, store
+from common.objects import procedural
 from common.objects.pool import HELD_OUT_SEED
 from common.objects.spec import GraspObject
 from common.policy.pretrained import policy_file, shipped_hands
 from common.transport.security import check_exposure
 from common.transport.zenoh_transport import ZenohTransport
-from services.assets.objects.meshes import ImportOptions, import_source
-from services.assets.objects.sources import find_sources
+from services.assets.objects.named import objects_at, one_object
+from services.assets.objects.options import ImportOptions
 from services.ops.access import credentials
 from services.ops.logs import say
 from services.serve.server import follow_file, follow_run
@@ -103,10 +103,7 @@ def catalogue(objects: pathlib.Path | None) -> Catalogue:
     """
     makers: dict[str, Callable[[], GraspObject]] = {}
     if objects is not None:
-        files = [objects] if objects.suffix == store.SUFFIX else sorted(objects.glob(f"*{store.SUFFIX}"))
-        makers |= {file.name.removesuffix(store.SUFFIX): functools.partial(store.load, file) for file in files}
-        for source in [] if files else find_sources(objects):
-            makers[source.name] = functools.partial(lambda source: import_source(source, _GUESS)[0], source)
+        makers |= {found.name: functools.partial(found.load, _GUESS) for found in objects_at(objects)}
     families = sorted(procedural.FAMILIES, key=lambda family: family != _FIRST)
     makers |= {family: functools.partial(procedural.generate, HELD_OUT_SEED, family) for family in families}
     return Catalogue(makers)
@@ -114,7 +111,8 @@ def catalogue(objects: pathlib.Path | None) -> Catalogue:
 
 def take_mesh(path: pathlib.Path) -> tuple[GraspObject, list[str]]:
     """Imports one mesh; what the user should know about it comes with it."""
-    return import_source(find_sources(path)[0], _GUESS)
+    obj = one_object(path, _GUESS)
+    return obj, list(obj.notes)
 
 
 def _read(window: TrainingWindow, recordings: pathlib.Path) -> None:

@@ -9,7 +9,8 @@ import trimesh
 
 from common.errors import CongraspError
 from services.assets.objects import repair
-from services.assets.objects.meshes import ImportOptions, import_source
+from services.assets.objects.meshes import import_source
+from services.assets.objects.options import ImportOptions
 from services.assets.objects.repair import closed, largest_body, reduced
 from services.assets.objects.sources import find_sources
 
