@@ -64,8 +64,8 @@ def motion(
     target = out or pathlib.Path(f"{paths[0].stem}{FORMATS[to] or f'-{to}'}")
     motions = [pick_motion(path, index, success=success) for path in paths]
     error = export_motions(motions, to, target)
-    moments = sum(len(motion.time) for motion in motions)
-    print(f"{target}: {moments} moments, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
+    frames = sum(len(motion.time) for motion in motions)
+    print(f"{target}: {frames} frames, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
     return 0
 
 

@@ -17,7 +17,7 @@ def view(
     """Ask for a grasp in the browser and see it: aim the arrow, paint what must not be touched, draw the wrist's path.
 
     With --connect it takes the newest weights of a run that is being trained and shows the run: its curves, its actors
-    and their episodes. With --recordings a click on a curve finds the episodes of that moment.
+    and their episodes. With --recordings a click on a curve finds the episodes of that time.
 
     Args:
       objects: Your own objects: a mesh, a folder of meshes, or what 'congrasp objects import' made.

@@ -1,4 +1,4 @@
-"""Where every link and the object are at every moment: what each format is made from, and what each is checked by."""
+"""Poses of every link and of the object over time: what each format is made from, and what each is checked by."""
 
 import re
 from collections.abc import Sequence
@@ -84,11 +84,11 @@ def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
 def error_mm(motion: GraspMotion, track: Track) -> float:
     """Largest distance in mm between where a point is and where the file has it.
 
-    The points are each frame's origin and three a decimetre away along its axes, at every moment, and the object's
+    The points are each frame's origin and three a decimetre away along its axes, at every time, and the object's
     triangles in its frame.
 
     Raises:
-      CongraspError: the file has other frames or moments than the motion.
+      CongraspError: the file has other bodies or times than the motion.
     """
     turns = Rotation.from_quat(motion.link_quaternion.reshape(-1, 4), scalar_first=True)
     links = pose_matrices(motion.link_position.reshape(-1, 3), turns).reshape(*motion.link_position.shape[:2], 4, 4)
@@ -98,7 +98,7 @@ def error_mm(motion: GraspMotion, track: Track) -> float:
     if odd := sorted(expected.keys() ^ track.poses.keys()):
         raise CongraspError(f"The file lacks or should not have the frame '{odd[0]}'.")
     if track.time.shape != motion.time.shape or np.abs(track.time - motion.time).max() > _SAME_TIME:
-        raise CongraspError("The file has other moments than the motion.")
+        raise CongraspError("The file has other times than the motion.")
     points = np.concatenate([np.zeros((1, 3)), _LEVER * np.eye(3)])
     points = np.concatenate([points, np.ones((4, 1))], 1).T
     distances = [np.linalg.norm(((expected[name] - track.poses[name]) @ points)[:, :3], axis=1) for name in expected]

@@ -1,7 +1,7 @@
 """A grasp motion as one NPZ file that says itself what its numbers mean; what exports and other programs start from.
 
 Metres, radians, seconds, newtons; quaternions are (w, x, y, z) and turn a body's frame into the world. The world's z
-axis points up and the table's top is at z = 0. T moments, F finger joints, L links, C capsules, K waypoints.
+axis points up and the table's top is at z = 0. T frames, F finger joints, L links, C capsules, K waypoints.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ class GraspMotion:
     success: bool
     """Whether the object was held a quarter of a second after the table went; `metrics["held"]`: to the end."""
     control_dt: float
-    """Seconds between two moments."""
+    """Seconds between two frames."""
     constraints: tuple[str, ...]
     """Active constraints: heading, affordance, pose, trajectory."""
     metrics: dict[str, float]

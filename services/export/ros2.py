@@ -1,7 +1,7 @@
 """A ROS 2 bag (MCAP): written by rosbags, read back by mcap and mcap-ros2-support.
 
-Topics: `/robot_description` (URDF), `/joint_trajectory` (all moments, finger joints), `/wrist_trajectory` (all moments,
-the palm in the world), `/joint_states`, `/tf` (moment by moment) and `/object` (a marker with the mesh).
+Topics: `/robot_description` (URDF), `/joint_trajectory` (all frames, finger joints), `/wrist_trajectory` (all frames,
+the palm in the world), `/joint_states`, `/tf` (frame by frame) and `/object` (a marker with the mesh).
 """
 
 import json

@@ -116,6 +116,31 @@ def read_episodes(path: pathlib.Path) -> Iterator[Message]:
     return _messages(path, EPISODE_SCHEMA, lambda topic: topic.startswith("/episode/") and topic.endswith("/raw"))
 
 
+def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Message:
+    """One of the recorded episodes at `path`.
+
+    Args:
+      path: a file or a folder.
+      index: from 0; -1 is the last.
+      success: count only episodes that succeeded.
+
+    Raises:
+      CongraspError: there is none of this index; the line says how many there are.
+    """
+    last: collections.deque[Message] = collections.deque(maxlen=max(1, -index))
+    count = 0
+    for episode in read_episodes(path):
+        if episode.meta["success"] or not success:
+            last.append(episode)
+            count += 1
+            if count == index + 1:
+                break
+    if not -count <= index < count:
+        kind = "successful episodes" if success else "episodes"
+        raise CongraspError(f"{path} holds {count} {kind}, not one with index {index}.")
+    return last[0 if index < 0 else -1]
+
+
 def read_rollouts(path: pathlib.Path) -> Iterator[Message]:
     """The recorded rollouts at `path`, a file or a folder, as the actors sent them, in the order of recording.
 

@@ -24,15 +24,15 @@ from common.task.types import MASKS
 from common.wire.codec import Message, encode
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
+from services.record.palette import HEADING, OBJECT, SKIN, TABLE, WAYPOINT
 
 EPISODE_SCHEMA = "congrasp.Episode"
 SPACING = 0.8
 """Metres between two actors' frames in the world."""
 Colour = tuple[float, float, float, float]
-_SKIN, _GHOST = (0.70, 0.73, 0.79, 1.0), (0.22, 0.40, 0.86, 0.25)
-_OBJECT, _TABLE = (0.95, 0.62, 0.24, 1.0), (0.80, 0.79, 0.77, 1.0)
+_SKIN, _GHOST, _OBJECT, _TABLE = (*SKIN, 1.0), (*HEADING, 0.25), (*OBJECT, 1.0), (*TABLE, 1.0)
 _PLUS, _MINUS = (0.20, 0.65, 0.32, 1.0), (0.80, 0.16, 0.16, 1.0)
-_HEADING, _WAYPOINT, _FORCE = (0.22, 0.40, 0.86, 1.0), (0.53, 0.30, 0.75, 1.0), (0.93, 0.26, 0.21, 1.0)
+_HEADING, _WAYPOINT, _FORCE = (*HEADING, 1.0), (*WAYPOINT, 1.0), (0.93, 0.26, 0.21, 1.0)
 _AXES = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.7, 0.2, 1.0), (0.2, 0.3, 0.9, 1.0))
 _ARROW = 0.10  # length of the approach arrow, m
 _FORCE_LENGTH, _FORCE_MAX = 0.01, 0.10  # m per newton, and the longest arrow

@@ -6,20 +6,11 @@ from scipy.spatial.transform import Rotation
 from common.constraints.headings import INWARD
 from common.hands import get_hand
 from common.wire.codec import Message
+from services.record.palette import HEADING, OBJECT, WAYPOINT
 from services.viz.raycast import Shape
-from services.viz.render import (
-    APPROACH,
-    OBJECT,
-    OBJECT_MINUS,
-    SKIN,
-    WAYPOINT,
-    arrow,
-    beads,
-    fit,
-    posed_hand,
-    table_shape,
-)
+from services.viz.render import OBJECT_AVOID
 from services.viz.shade import render_scene
+from services.viz.shapes import arrow, beads, fit, posed_hand, table_shape
 from services.viz.sheets import contact_sheet
 
 _ARROWS, _PATHS = 14, 4
@@ -51,7 +42,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
         for h in some(arrays["heading/allowed"][v, rest], _ARROWS):
             direction = turn.apply(arrays["heading/direction"][v, h])
             tip = turn.apply(arrays["heading/position"][v, h]) + place[:3] - (INWARD + _GAP) * direction
-            shapes += arrow(tip - _ARROW_LENGTH * direction, tip, 0.0016, APPROACH)
+            shapes += arrow(tip - _ARROW_LENGTH * direction, tip, 0.0016, HEADING)
         return shapes
 
     def paths(v: int, chosen: np.ndarray) -> list[Shape]:
@@ -62,11 +53,11 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
         for m in chosen:
             wrist = turn * Rotation.from_quat(arrays["pose/quaternion"][v, m], scalar_first=True)
             position = turn.apply(arrays["pose/position"][v, m]) + place[:3]
-            shapes += posed_hand(hand, arrays["pose/q"][v, m], position, wrist, SKIN)
+            shapes += posed_hand(hand, arrays["pose/q"][v, m], position, wrist)
         return shapes
 
     minus = arrays["surface/minus"]
-    thing = Shape(
+    body = Shape(
         "mesh",
         (0, 0, 0),
         OBJECT,
@@ -75,7 +66,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
         vertices=arrays["visual/vertices"],
         faces=arrays["visual/faces"],
         paint_points=arrays["surface/points"],
-        paint_colours=np.where(minus[:, None], OBJECT_MINUS, OBJECT),
+        paint_colours=np.where(minus[:, None], OBJECT_AVOID, OBJECT),
     )
     clear = arrays["pose/allowed"][:, rest]
     whole, plus = some(clear[0], _PATHS), some(clear[1], _PATHS)
@@ -92,7 +83,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
     for shapes in panels.values():
         extent = np.concatenate([solid, *(_extent(shape) for shape in shapes)])
         camera = fit(extent, np.array(_VIEW), _SIZE[0] / _SIZE[1])
-        images.append(render_scene([*shapes, thing, table_shape(place[:3])], camera, _SIZE))
+        images.append(render_scene([*shapes, body, table_shape(place[:3])], camera, _SIZE))
     title = f"{meta['object']}, {meta['hand']} hand, resting pose {rest + 1} of {len(arrays['rest'])}; O- in dark red"
     return contact_sheet(images, list(panels), columns=3, title=title)
 

@@ -3,27 +3,22 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand, link_origin
-from services.assets.hands.kinematics import mujoco_link_poses
+from services.record.palette import HEADING, OBJECT, SKIN, WAYPOINT
 from services.viz.raycast import Shape
-from services.viz.render import APPROACH, SKIN, WAYPOINT, arrow, beads, fit, hand_shapes, shape_points, upright
 from services.viz.shade import render_scene
+from services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, upright
 from services.viz.sheets import contact_sheet
 
-MOVED = (0.95, 0.62, 0.24)
 _VIEW = np.array([0.75, 0.65, 0.35])
 
 
 def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = ()) -> list[Shape]:
     """The hand upright with finger angles (F,), some of its links in another colour."""
-    turn = upright(hand)
-    position, quaternion = mujoco_link_poses(hand, q)
-    turned = (turn * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
-    colours = [MOVED if i in moved else SKIN for i in range(len(hand.links))]
-    return hand_shapes(hand, turn.apply(position), turned, colours)
+    colours = [OBJECT if i in moved else SKIN for i in range(len(hand.links))]
+    return posed_hand(hand, q, np.zeros(3), upright(hand), colours)
 
 
 def _frame(hand: Hand) -> list[Shape]:
@@ -33,7 +28,7 @@ def _frame(hand: Hand) -> list[Shape]:
     ends = frame.center + np.outer([-0.5, 0.5], frame.opening * frame.cross)
     forward = turn.apply(np.array([frame.center - reach * frame.heading, frame.center]))
     return [
-        *arrow(forward[0], forward[1], 0.0028, APPROACH),
+        *arrow(forward[0], forward[1], 0.0028, HEADING),
         beads(turn.apply(ends), 0.005, WAYPOINT),
     ]
 
@@ -45,7 +40,25 @@ def _side(hand: Hand) -> np.ndarray:
 
 
 def _points(shapes: Sequence[Shape]) -> np.ndarray:
+    """(n, 3) points that a picture of the shapes must hold."""
     return np.concatenate([shape_points(shape) for shape in shapes])
+
+
+def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
+    """The hand open, half closed and closed (columns), from the palm, the thumb's side and between (rows)."""
+    poses = {"open": hand.q_open, "half closed": (hand.q_open + hand.q_closed) / 2, "closed": hand.q_closed}
+    up = upright(hand)
+    placed = {name: posed_hand(hand, q, np.zeros(3), up) for name, q in poses.items()}
+    points = np.concatenate([_points(shapes) for shapes in placed.values()])
+    thumb = np.sign(up.apply(hand.keypoints[len(hand.links)])[1])
+    images, labels = [], []
+    for view, azimuth in {"palm": 0.0, "between": 50.0, "thumb's side": 95.0}.items():
+        angle = thumb * np.radians(azimuth)
+        camera = fit(points, np.array([np.cos(angle), np.sin(angle), 0.25]), size[0] / size[1])
+        images += [render_scene(shapes, camera, size) for shapes in placed.values()]
+        labels += [f"{name}, {view}" for name in placed]
+    title = f"{hand.name} hand: {len(hand.joints)} finger joints, {len(hand.links)} links"
+    return contact_sheet(images, labels, columns=len(poses), title=title)
 
 
 def hands_sheet(hands: Sequence[Hand], *, size: tuple[int, int] = (300, 300)) -> np.ndarray:

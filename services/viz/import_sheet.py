@@ -12,9 +12,10 @@ from common.objects.spec import GraspObject
 from services.assets.objects.repair import MAX_FACES
 from services.assets.objects.sizes import length, size_in_words
 from services.assets.objects.sources import Source, read_mesh
+from services.record.palette import OBJECT
 from services.viz.raster import Raster
 from services.viz.raycast import Shape
-from services.viz.render import OBJECT, SKIN, fit, posed_hand, shape_points, upright
+from services.viz.shapes import fit, posed_hand, shape_points, upright
 from services.viz.sheets import contact_sheet
 
 Body = tuple[np.ndarray, np.ndarray, tuple[float, float, float]]
@@ -82,8 +83,8 @@ def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
         Shape("mesh", (0, 0, 0), colour, vertices=vertices - middle, faces=faces) for vertices, faces, colour in bodies
     ]
     turn = upright(hand)
-    standing = posed_hand(hand, hand.q_open, np.zeros(3), turn, SKIN)
+    standing = posed_hand(hand, hand.q_open, np.zeros(3), turn)
     own = np.concatenate([shape_points(shape) for shape in standing])
     side = (high[1] - low[1]) / 2 + _GAP - own[:, 1].min()
     place = np.array([-own[:, 0].mean(), side, -own[:, 2].min()])
-    return shapes + posed_hand(hand, hand.q_open, place, turn, SKIN)
+    return shapes + posed_hand(hand, hand.q_open, place, turn)

@@ -2,7 +2,7 @@
 
 `anno/seq_all.json` lists [sequence, subject, frame, camera]; `anno/general_info/<those joined by __>.pkl` holds
 `hand_anno` (`hand_pose (16, 4)` quaternions (w, x, y, z), `hand_shape (10,)`, and `hand_tsl (3,)`, which is the wrist
-itself) and `obj_anno (4, 4)`. The same moments are annotated for several cameras, of which one is taken; frames are
+itself) and `obj_anno (4, 4)`. The same frames are annotated for several cameras, of which one is taken; frames are
 sorted. An object's mesh is centred on its bounding box before the annotated pose moves it.
 `OakBase/<category>/<object>` holds `part_*.ply` with `part_*.json`.
 """

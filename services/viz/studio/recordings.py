@@ -1,4 +1,4 @@
-"""Episodes of a moment, from a run's MCAP files."""
+"""Episodes around a time, from a run's MCAP files."""
 
 import pathlib
 import threading
@@ -13,7 +13,7 @@ from services.record.reader import is_complete, log_files, read_records
 from services.record.scene import EPISODE_SCHEMA
 
 MOST = 60
-"""Episodes that one search finds at most; the nearest to the moment."""
+"""Episodes that one search finds at most; the nearest to the time."""
 FARTHER = (1.0, 5.0, 25.0)
 """Factors by which it is looked farther where there is no episode."""
 

@@ -145,7 +145,7 @@ def test_a_file_that_is_off_is_not_kept(
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_a_single_moment_is_a_motion(human: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
+def test_a_single_frame_is_a_motion(human: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
     cut = {
         name: getattr(human, name)[:1]
         for name in vars(human)
@@ -278,7 +278,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     save_motion(tmp_path / "mug.npz", motion_of_episode(episode(T)))
     assert run("logs", "--to", "bvh") == 0
     assert run("mug.npz") == 0
-    assert "mug.glb: 7 moments, largest error" in capsys.readouterr().out
+    assert "mug.glb: 7 frames, largest error" in capsys.readouterr().out
     assert run("mug.npz", "logs", "--to", "lerobot") == 0
     made = {"logs.bvh", "logs.bvh.json", "mug-lerobot", "mug.glb"}
     assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *made}
