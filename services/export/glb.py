@@ -21,9 +21,10 @@ from services.export.frames import (
     TO_Y_UP,
     Track,
     bodies,
+    capsules,
+    continuous_quaternions,
     facts,
     pose_matrices,
-    quaternions,
 )
 from services.export.motion_file import GraspMotion
 
@@ -55,7 +56,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         if shape is not None:
             node.mesh = len(file.meshes)
             file.meshes.append(gltf.Mesh(name=body.name, primitives=[_primitive(file, data, body.name, shape)]))
-        tracks = {"rotation": quaternions(body.rotation, scalar_first=False)}
+        tracks = {"rotation": continuous_quaternions(body.rotation, scalar_first=False)}
         if len(body.translation) > 1:
             tracks["translation"] = body.translation
         for name, values in tracks.items():
@@ -107,14 +108,10 @@ def _primitive(file: gltf.GLTF2, data: bytearray, name: str, mesh: trimesh.Trime
 def _link_mesh(motion: GraspMotion, link: int) -> Any:
     """The link's capsules in its frame; None if it has none."""
     parts = []
-    for k in np.flatnonzero(motion.capsule_link == link):
-        (start, end), radius = motion.capsule_ends[k].astype(float), float(motion.capsule_radius[k])
-        length = float(np.linalg.norm(end - start))
+    for _, length, radius, middle, turn in capsules(motion, link):
         part = trimesh.creation.capsule(length, radius, _SECTIONS)
-        part.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], end - start) if length else np.eye(4))
-        # trimesh centres a capsule at its middle.
-        part.apply_translation((start + end) / 2 - part.bounds.mean(0))
-        parts.append(part)
+        part.apply_translation(-part.bounds.mean(0))
+        parts.append(part.apply_transform(pose_matrices(middle[None], turn)[0]))
     return trimesh.util.concatenate(parts) if parts else None
 
 

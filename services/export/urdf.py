@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from services.export.frames import pose_matrices
+from services.export.frames import capsules, pose_matrices
 from services.export.motion_file import GraspMotion
 
 _MASS, _INERTIA = "0.01", "1e-6"
@@ -64,15 +64,12 @@ def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, off
 
 def _add_capsules(link: ET.Element, motion: GraspMotion, index: int) -> None:
     """Each capsule as a cylinder and two spheres, which is what URDF has."""
-    for k in np.flatnonzero(motion.capsule_link == index):
-        (start, end), radius = motion.capsule_ends[k].astype(float), _number(motion.capsule_radius[k])
-        length = float(np.linalg.norm(end - start))
-        for end_point in (start, end):
-            ET.SubElement(_visual(link, end_point, np.zeros(3)), "sphere", radius=radius)
+    for number, length, radius, middle, turn in capsules(motion, index):
+        for end in motion.capsule_ends[number]:
+            ET.SubElement(_visual(link, end, np.zeros(3)), "sphere", radius=_number(radius))
         if length:
-            turn = Rotation.align_vectors([end - start], [[0, 0, 1]])[0]
-            visual = _visual(link, (start + end) / 2, turn.as_euler("xyz"))
-            ET.SubElement(visual, "cylinder", radius=radius, length=_number(length))
+            visual = _visual(link, middle, turn.as_euler("xyz"))
+            ET.SubElement(visual, "cylinder", radius=_number(radius), length=_number(length))
 
 
 def _visual(link: ET.Element, position: np.ndarray, angles: np.ndarray) -> ET.Element:

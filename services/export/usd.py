@@ -14,7 +14,17 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
 
-from services.export.frames import COLOURS, OBJECT, Track, bodies, facts, identifiers, pose_matrices, quaternions
+from services.export.frames import (
+    COLOURS,
+    OBJECT,
+    Track,
+    bodies,
+    capsules,
+    continuous_quaternions,
+    facts,
+    identifiers,
+    pose_matrices,
+)
 from services.export.motion_file import GraspMotion
 
 _NAME = "congrasp:name"
@@ -43,7 +53,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         translate, orient = xform.AddTranslateOp(_DOUBLE), xform.AddOrientOp(_DOUBLE)
         if len(body.translation) == 1:
             translate.Set(Gf.Vec3d(*body.translation[0]))
-        for t, turn in enumerate(quaternions(body.rotation, scalar_first=True)):
+        for t, turn in enumerate(continuous_quaternions(body.rotation, scalar_first=True)):
             orient.Set(Gf.Quatd(*turn), t)
             if len(body.translation) > 1:
                 translate.Set(Gf.Vec3d(*body.translation[t]), t)
@@ -56,17 +66,14 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 
 def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link: int) -> None:
     """The link's capsules in its frame."""
-    for k in np.flatnonzero(motion.capsule_link == link):
-        (start, end), radius = motion.capsule_ends[k].astype(float), float(motion.capsule_radius[k])
-        length = float(np.linalg.norm(end - start))
-        turn = Rotation.align_vectors([end - start], [[0, 0, 1]])[0] if length else Rotation.identity()
-        capsule = UsdGeom.Capsule.Define(stage, parent.AppendChild(f"capsule_{k}"))
+    for number, length, radius, middle, turn in capsules(motion, link):
+        capsule = UsdGeom.Capsule.Define(stage, parent.AppendChild(f"capsule_{number}"))
         capsule.CreateAxisAttr(UsdGeom.Tokens.z)
         capsule.CreateHeightAttr(length)
         capsule.CreateRadiusAttr(radius)
         capsule.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(capsule, Usd.TimeCode.Default()))
         capsule.CreateDisplayColorAttr([COLOURS["hand"]])
-        capsule.AddTranslateOp(_DOUBLE).Set(Gf.Vec3d(*(start + end) / 2))
+        capsule.AddTranslateOp(_DOUBLE).Set(Gf.Vec3d(*middle))
         capsule.AddOrientOp(_DOUBLE).Set(Gf.Quatd(*turn.as_quat(scalar_first=True)))
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from common.hands.spec import Hand
 from common.objects.shapes import tessellate
 from common.objects.spec import GraspObject
-from services.assets.objects.repair import MAX_FACES
+from services.assets.objects.repair import with_few_faces
 from services.assets.objects.sizes import length, size_in_words
 from services.assets.objects.sources import Source, read_mesh
 from services.record.palette import OBJECT
@@ -71,7 +71,7 @@ def mesh_of_file(source: Source) -> trimesh.Trimesh | None:
     if sum(path.stat().st_size for path in files) > _LARGE_FILE:
         return None
     whole: Any = trimesh.util.concatenate([read_mesh(path) for path in files])
-    return whole if len(whole.faces) <= MAX_FACES else whole.simplify_quadric_decimation(face_count=MAX_FACES)
+    return with_few_faces(whole)
 
 
 def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:

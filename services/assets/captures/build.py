@@ -3,7 +3,6 @@
 import collections
 import dataclasses
 import pathlib
-import re
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
@@ -26,6 +25,7 @@ from services.assets.captures.sequence import Dropped, Sequence
 from services.assets.captures.transfer import demonstrated_headings, transferred
 from services.assets.objects.affordance import near_points, relabelled, two_parts
 from services.assets.objects.meshes import UNLABELLED
+from services.assets.objects.sources import safe_name
 from services.grasp.constraint_sets import set_of
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
@@ -143,7 +143,7 @@ def _shape(
 ) -> tuple[GraspObject, Surface]:
     if sequence.mesh not in shapes:
         try:
-            obj = load_object(sequence.mesh, _name(sequence.object_name))
+            obj = load_object(sequence.mesh, safe_name(sequence.object_name))
             # Without labelled parts the whole surface may be grasped.
             obj = dataclasses.replace(obj, graspable=np.ones_like(obj.graspable))
             shapes[sequence.mesh] = obj, Surface(obj)
@@ -164,7 +164,7 @@ def _labelled(
         return obj
     if affordance == "contacts":
         touched = near_points(obj, demonstration.contact, _TOUCHED)
-        return _with_region(sequence, lambda: two_parts(obj, touched, _name(f"{obj.name}-{sequence.name}")))
+        return _with_region(sequence, lambda: two_parts(obj, touched, safe_name(f"{obj.name}-{sequence.name}")))
     if not names:
         raise Dropped(sequence.name, "no labelled parts", f"the parts of '{sequence.object_name}' are not labelled")
     labels = _nearest(clouds, obj.points)
@@ -174,7 +174,7 @@ def _labelled(
         reason = f"fingers touch no part in {_VERTICES} points ({counts.max()} at most)"
         raise Dropped(sequence.name, "no part touched", reason)
     touched_names = [name for name, touched in zip(names, plus, strict=True) if touched]
-    name = obj.name if plus.all() else _name("-".join([obj.name, *touched_names]))
+    name = obj.name if plus.all() else safe_name("-".join([obj.name, *touched_names]))
     return _with_region(sequence, lambda: relabelled(obj, labels, names, [bool(part) for part in plus], name))
 
 
@@ -245,8 +245,3 @@ def _ends_nearer_to_plus(wrist: np.ndarray, points: np.ndarray, minus: np.ndarra
     """(M,) bool: wrist positions (M, 3) that agree with the affordance (`common.constraints.priority`)."""
     away = np.linalg.norm(points[None] - wrist[:, None], axis=-1)
     return away[:, ~minus].min(-1, initial=np.inf) < away[:, minus].min(-1, initial=np.inf)
-
-
-def _name(text: str) -> str:
-    """A text as the name of an object."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object"

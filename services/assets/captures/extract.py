@@ -19,6 +19,7 @@ from common.hands.human import HUMAN
 from common.objects.spec import GraspObject
 from services.assets.captures.fit import Fit, fit
 from services.assets.captures.sequence import FINGERS, Dropped, Sequence
+from services.export.frames import continuous_quaternions
 
 STABLE = 5
 """Frames that thumb and another finger must touch in a row."""
@@ -263,11 +264,4 @@ def _resampled(path: np.ndarray, turns: Rotation, waypoints: int) -> tuple[np.nd
     length, path, turns = length[keep], path[keep], turns[keep]
     wanted = np.linspace(length[0], length[-1], waypoints)
     position = np.stack([np.interp(wanted, length, axis) for axis in path.T], -1)
-    return position, continuous(Slerp(length, turns)(wanted))
-
-
-def continuous(turns: Rotation) -> np.ndarray:
-    """(K, 4) quaternions w x y z of rotations along a path, without a change of sign between neighbours."""
-    quaternion = turns.as_quat(scalar_first=True)
-    signs = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
-    return quaternion * np.cumprod([1.0, *signs])[:, None]
+    return position, continuous_quaternions(Slerp(length, turns)(wanted), scalar_first=True)

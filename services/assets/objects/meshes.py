@@ -24,7 +24,6 @@ from services.assets.objects.sources import MeshFile, Source, read_mesh
 UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""
 _CACHE_VERSION = 3
-_MAX_FACES = 20_000
 
 
 def import_source(source: Source, options: ImportOptions) -> GraspObject:
@@ -102,7 +101,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
             dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
             for piece, vote in zip(pieces, votes, strict=True)
         )
-    picture = _reduced(whole)
+    picture = repair.with_few_faces(whole)
     obj = GraspObject(
         name=source.name,
         family="imported",
@@ -128,11 +127,6 @@ def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
     return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)
-
-
-def _reduced(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with at most `_MAX_FACES` faces."""
-    return mesh if len(mesh.faces) <= _MAX_FACES else mesh.simplify_quadric_decimation(face_count=_MAX_FACES)
 
 
 def _corners(file: MeshFile) -> np.ndarray:
@@ -167,7 +161,7 @@ def _pieces(
             limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
             groups = []
             for mesh, limit in zip(meshes, limits, strict=True):
-                small = _reduced(mesh)
+                small = repair.with_few_faces(mesh)
                 found = decompose.decompose(
                     np.asarray(small.vertices),
                     np.asarray(small.faces),

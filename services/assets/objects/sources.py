@@ -67,7 +67,7 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
     """
     path = pathlib.Path(path)
     if path.is_file():
-        return [Source(_name(path.stem), path, (MeshFile(path, "visual"),))]
+        return [Source(safe_name(path.stem), path, (MeshFile(path, "visual"),))]
     if not path.is_dir():
         raise CongraspError(f"There is no file or folder {path}.", "Check the path.")
     meshes = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
@@ -121,7 +121,7 @@ def _nested(folder: pathlib.Path) -> list[Source]:
 
 
 def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]:
-    name = _name(folder.resolve().name)
+    name = safe_name(folder.resolve().name)
     two = _two_parts(meshes)
     if two:
         return [Source(name, folder, two, (), two)]
@@ -130,7 +130,7 @@ def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]
     main = next((file for file in others if all(o.stem.startswith(file.stem) for o in others)), None)
     if others and main is None:
         if not pieces:
-            return [Source(_name(file.stem), file, (MeshFile(file, "visual"),)) for file in others]
+            return [Source(safe_name(file.stem), file, (MeshFile(file, "visual"),)) for file in others]
         raise CongraspError(
             f"The folder {folder} has contact pieces, but it is not clear which mesh shows the whole object.",
             f"Name it {name}{others[0].suffix} and its parts {name}_<part>{others[0].suffix}.",
@@ -161,7 +161,7 @@ def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
     return tuple(MeshFile(found[key], "part", names[key], key) for key in (True, False) if key in found)
 
 
-def _name(text: str) -> str:
-    """A name that can be a file name."""
+def safe_name(text: str) -> str:
+    """A text as the name of an object, which can be a file name."""
     safe = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in text).lstrip("._-")
     return safe or "object"

@@ -16,7 +16,7 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.cli.main import main
-from services.export import bvh, frames, glb, lerobot, motion, ros2, urdf, usd
+from services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
 from services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
 from services.record.channels import Entry
 from services.record.entries import Converter
@@ -25,7 +25,7 @@ from tests.episodes import episode
 
 T = 7
 MODULES: dict[str, ModuleType] = {"glb": glb, "usd": usd, "bvh": bvh, "ros2": ros2, "lerobot": lerobot}
-FORMATS = list(motion.FORMATS)
+FORMATS = list(motion_formats.FORMATS)
 
 
 def posed(motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], seed: int) -> GraspMotion:
@@ -103,8 +103,8 @@ def odd_hand(human: GraspMotion) -> GraspMotion:
 
 
 def export(motions: Sequence[GraspMotion], kind: str, folder: pathlib.Path) -> tuple[pathlib.Path, float]:
-    path = folder / f"motion{motion.FORMATS[kind]}"
-    return path, motion.export_motions(motions, kind, path)
+    path = folder / f"motion{motion_formats.FORMATS[kind]}"
+    return path, motion_formats.export_motions(motions, kind, path)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -195,7 +195,7 @@ def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pa
 
 def test_neighbouring_quaternions_do_not_jump() -> None:
     flipped = Rotation.from_rotvec(np.outer(np.linspace(0, 12, 50), [0, 0, 1]))
-    q = frames.quaternions(flipped, scalar_first=False)
+    q = frames.continuous_quaternions(flipped, scalar_first=False)
     assert (np.sum(q[1:] * q[:-1], -1) > 0).all()
 
 

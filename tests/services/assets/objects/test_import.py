@@ -13,7 +13,6 @@ from common.objects.resting import settle
 from common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES
 from common.objects.store import digest
 from services.assets.objects import decompose, meshes
-from services.assets.objects.meshes import import_source
 from services.assets.objects.named import objects_of
 from services.assets.objects.options import ImportOptions
 from services.assets.objects.sources import find_sources
@@ -36,7 +35,7 @@ def block(sides=SIDES, center=(0.0, 0.0, 0.0)):
 def test_a_solid_block_gets_the_mass_properties_worked_out(tmp_path, options, suffix):
     block(center=(0.5, 0.1, -0.2)).export(tmp_path / f"block.{suffix}")
     (obj,) = objects_of(tmp_path / f"block.{suffix}", options)
-    assert (obj.name, obj.family, len(obj.pieces), obj.primitive) == ("block", "imported", 1, False)
+    assert (obj.name, obj.family, [piece.kind for piece in obj.pieces]) == ("block", "imported", ["mesh"])
     # 192 cm^3 of 500 kg/m^3; I = m/12 (b^2 + c^2).
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-5)
     np.testing.assert_allclose(np.sort(np.ptp(obj.visual_vertices, axis=0)), SIDES, rtol=1e-5)
@@ -154,8 +153,8 @@ def test_an_open_mesh_counts_its_hull_and_says_so(tmp_path, options):
     mesh.update_faces(np.arange(12) > 1)
     mesh.export(tmp_path / "open.stl")
     quick = dataclasses.replace(options, time_limit=0.01)
-    obj, notes = import_source(find_sources(tmp_path / "open.stl")[0], quick)
-    assert any("surface is open" in note and "convex hull" in note for note in notes)
+    (obj,) = objects_of(tmp_path / "open.stl", quick)
+    assert any("surface is open" in note and "convex hull" in note for note in obj.notes)
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-4)
 
 
