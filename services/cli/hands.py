@@ -70,7 +70,7 @@ def import_hand(
     The result is one JSON file, which every command takes as --hand, by its name or its path. Look at the picture, and
     correct the file where the proposal is wrong: poses, fingertips, gains and capsules are all in it.
 
-    Examples: congrasp hands import hand.urdf; congrasp hands import hand.xml --name mine --palm palm_link --out mine.json
+    Examples: congrasp hands import hand.urdf; congrasp hands import hand.xml --name mine --palm palm_link
 
     Args:
       file: The hand's URDF (.urdf) or MJCF (.xml), a right or left hand of hinges.

@@ -59,11 +59,7 @@ def report(
     from services.evaluate.worlds import objects_in_words, two_seconds
     from services.viz.sheets import png_of
 
-    for name, value in (("episodes", episodes), ("pool", pool)):
-        if value < 1:
-            raise CongraspError(f"--{name} is {value}.", "It must be at least 1.")
-    if out.is_dir():
-        raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
+    _check(out, episodes=episodes, pool=pool)
     template()  # what is missing is said now, not after the evaluation
     run_dir = source if source is not None and source.is_dir() else None
     file = _policy_of_run(run_dir) if run_dir else policy_file(source, hand)
@@ -75,14 +71,8 @@ def report(
             objects_of(objects, track=track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
         )
         track("Making constraints", None)
-        evaluator = Evaluator(
-            policy,
-            given,
-            physics=engine,
-            threads=os.cpu_count() or 1,
-            seed=seed,
-            hold_steps=two_seconds(policy.task),
-        )
+        held, threads = two_seconds(policy.task), os.cpu_count() or 1
+        evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)
         names, left_out = evaluator.allowed(names)
         rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
         advance = track("Pictures", len(names))
@@ -90,19 +80,27 @@ def report(
         for name, sheet, causes in failure_sheets(evaluator, policy, names, _PICTURED, _PICTURED):
             sheets.append(Picture(name, png_of(sheet), causes_in_words(causes)))
             advance(len(sheets))
-    flags = (
-        f"{f'--policy {file}' if source else f'--hand {hand}'} {f'--objects {objects}' if objects else f'--pool {pool}'}"
-        f" --episodes {episodes} --physics {engine} --seed {seed}"
-    )
+    subject = f"--policy {file}" if source else f"--hand {hand}"
+    subject += f" --objects {objects}" if objects else f" --pool {pool}"
+    flags = f"{subject} --episodes {episodes} --physics {engine} --seed {seed}"
     command = f"congrasp evaluate --table single composed {flags}"
     made = Made(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
     which = f"{len(given)} objects ({objects_in_words(policy, objects)})"
-    conditions = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
-    write_report(out, policy, file.name, rows, conditions, sheets, curves, made)
+    how = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
+    write_report(out, policy, file.name, rows, how, sheets, curves, made)
     for error in left_out:
         print(f"Left out: {error}")
     print(f"The report is in {out}: open it in a browser.")
     return 0
+
+
+def _check(out: pathlib.Path, **counts: int) -> None:
+    """Raises a CongraspError for a count below one, or a folder in place of a file."""
+    for name, value in counts.items():
+        if value < 1:
+            raise CongraspError(f"--{name} is {value}.", "It must be at least 1.")
+    if out.is_dir():
+        raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
 
 
 def _policy_of_run(run_dir: pathlib.Path) -> pathlib.Path:

@@ -1,4 +1,4 @@
-"""Puts a studio together from what the command was given, and takes it apart again."""
+"""Opens a studio with the policies, objects and runs that the command names, and closes it again."""
 
 import contextlib
 import functools
@@ -65,7 +65,7 @@ def open_view(
         elif policy is not None:
             hands = {"of the policy": functools.partial(PolicyGrasping, follow_file(policy), policy.name)}
         else:
-            hands = _shipped()
+            hands = _pretrained()
         session = Session(hands, catalogue(objects), take_mesh, window, Recordings(recordings) if recordings else None)
         stack.callback(session.close)
         server = PageServer(session.gets, session.posts, host, port)
@@ -83,14 +83,15 @@ def _of_run(
             mine = credentials(certs, "server")
         except CongraspError as error:
             say("warning", f"{error} Until then the studio grasps with the policies that come with congrasp.")
-            return _shipped()
+            return _pretrained()
         pulling = stack.enter_context(ZenohTransport(connect=[connect], credentials=mine))
     return {"of the run": functools.partial(PolicyGrasping, follow_run(pulling, run), f"the run '{run}'")}
 
 
-def _shipped() -> dict[str, Callable[[], PolicyGrasping]]:
+def _pretrained() -> dict[str, Callable[[], PolicyGrasping]]:
+    """The policies that come with the package, by the names of their hands."""
     return {
-        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "shipped policy")
+        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
         for name in shipped_hands()
     }
 
