@@ -18,7 +18,7 @@ from common.hands.mano import VARIABLE, ManoModel
 from services.assets.captures import mano
 from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Sequence
+from services.assets.captures.sequence import Dropped, Sequence, read_or_drop
 
 HOLDS = "<date>-subject-01/<session>/meta.yml"
 OBJECTS = (
@@ -44,12 +44,7 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
     found = meshes.beside(root / "models")
     for file in sorted(path.glob("**/meta.yml")):
         name = f"{file.parent.parent.name}/{file.parent.name}"
-        try:
-            yield _sequence(name, file.parent, root, found, model)
-        except Dropped as dropped:
-            yield dropped
-        except (CongraspError, yaml.YAMLError, OSError) as error:
-            yield Dropped(name, "unreadable", " ".join(str(error).split()))
+        yield read_or_drop(name, _sequence, name, file.parent, root, found, model)
 
 
 def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel) -> Sequence:
@@ -89,7 +84,10 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
 def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
     if not path.is_file():
         raise Dropped(name, "wrong layout", f"there is no {path.name} in {path.parent}")
-    content = yaml.safe_load(path.read_text())
+    try:
+        content = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise Dropped(name, "unreadable", " ".join(str(error).split())) from None
     if not isinstance(content, dict):
         raise Dropped(name, "wrong layout", f"{path} holds no settings")
     return content

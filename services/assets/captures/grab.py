@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
 from common.hands.mano import ManoModel
 from services.assets.captures import mano
 from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import FINGERS, Dropped, Sequence
+from services.assets.captures.sequence import FINGERS, Dropped, Sequence, read_or_drop
 
 HOLDS = "s1/*.npz and the other subjects"
 _LABELS = {"thumb": (53, 55), "index": (41, 43), "middle": (44, 46), "ring": (50, 52), "little": (47, 49)}
@@ -33,12 +32,7 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
     files = sorted(file for file in path.glob("**/s*/*.npz")) if path.is_dir() else [path]
     named = _grasping_frames(root)
     for file in files:
-        try:
-            yield _sequence(file, root, found, model, named)
-        except Dropped as dropped:
-            yield dropped
-        except CongraspError as error:
-            yield Dropped(file.stem, "unreadable", str(error))
+        yield read_or_drop(file.stem, _sequence, file, root, found, model, named)
 
 
 def _root(path: pathlib.Path) -> pathlib.Path:
@@ -72,7 +66,7 @@ def _sequence(
     object_name = str(data.get("obj_name", file.stem.split("_")[0]))
     subject = _template(root, data)
     skeleton = _skeleton(model, subject)
-    frames = len(turn)
+    frames, grasp = len(turn), named.get((file.parent.name, file.stem))
     present = np.isfinite(np.concatenate([turn, shift, fingers], 1)).all(-1)
     present &= np.isfinite(np.concatenate([object_shift, object_turn], 1)).all(-1)
     for values in (turn, shift, fingers, object_shift, object_turn):
@@ -87,7 +81,7 @@ def _sequence(
         object_position=object_shift,
         object_rotation=np.swapaxes(Rotation.from_rotvec(object_turn).as_matrix(), -1, -2),
         present=present,
-        grasp=_grasp(named.get((file.parent.name, file.stem)), frames),
+        grasp=grasp if grasp is not None and grasp < frames else None,
         touching=_touching(data, frames),
     )
 
@@ -122,10 +116,6 @@ def _template(root: pathlib.Path, data: dict[str, Any]) -> pathlib.Path | None:
 @functools.lru_cache(maxsize=32)
 def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> mano.Skeleton:
     return mano.skeleton(model, template=template)
-
-
-def _grasp(named: int | None, frames: int) -> int | None:
-    return named if named is not None and named < frames else None
 
 
 def _touching(data: dict[str, Any], frames: int) -> np.ndarray | None:

@@ -13,12 +13,11 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
 from common.hands.mano import ManoModel
 from services.assets.captures.archive import read_archive
 from services.assets.captures.fit import joint_positions
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Sequence
+from services.assets.captures.sequence import Dropped, Sequence, read_or_drop
 
 HOLDS = "MyoHand_<object>_<action>.npz"
 _KEYS = {"time": 0, "robot": 29, "object": 7}
@@ -36,12 +35,7 @@ _LARGEST = 2 * np.pi
 def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None = None) -> Iterator[Sequence | Dropped]:
     """The sequences of a file, or of all NPZ files of a folder; MANO has no part in them."""
     for file in sorted(path.glob("**/*.npz")) if path.is_dir() else [path]:
-        try:
-            yield _sequence(file, meshes)
-        except Dropped as dropped:
-            yield dropped
-        except CongraspError as error:
-            yield Dropped(file.stem, "unreadable", str(error))
+        yield read_or_drop(file.stem, _sequence, file, meshes)
 
 
 def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:

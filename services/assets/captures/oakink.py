@@ -22,7 +22,7 @@ from common.hands.mano import ManoModel
 from common.pickles import read_pickle
 from services.assets.captures import mano
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Part, Sequence
+from services.assets.captures.sequence import Dropped, Part, Sequence, read_or_drop
 from services.assets.objects.sources import read_mesh
 
 HOLDS = "anno/seq_all.json"
@@ -42,12 +42,8 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
     found = meshes.beside(root / "obj", path / "obj")
     names = _names(path)
     for (name, _), frames in sorted(_sequences(json.loads(index.read_text())).items()):
-        try:
-            yield _sequence(name, frames, root / "anno" / "general_info", found, model, names, path)
-        except Dropped as dropped:
-            yield dropped
-        except CongraspError as error:
-            yield Dropped(name, "unreadable", str(error))
+        folder = root / "anno" / "general_info"
+        yield read_or_drop(name, _sequence, name, frames, folder, found, model, names, path)
 
 
 def _sequences(rows: list[list[Any]]) -> dict[tuple[str, int], _Frames]:

@@ -6,9 +6,13 @@ of the hand +z.
 
 import dataclasses
 import pathlib
+from collections.abc import Callable
 from collections.abc import Sequence as Items
+from typing import Any
 
 import numpy as np
+
+from common.errors import CongraspError
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
@@ -73,3 +77,13 @@ class Sequence:
                 raise Dropped(self.name, "wrong layout", f"{field} has {len(values)} frames, but there are {frames}")
             if not np.isfinite(values[self.present]).all():
                 raise Dropped(self.name, "not finite", f"{field} holds values that are not finite")
+
+
+def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> Sequence | Dropped:
+    """What `read(*arguments)` returns, or why the sequence of this name cannot be used."""
+    try:
+        return read(*arguments)
+    except Dropped as dropped:
+        return dropped
+    except (CongraspError, OSError) as error:
+        return Dropped(name, "unreadable", " ".join(str(error).split()))
