@@ -192,4 +192,5 @@ def _each(**angles: float) -> dict[str, float]:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of length one."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

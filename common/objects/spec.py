@@ -76,6 +76,7 @@ class GraspObject:
             return self
 
         def longer(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+            """A vector times the factor."""
             x, y, z = (factor * length for length in vector)
             return x, y, z
 

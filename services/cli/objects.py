@@ -119,7 +119,7 @@ def list_objects(folder: Annotated[str, tyro.conf.Positional] = "objects", famil
         weight, pieces, poses = f"{1000 * obj.mass:.0f}", str(len(obj.pieces)), str(len(obj.rest_poses))
         rows.append((name, obj.family, _size(obj), weight, pieces, *_parts(obj), poses))
     if names:
-        show_table(("name", "family", "size (cm)", "mass (g)", "pieces", "O+", "O-", "poses"), rows)
+        show_table(("name", "family", "size (cm)", "mass (g)", "pieces", "graspable", "avoid", "poses"), rows)
     else:
         print(f"{folder} holds no object.")
     return 2 if failures else 0
@@ -155,8 +155,8 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
         "mass": f"{1000 * obj.mass:.1f} g",
         "principal inertia": " ".join(f"{1e6 * v:.1f}" for v in np.linalg.eigvalsh(obj.inertia)) + " kg.mm²",
         "pieces": ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds)),
-        "O+": f"{graspable} ({share:.0%} of the surface)",
-        "O-": avoided or "nothing",
+        "graspable region": f"{graspable} ({share:.0%} of the surface)",
+        "avoid region": avoided or "nothing",
         "digest": digest(obj),
     }
     for i, pose in enumerate(obj.rest_poses):
@@ -169,7 +169,7 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
             reachable = feasible(cleared, pose)
             counts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
         facts[f"resting pose {i + 1}"] = (
-            f"{100 * pose[2]:.1f} cm high; headings within reach {counts[0]}, on O+ {counts[1]}"
+            f"{100 * pose[2]:.1f} cm high; headings within reach {counts[0]}, on the graspable region {counts[1]}"
         )
     print(obj.name)
     show_facts(facts)
@@ -250,9 +250,9 @@ def _size(obj: "GraspObject") -> str:
 
 
 def _parts(obj: "GraspObject") -> tuple[str, str]:
-    """The names of the parts in O+ and in O-."""
+    """The names of the parts of the graspable and of the avoid region."""
     named = list(zip(obj.part_names, obj.graspable, strict=True))
-    graspable, avoided = (", ".join(name for name, plus in named if plus == wanted) for wanted in (True, False))
+    graspable, avoided = (", ".join(name for name, allowed in named if allowed == wanted) for wanted in (True, False))
     return graspable, avoided
 
 

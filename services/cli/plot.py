@@ -16,7 +16,7 @@ def plot(
     Examples: congrasp plot runs/mine; congrasp plot evaluation.json --formats pdf
 
     Args:
-      path: A run's folder, or one MCAP file; a run that still goes on is drawn up to its last half second. Or the JSON
+      path: A run's folder, or one MCAP file; a run that is not over is drawn up to its last half second. Or the JSON
         file of 'congrasp evaluate --json'.
       out: Folder for the figures; 'plots' beside the recordings or the JSON file otherwise.
       formats: Of the files.

@@ -26,7 +26,7 @@ _META = "meta"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GraspMotion:
-    """A hand that approaches an object, closes, and holds it after the table is gone.
+    """A hand that approaches an object, closes, and holds it after table removal.
 
     What is no array is kept as JSON under the name `meta`, beside the meaning of every array.
     """
@@ -36,7 +36,7 @@ class GraspMotion:
     object: str
     """Name of the object."""
     success: bool
-    """Whether the object was held a quarter of a second after the table went; `metrics["held"]`: to the end."""
+    """Whether the object was held a quarter of a second after table removal; `metrics["held"]`: to the end."""
     control_dt: float
     """Seconds between two frames."""
     constraints: tuple[str, ...]

@@ -96,6 +96,7 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
 
 
 def _check(motion: GraspMotion) -> None:
+    """Raises a CongraspError for numbers that are not finite, or quaternions that are not of length one."""
     remedy = "Make it anew with 'congrasp grasp'."
     for name in _NUMBERS:
         values = np.asarray(getattr(motion, name))

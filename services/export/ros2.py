@@ -76,16 +76,20 @@ class _Messages:
         return self._types[f"{package}/msg/{name}"](**fields)
 
     def header(self, stamp: int, frame: str) -> Any:
+        """A header with a time in ns."""
         time = self("builtin_interfaces/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
         return self("std_msgs/Header", stamp=time, frame_id=frame)
 
     def duration(self, ns: int) -> Any:
+        """A duration of so many ns."""
         return self("builtin_interfaces/Duration", sec=ns // 10**9, nanosec=ns % 10**9)
 
     def vector(self, values: np.ndarray, kind: str = "Vector3") -> Any:
+        """A vector (3,)."""
         return self(f"geometry_msgs/{kind}", **dict(zip("xyz", map(float, values), strict=True)))
 
     def quaternion(self, values: Sequence[float]) -> Any:
+        """A quaternion x, y, z, w."""
         return self("geometry_msgs/Quaternion", **dict(zip("xyzw", map(float, values), strict=True)))
 
 
@@ -137,6 +141,7 @@ def _wrist_trajectory(make: _Messages, wrist: Sequence[Any], since: Sequence[int
 
 
 def _transforms(make: _Messages, found: Sequence[Body], t: int, stamp: int) -> Any:
+    """TF of all bodies at frame t."""
     transforms = []
     for body in found:
         turn = body.rotation[t].as_quat()
@@ -156,6 +161,7 @@ def _transforms(make: _Messages, found: Sequence[Body], t: int, stamp: int) -> A
 
 
 def _marker(make: _Messages, motion: GraspMotion) -> Any:
+    """The object's mesh as a marker."""
     corners = motion.object_vertices[motion.object_faces.ravel()]
     image = make("sensor_msgs/CompressedImage", header=make.header(0, ""), format="", data=np.zeros(0, np.uint8))
     return make(
@@ -183,11 +189,12 @@ def _marker(make: _Messages, motion: GraspMotion) -> Any:
 
 
 def _upright(make: _Messages) -> Any:
+    """The identity."""
     return make.quaternion([0.0, 0.0, 0.0, 1.0])
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """What mcap-ros2-support decodes: poses by joint trajectory and URDF, having seen that TF says the same."""
+    """What mcap-ros2-support decodes: poses by joint trajectory and URDF, after a check that TF says the same."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
@@ -202,6 +209,7 @@ def read(path: pathlib.Path) -> list[Track]:
     tf: dict[str, np.ndarray] = {}
 
     def visit(name: str) -> np.ndarray:
+        """World poses (T, 4, 4) of a frame by TF."""
         if name not in tf:
             parent = first[name].header.frame_id
             tf[name] = local[name] if parent == _WORLD else visit(parent) @ local[name]

@@ -47,6 +47,7 @@ def hand_urdf(motion: GraspMotion) -> str:
 
 
 def _link(robot: ET.Element, name: str) -> ET.Element:
+    """Adds a link with a mass."""
     link = ET.SubElement(robot, "link", name=name)
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "mass", value=_MASS)
@@ -55,6 +56,7 @@ def _link(robot: ET.Element, name: str) -> ET.Element:
 
 
 def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, offset: np.ndarray) -> ET.Element:
+    """Adds a joint at an offset (3,) in its parent's frame."""
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
@@ -73,16 +75,19 @@ def _add_capsules(link: ET.Element, motion: GraspMotion, index: int) -> None:
 
 
 def _visual(link: ET.Element, position: np.ndarray, angles: np.ndarray) -> ET.Element:
+    """Adds a shape at a position (3,) with angles (3,); returns its geometry."""
     visual = ET.SubElement(link, "visual")
     ET.SubElement(visual, "origin", xyz=_numbers(position), rpy=_numbers(angles))
     return ET.SubElement(visual, "geometry")
 
 
 def _number(value: float) -> str:
+    """Nine digits."""
     return f"{value:.9g}"
 
 
 def _numbers(values: np.ndarray) -> str:
+    """Numbers of a vector."""
     return " ".join(map(_number, values))
 
 

@@ -150,6 +150,7 @@ def read_rollouts(path: pathlib.Path) -> Iterator[Message]:
 
 
 def _messages(path: pathlib.Path, schema: str, wanted: Callable[[str], bool]) -> Iterator[Message]:
+    """Decoded messages of one schema on the wanted topics."""
     for file in log_files(path):
         for record in read_records(file, wanted):
             if record.schema == schema:

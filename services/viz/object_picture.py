@@ -9,15 +9,15 @@ from common.errors import CongraspError
 from common.objects import shapes
 from common.objects.spec import GraspObject
 
-_PLUS, _MINUS, _ARROW, _GREY = "#2a9d3a", "#d1495b", "#2b6cb0", "#b0b4b8"
+_GRASPABLE, _AVOID, _ARROW, _GREY = "#2a9d3a", "#d1495b", "#2b6cb0", "#b0b4b8"
 _ARROWS = 24
 
 
 def draw_object(obj: GraspObject, headings: Headings, path: pathlib.Path) -> None:
-    """Writes a PNG with three views of the object in its likeliest resting pose.
+    """Writes a PNG with three views of the object in its most stable resting pose.
 
-    Left: surface points, O+ green and O- red. Middle: the convex pieces. Right: some of the headings that the table
-    leaves, drawn from 8 cm before the heading position up to it.
+    Left: surface points, the graspable region green and the avoid region red. Middle: the convex pieces. Right: some of
+    the headings that the table leaves, drawn from 8 cm before the heading position up to it.
 
     Raises:
       CongraspError: the file cannot be written.
@@ -32,6 +32,7 @@ def draw_object(obj: GraspObject, headings: Headings, path: pathlib.Path) -> Non
     turn = shapes.matrix(pose[3:])
 
     def world(points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) of the object frame in the world."""
         return points @ turn.T + pose[:3]
 
     cleared = clear_table(headings, pose)
@@ -42,7 +43,7 @@ def draw_object(obj: GraspObject, headings: Headings, path: pathlib.Path) -> Non
     figure, axes = plt.subplots(1, 3, figsize=(15, 5.5), subplot_kw={"projection": "3d"})
     for axis, title, extent in zip(
         axes,
-        ("surface: O+ green, O- red", f"{len(obj.pieces)} convex pieces", "headings"),
+        ("surface: graspable green, avoid red", f"{len(obj.pieces)} convex pieces", "headings"),
         everything[::-1],
         strict=True,
     ):
@@ -52,8 +53,8 @@ def draw_object(obj: GraspObject, headings: Headings, path: pathlib.Path) -> Non
         axis.set_box_aspect((1, 1, 1))
         axis.set_title(title)
         axis.tick_params(labelsize=6)
-    minus = obj.non_graspable_points
-    for which, color in ((minus, _MINUS), (~minus, _PLUS)):
+    avoid = obj.non_graspable_points
+    for which, color in ((avoid, _AVOID), (~avoid, _GRASPABLE)):
         axes[0].scatter(*points[which].T, s=8, color=color)
     for i, piece in enumerate(obj.pieces):
         vertices, faces = shapes.tessellate(piece)

@@ -176,6 +176,7 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def _curve(axes: Any, steps: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
+    """Draws a metric; a long one smoothed, over itself."""
     window = len(values) // 40
     if window < 3:
         marker = "o" if len(values) < 20 else ""
@@ -191,15 +192,18 @@ def _metric(name: str) -> str:
 
 
 def _label(name: str, panel: Panel) -> str:
+    """The line's name in a legend."""
     role, process, metric = name.split("/", 2)
     return f"{role} {process}" if len(panel.metrics) == 1 else metric.replace("_", " ")
 
 
 def _panels(metrics: Sequence[str], prefix: str, unit: str) -> list[Panel]:
+    """A panel for each metric with a prefix."""
     return [_panel(metric, prefix, unit) for metric in metrics if metric.startswith(prefix)]
 
 
 def _panel(metric: str, prefix: str = "", unit: str = "") -> Panel:
+    """A panel of one metric, with the unit that its name implies."""
     words = metric.removeprefix(prefix)
     found = next((unit for end, unit in _UNITS.items() if metric.endswith(end)), unit)
     return Panel(words.replace("/", ": ").replace("_", " ").capitalize(), found, (metric,))

@@ -65,12 +65,14 @@ class Raster:
         return (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8)
 
     def _patch(self, shape: Shape) -> Patch:
+        """A shape's triangles in the world."""
         local = self._local(shape)
         turn = Rotation.from_quat(shape.quaternion, scalar_first=True).as_matrix().astype(np.float32)
         place = np.asarray(shape.position, np.float32)
         return local._replace(corners=local.corners @ turn.T + place, normals=local.normals @ turn.T)
 
     def _local(self, shape: Shape) -> Patch:
+        """A shape's triangles in its own frame; those of meshes are remembered."""
         if shape.kind != "mesh":
             corners, normals = _round(shape.size[0], shape.size[1] if shape.kind == "capsule" else 0.0)
             return Patch(corners, normals, _even(shape.colour, corners), True)
@@ -90,10 +92,12 @@ class Raster:
 
 
 def _even(colour: tuple[float, float, float], corners: np.ndarray) -> np.ndarray:
+    """One colour for every corner."""
     return np.broadcast_to(_linear(np.asarray(colour)), corners.shape)
 
 
 def _linear(colour: np.ndarray) -> np.ndarray:
+    """sRGB as linear light."""
     return (colour**GAMMA).astype(np.float32)
 
 
@@ -265,8 +269,10 @@ def _expand(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n,) dot products of rows."""
     return np.einsum("ij,ij->i", a, b)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Rows of length one."""
     return vectors / (np.sqrt(_dot(vectors, vectors)) + 1e-12)[:, None]

@@ -146,6 +146,7 @@ class Scene:
 
     @functools.cached_property
     def _smooth(self) -> dict[int, SmoothNormals]:
+        """Smooth normals of the meshes by their indices."""
         meshes = {i: shape for i, shape in enumerate(self.shapes) if shape.kind == "mesh"}
         return {i: SmoothNormals(np.asarray(s.vertices), np.asarray(s.faces)) for i, s in meshes.items()}
 

@@ -44,10 +44,11 @@ def episode_shapes(episode: Message, step: int) -> list[Shape]:
 
 
 def _object(episode: Message, step: int) -> Shape:
+    """The object at a step, painted where its avoid region is a constraint."""
     arrays = episode.arrays
     affordance = arrays["goal/mask"][MASKS.index("affordance")] > 0
-    minus = np.asarray(arrays["surface_minus"], bool)
-    painted = affordance and bool(minus.any())
+    avoid = np.asarray(arrays["surface_minus"], bool)
+    painted = affordance and bool(avoid.any())
     return Shape(
         "mesh",
         (0, 0, 0),
@@ -57,7 +58,7 @@ def _object(episode: Message, step: int) -> Shape:
         vertices=arrays["visual_vertices"],
         faces=arrays["visual_faces"],
         paint_points=np.asarray(arrays["surface_points"]) if painted else None,
-        paint_colours=np.where(minus[:, None], OBJECT_AVOID, OBJECT) if painted else None,
+        paint_colours=np.where(avoid[:, None], OBJECT_AVOID, OBJECT) if painted else None,
     )
 
 
@@ -88,12 +89,13 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
 def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -> Camera:
     """A camera that holds everything that happens in the steps, from where object and touching links show most."""
     points = np.concatenate([_extent(episode, step) for step in steps])
-    looks = [Scene(episode_shapes(episode, steps[i])) for i in sorted({len(steps) // 2, len(steps) - 1})]
+    scenes = [Scene(episode_shapes(episode, steps[i])) for i in sorted({len(steps) // 2, len(steps) - 1})]
     links = sum(len(link.capsules) for link in get_hand(episode.meta["hand"]).links)
 
     def score(camera: Camera) -> float:
+        """How much of object, touching links and constraints a camera shows."""
         total = 0.0
-        for scene in looks:
+        for scene in scenes:
             shown, rest = scene.shapes[: links + 1], scene.shapes[links + 1 :]
             worth = np.array([0.2 if shape.colour == SKIN else 1.0 for shape in shown] + [0.5] * len(rest))
             seen = visible(scene, camera, (round(72 * aspect), 72))

@@ -145,6 +145,7 @@ class _Picture:
         key, sky, whole = np.zeros(len(start)), np.full(len(start), 1e-9), np.full(len(start), 1e-9)
 
         def judge(thread: int) -> None:
+            """Lights the points of every so many'th set of lamps."""
             for one in range(thread, sets, THREADS):
                 mine = np.flatnonzero(lamp_set == one)
                 towards = mine[hits.normal[mine] @ self._key > 0]

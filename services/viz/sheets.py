@@ -45,6 +45,7 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
 
 
 def _font(text: str, size: int, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The largest font up to a size in which a text fits a width in pixels."""
     font = ImageFont.load_default(size)
     while size > 8 and font.getlength(text) > width:
         size -= 1

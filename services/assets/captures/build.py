@@ -141,6 +141,7 @@ def import_sets(
 def _shape(
     sequence: Sequence, shapes: dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
 ) -> tuple[GraspObject, Surface]:
+    """The object of a sequence's mesh and its surface, imported once."""
     if sequence.mesh not in shapes:
         try:
             obj = load_object(sequence.mesh, safe_name(sequence.object_name))
@@ -169,13 +170,13 @@ def _labelled(
         raise Dropped(sequence.name, "no labelled parts", f"the parts of '{sequence.object_name}' are not labelled")
     labels = _nearest(clouds, obj.points)
     counts = np.bincount(_nearest(clouds, demonstration.contact), minlength=len(names))
-    plus = counts >= _VERTICES
-    if not plus.any():
+    graspable = counts >= _VERTICES
+    if not graspable.any():
         reason = f"fingers touch no part in {_VERTICES} points ({counts.max()} at most)"
         raise Dropped(sequence.name, "no part touched", reason)
-    touched_names = [name for name, touched in zip(names, plus, strict=True) if touched]
-    name = obj.name if plus.all() else safe_name("-".join([obj.name, *touched_names]))
-    return _with_region(sequence, lambda: relabelled(obj, labels, names, [bool(part) for part in plus], name))
+    touched_names = [name for name, touched in zip(names, graspable, strict=True) if touched]
+    name = obj.name if graspable.all() else safe_name("-".join([obj.name, *touched_names]))
+    return _with_region(sequence, lambda: relabelled(obj, labels, names, [bool(part) for part in graspable], name))
 
 
 def _parts(sequence: Sequence, obj: GraspObject) -> tuple[list[str], list[np.ndarray]]:
@@ -188,6 +189,7 @@ def _parts(sequence: Sequence, obj: GraspObject) -> tuple[list[str], list[np.nda
 
 
 def _with_region(sequence: Sequence, make: Callable[[], GraspObject]) -> GraspObject:
+    """The object that `make` returns; the sequence is dropped where its graspable region is too small."""
     try:
         return make()
     except CongraspError as error:
@@ -217,7 +219,7 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
         posed = transferred(hand, demonstrations, fitting, scale)
     q, position, quaternion = (values.astype(np.float32) for values in posed)
     clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, np.stack([fields["rest"]] * len(position))))
-    nearer = _ends_nearer_to_plus(position[:, -1], fields["points"], fields["minus"])
+    nearer = _ends_nearer_to_graspable(position[:, -1], fields["points"], fields["minus"])
     row = TaskSet(
         **{name: value for name, value in fields.items() if not name.startswith("chosen")},
         pose_q=_twice(q),
@@ -237,11 +239,11 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
 
 
 def _twice(values: np.ndarray) -> np.ndarray:
-    """The same for both variants (2, ...): the whole surface, and O+."""
+    """The same for both regions (2, ...): the whole surface, and the graspable region."""
     return np.stack([values, values])
 
 
-def _ends_nearer_to_plus(wrist: np.ndarray, points: np.ndarray, minus: np.ndarray) -> np.ndarray:
+def _ends_nearer_to_graspable(wrist: np.ndarray, points: np.ndarray, avoid: np.ndarray) -> np.ndarray:
     """(M,) bool: wrist positions (M, 3) that agree with the affordance (`common.constraints.priority`)."""
     away = np.linalg.norm(points[None] - wrist[:, None], axis=-1)
-    return away[:, ~minus].min(-1, initial=np.inf) < away[:, minus].min(-1, initial=np.inf)
+    return away[:, ~avoid].min(-1, initial=np.inf) < away[:, avoid].min(-1, initial=np.inf)

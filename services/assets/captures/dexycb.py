@@ -48,6 +48,7 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
 
 
 def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel) -> Sequence:
+    """The sequence of a session's folder."""
     meta = _yaml(name, folder / "meta.yml")
     sides = _value(name, meta, "mano_sides")
     if sides != ["right"]:
@@ -82,6 +83,7 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
 
 
 def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
+    """The settings in a YAML file."""
     if not path.is_file():
         raise Dropped(name, "wrong layout", f"there is no {path.name} in {path.parent}")
     try:
@@ -94,12 +96,14 @@ def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
 
 
 def _value(name: str, meta: dict[str, Any], key: str) -> Any:
+    """A value of `meta.yml`."""
     if key not in meta:
         raise Dropped(name, "wrong layout", f"meta.yml has no '{key}'")
     return meta[key]
 
 
 def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
+    """(10,) shape parameters of a calibration."""
     content = _yaml(name, root / "calibration" / f"mano_{calibration}" / "mano.yml")
     betas = np.array(content.get("betas", []), float)
     if betas.shape != (10,):
@@ -108,6 +112,7 @@ def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
 
 
 def _poses(name: str, poses: dict[str, Any], key: str, width: int) -> np.ndarray:
+    """(F, n, width) of an array of `pose.npz`."""
     if key not in poses:
         raise Dropped(name, "wrong layout", f"pose.npz has no '{key}'")
     array = np.asarray(poses[key], float)

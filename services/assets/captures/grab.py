@@ -55,6 +55,7 @@ def _grasping_frames(root: pathlib.Path) -> dict[tuple[str, str], int]:
 def _sequence(
     file: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel | None, named: dict[tuple[str, str], int]
 ) -> Sequence:
+    """The sequence of a file."""
     name = f"{file.parent.name}/{file.stem}"
     data = read_archive(file)
     if "rhand" not in data and "lhand" in data:
@@ -90,6 +91,7 @@ _HAND = {"global_orient": 3, "transl": 3, "fullpose": 45}
 
 
 def _entry(name: str, data: dict[str, Any], *keys: str) -> dict[str, Any]:
+    """The dictionary under some keys."""
     for key in keys:
         if not isinstance(data, dict) or key not in data:
             raise Dropped(name, "wrong layout", f"the file has no '{'/'.join(keys)}'")
@@ -98,6 +100,7 @@ def _entry(name: str, data: dict[str, Any], *keys: str) -> dict[str, Any]:
 
 
 def _array(name: str, values: dict[str, Any], of: str, key: str, width: int) -> np.ndarray:
+    """(T, width) of a body's parameters."""
     if key not in values:
         raise Dropped(name, "wrong layout", f"the file has no '{of}/params/{key}'")
     array = np.array(values[key], float)
@@ -115,6 +118,7 @@ def _template(root: pathlib.Path, data: dict[str, Any]) -> pathlib.Path | None:
 
 @functools.lru_cache(maxsize=32)
 def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> mano.Skeleton:
+    """A subject's skeleton, by the template of the hand at rest."""
     return mano.skeleton(model, template=template)
 
 

@@ -48,6 +48,7 @@ def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
 
 
 def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
+    """The sequence of a file."""
     name = file.stem
     arrays = read_archive(file)
     for key, width in _KEYS.items():

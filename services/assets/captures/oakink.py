@@ -72,6 +72,7 @@ def _sequence(
     names: dict[str, str],
     root: pathlib.Path,
 ) -> Sequence:
+    """The sequence of some frames' annotations."""
     object_id = name.split("_")[0]
     object_name = names.get(object_id, object_id)
     mesh = meshes.find(name, object_id if meshes.has(object_id) else object_name)
@@ -122,6 +123,7 @@ def _frame(name: str, file: pathlib.Path) -> tuple[np.ndarray, ...] | None:
 
 
 def _shaped(name: str, file: pathlib.Path, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An array of this shape."""
     array = np.asarray(value, float)
     if array.size != np.prod(shape):
         raise Dropped(name, "wrong layout", f"'{key}' of {file.name} has the shape {array.shape}, not {shape}")

@@ -43,6 +43,7 @@ class Meshes:
         return found
 
     def _look(self, name: str, inside: str) -> pathlib.Path | None:
+        """The first mesh of a name."""
         for folder in self.folders:
             for suffix in SUFFIXES:
                 if (file := folder / f"{name}{suffix}").is_file():

@@ -23,7 +23,7 @@ class Dropped(Exception):
     Attributes:
       name: the sequence's.
       rule: what excludes it, in two or three words, to count by.
-      reason: why, in words, without a full stop.
+      reason: why, as a sentence without a full stop.
     """
 
     def __init__(self, name: str, rule: str, reason: str):

@@ -44,6 +44,7 @@ def posed(hand: Hand) -> Hand:
     way = np.where(both, 0.0, np.sign(hand.upper + hand.lower))
 
     def closing() -> np.ndarray:
+        """(F,) the closed pose by the present ways of closing."""
         ends = np.where(way > 0, hand.upper, hand.lower)
         return np.where(way != 0, flat + _CLOSED * (ends - flat), flat)
 
@@ -59,6 +60,7 @@ def posed(hand: Hand) -> Hand:
     names = [joint.name for joint in hand.joints]
 
     def pose(q: np.ndarray) -> dict[str, float]:
+        """Angles (F,) by the names of their joints, without zeros."""
         q = np.clip(q.round(3), hand.lower, hand.upper)
         return {name: round(float(x), 6) for name, x in zip(names, q, strict=True) if x}
 

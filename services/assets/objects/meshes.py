@@ -1,4 +1,4 @@
-"""Import of meshes: from files to a `GraspObject`, with every complaint in one line."""
+"""Import of meshes: from files to a `GraspObject`."""
 
 import dataclasses
 import hashlib
@@ -49,12 +49,14 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
 
 
 def _cache_folder(options: ImportOptions) -> pathlib.Path:
+    """Where finished imports are kept."""
     if options.cache_dir:
         return pathlib.Path(options.cache_dir)
     return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "objects"
 
 
 def _cache_key(source: Source, options: ImportOptions) -> str:
+    """24 hex digits of everything that an import depends on."""
     settings = dataclasses.replace(options, cache_dir="")
     content = hashlib.sha256(f"{_CACHE_VERSION} {source.name} {settings}".encode())
     for file in source.files():
@@ -124,16 +126,19 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
 
 
 def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Several meshes as one, faces in their order."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
     return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)
 
 
 def _corners(file: MeshFile) -> np.ndarray:
+    """(V, 3) vertices of a file."""
     return np.asarray(read_mesh(file.path).vertices, np.float64)
 
 
 def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
+    """A mesh in metres that faces outwards."""
     mesh = mesh.copy()
     mesh.apply_scale(factor)
     if mesh.volume < 0:
@@ -213,6 +218,7 @@ def _weigh(
 
 
 def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
+    """A convex piece of vertices (V, 3) around its own middle, relative to the centre of mass."""
     middle = hull.mean(0)
     return Piece("mesh", (0.0, 0.0, 0.0), tuple((middle - center).tolist()), vertices=hull - middle, part=part)
 

@@ -77,6 +77,7 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 
 def _components(faces: np.ndarray, count: int) -> tuple[int, np.ndarray]:
+    """Connected components of triangles (F, 3) over `count` vertices: their number, and that of each vertex."""
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (count, count))
     number, labels = connected_components(graph, directed=False)
@@ -175,4 +176,5 @@ def _wound_alike(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _was(count: int) -> str:
+    """The verb for so many."""
     return "was" if count == 1 else "were"

@@ -116,11 +116,13 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Tri
 
 
 def _nested(folder: pathlib.Path) -> list[Source]:
+    """The objects of a folder's own meshes; those of folders below it do not count."""
     meshes = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
     return _in_folder(folder, meshes) if meshes else []
 
 
 def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]:
+    """The objects of a folder with these meshes."""
     name = safe_name(folder.resolve().name)
     two = _two_parts(meshes)
     if two:
@@ -141,6 +143,7 @@ def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]
 
 
 def _part(file: pathlib.Path, part: str) -> MeshFile:
+    """The file of a part, graspable where its name is that of a handle."""
     return MeshFile(file, "part", part, any(word in part.lower() for word in _GRASPABLE_WORDS))
 
 

@@ -121,6 +121,7 @@ def _read(window: TrainingWindow, recordings: pathlib.Path) -> None:
     Recordings(recordings).check()
 
     def work() -> None:
+        """Reads them all."""
         try:
             window.load(recordings)
         except CongraspError as error:

@@ -15,7 +15,7 @@ from services.record.scene import EPISODE_SCHEMA
 MOST = 60
 """Episodes that one search finds at most; the nearest to the time."""
 FARTHER = (1.0, 5.0, 25.0)
-"""Factors by which it is looked farther where there is no episode."""
+"""Factors on the time searched, tried in turn until there is an episode."""
 
 
 class Recordings:
@@ -40,10 +40,10 @@ class Recordings:
 
         Args:
           time: seconds since 1970.
-          seconds: how far from it they may be; where there are none, it is looked farther away.
+          seconds: how far from it they may be; the search widens where there are none.
 
         Returns:
-          How far it was looked, and for each episode what a list shows of it; its `id` is for `episode`.
+          How far the search went, and for each episode what a list shows of it; its `id` is for `episode`.
 
         Raises:
           CongraspError: there are no recordings.
@@ -78,6 +78,7 @@ def is_episode(topic: str) -> bool:
 
 
 def _row(key: str, message: Message) -> dict[str, Any]:
+    """What a list shows of an episode."""
     time, _, topic = key.partition("/")
     return {
         "id": key,
