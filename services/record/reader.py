@@ -89,6 +89,11 @@ def read_records(path: pathlib.Path, wanted: Callable[[str], bool] = lambda topi
             return  # cut off here; everything before has been given
 
 
+def is_episode(topic: str) -> bool:
+    """Whether a topic is that of an actor's whole episodes."""
+    return topic.startswith("/episode/") and topic.endswith("/raw")
+
+
 def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Every metric of a run's recordings, by `<role>/<name>/<metric>`.
 
@@ -113,7 +118,7 @@ def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]
 
 def read_episodes(path: pathlib.Path) -> Iterator[Message]:
     """The recorded episodes at `path`, a file or a folder, as the actors sent them, in the order of recording."""
-    return _messages(path, EPISODE_SCHEMA, lambda topic: topic.startswith("/episode/") and topic.endswith("/raw"))
+    return _messages(path, EPISODE_SCHEMA, is_episode)
 
 
 def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Message:

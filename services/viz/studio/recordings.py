@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 
 from common.errors import CongraspError
 from common.wire.codec import Message, decode
-from services.record.reader import is_complete, log_files, read_records
+from services.record.reader import is_complete, is_episode, log_files, read_records
 from services.record.scene import EPISODE_SCHEMA
 
 MOST = 60
@@ -70,11 +70,6 @@ class Recordings:
             if key not in self._found:
                 raise CongraspError("This episode is not among those found last.", "Click the curve again.")
             return self._found[key]
-
-
-def is_episode(topic: str) -> bool:
-    """Whether a topic is that of an actor's whole episodes."""
-    return topic.startswith("/episode/") and topic.endswith("/raw")
 
 
 def _row(key: str, message: Message) -> dict[str, Any]:

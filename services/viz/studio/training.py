@@ -21,8 +21,7 @@ from common.transport.keys import Keys
 from common.wire.codec import Message, decode
 from services.ops import status as statuses
 from services.record.channels import flatten
-from services.record.reader import Record, log_files, read_records
-from services.viz.studio.recordings import is_episode
+from services.record.reader import Record, is_episode, log_files, read_records
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows first."""
