@@ -75,7 +75,8 @@ def generate(
         track("Making constraints", None)
         for constraints in make_sets(known, TaskConfig(hand=known.name), found, seed, taskset):
             save(constraints, out)
-    print(f"The constraint set{'s' if len(found) > 1 else ''} of {len(found)} object(s) are in {out}.")
+    what = "The constraint set of 1 object is" if len(found) == 1 else f"The sets of {len(found)} objects are"
+    print(f"{what} in {out}.")
     return 0
 
 

@@ -14,7 +14,7 @@ _ARROWS = 24
 
 
 def draw_object(obj: GraspObject, headings: Headings, path: pathlib.Path) -> None:
-    """Writes a PNG with three views of the object in its most stable resting pose.
+    """Writes a PNG with three views of the object in its most likely resting pose.
 
     Left: surface points, the graspable region green and the avoid region red. Middle: the convex pieces. Right: some of
     the headings that the table leaves, drawn from 8 cm before the heading position up to it.
