@@ -10,11 +10,12 @@ import numpy as np
 
 from common.errors import CongraspError
 from common.files import write_atomically
+from services.record.palette import INK
 from services.record.reader import read_metrics
 
 Series = Mapping[str, tuple[np.ndarray, np.ndarray]]
 _COLUMNS = 4
-INK, QUIET, _GRID = "#262b35", "#6b7280", "#e3e6ea"
+QUIET, _GRID = "#6b7280", "#e3e6ea"
 COLOURS = ("#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a", "#c2478f", "#6b7280")
 _LEGEND = 8
 """Lines of one panel that a legend still names."""
@@ -70,7 +71,7 @@ def plot_run(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str] = ("p
       The files written, each figure in each format.
 
     Raises:
-      CongraspError: there are no metrics, matplotlib is absent, or a file cannot be written.
+      CongraspError: there are no metrics, or a file cannot be written.
     """
     series = read_metrics(path)
     if not series:
@@ -99,15 +100,9 @@ def encoded(figure: Any, kind: str = "png") -> bytes:
 
 
 def new_figure(width: float, height: float, title: str) -> Any:
-    """An empty figure of so many inches.
+    """An empty figure of so many inches."""
+    from matplotlib.figure import Figure
 
-    Raises:
-      CongraspError: matplotlib is absent.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise CongraspError("Figures need the package 'matplotlib'.", "Run: pip install 'congrasp[viz]'") from None
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     figure.suptitle(title, x=0.01, ha="left", color=INK, fontsize=15, fontweight="bold")
     return figure
