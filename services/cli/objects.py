@@ -174,10 +174,11 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     print(obj.name)
     show_facts(facts)
     if png is not None:
-        from services.viz.object_picture import draw_object
+        from services.viz.object_sheet import object_sheet
+        from services.viz.sheets import save_png
 
-        assert free is not None, "only O+ may be out of reach"
-        draw_object(obj, free, png)
+        assert free is not None, "only the graspable region may be out of reach"
+        save_png(png, object_sheet(obj, free))
         print(f"The picture is {png}.")
     return 0
 

@@ -8,5 +8,15 @@ TABLE: Colour = (0.80, 0.79, 0.77)
 HEADING: Colour = (0.22, 0.40, 0.86)
 """Also reference poses."""
 WAYPOINT: Colour = (0.53, 0.30, 0.75)
+GRASPABLE: Colour = (0.20, 0.65, 0.32)
+AVOID: Colour = (0.80, 0.16, 0.16)
+PIECES: tuple[Colour, ...] = (
+    (0.90, 0.45, 0.36),
+    (0.35, 0.63, 0.78),
+    (0.95, 0.72, 0.30),
+    (0.45, 0.70, 0.48),
+    (0.66, 0.52, 0.78),
+)
+"""Of convex pieces, in turn."""
 INK = "#262b35"
 """Text and titles."""

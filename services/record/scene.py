@@ -24,14 +24,14 @@ from common.task.types import MASKS
 from common.wire.codec import Message, encode
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
-from services.record.palette import HEADING, OBJECT, SKIN, TABLE, WAYPOINT
+from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, SKIN, TABLE, WAYPOINT
 
 EPISODE_SCHEMA = "congrasp.Episode"
 SPACING = 0.8
 """Metres between two actors' frames in the world."""
 Colour = tuple[float, float, float, float]
 _SKIN, _GHOST, _OBJECT, _TABLE = (*SKIN, 1.0), (*HEADING, 0.25), (*OBJECT, 1.0), (*TABLE, 1.0)
-_GRASPABLE, _AVOID = (0.20, 0.65, 0.32, 1.0), (0.80, 0.16, 0.16, 1.0)
+_GRASPABLE, _AVOID = (*GRASPABLE, 1.0), (*AVOID, 1.0)
 _HEADING, _WAYPOINT, _FORCE = (*HEADING, 1.0), (*WAYPOINT, 1.0), (0.93, 0.26, 0.21, 1.0)
 _AXES = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.7, 0.2, 1.0), (0.2, 0.3, 0.9, 1.0))
 _ARROW = 0.10  # length of the approach arrow, m

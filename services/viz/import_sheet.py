@@ -12,7 +12,7 @@ from common.objects.spec import GraspObject
 from services.assets.objects.repair import with_few_faces
 from services.assets.objects.sizes import length, size_in_words
 from services.assets.objects.sources import Source, read_mesh
-from services.record.palette import OBJECT
+from services.record.palette import OBJECT, PIECES
 from services.viz.raster import Raster
 from services.viz.raycast import Shape
 from services.viz.shapes import fit, posed_hand, shape_points, upright
@@ -25,7 +25,6 @@ _VIEW = (0.9, -0.6, 0.45)
 _GAP = 0.03  # m between the hand and the object
 _LARGEST, _SMALLEST = 1.5, 0.01  # m; a mesh beyond is drawn at another scale before its import
 _LARGE_FILE = 30 << 20  # bytes
-_COLOURS = ((0.90, 0.45, 0.36), (0.35, 0.63, 0.78), (0.95, 0.72, 0.30), (0.45, 0.70, 0.48), (0.66, 0.52, 0.78))
 
 
 def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -> np.ndarray:
@@ -54,7 +53,7 @@ def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -
     pieces = enumerate(map(tessellate, obj.pieces))
     count = len(obj.pieces)
     parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [
-        (rest.apply(vertices), faces, _COLOURS[i % len(_COLOURS)]) for i, (vertices, faces) in pieces
+        (rest.apply(vertices), faces, PIECES[i % len(PIECES)]) for i, (vertices, faces) in pieces
     ]
     raster = Raster()
     images = []
