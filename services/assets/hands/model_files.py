@@ -17,7 +17,7 @@ from common.errors import CongraspError
 from common.hands.files import faults, hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Capsule, Hand, Joint, Link, chain_of, vector, wrist_gains
-from services.assets.hands.poses import opening, posed, thumb_of
+from services.assets.hands.poses import opening, propose_poses, thumb_of
 
 TORQUE = 1.0
 """N.m, of a joint for which the file names no limit."""
@@ -79,7 +79,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
         closed_pose={},
         wrist=wrist_gains(sum(link.mass for link in links)),
     )
-    hand = posed(hand)
+    hand = propose_poses(hand)
     scale = choices.object_scale or round(float(np.clip(opening(hand) / _HUMAN_OPENING, 0.3, 3.0)), 1)
     hand = dataclasses.replace(hand, object_scale=scale)
     for fault in faults(hand):

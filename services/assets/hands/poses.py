@@ -30,7 +30,7 @@ def thumb_of(links: list[Link], tips: list[str], wanted: str) -> str:
     return tips[int(np.argmax(apart))]
 
 
-def posed(hand: Hand) -> Hand:
+def propose_poses(hand: Hand) -> Hand:
     """The hand with an open and a closed pose.
 
     A joint closes towards the longer side of its range. Where the sides are much alike, a finger's joint spreads and

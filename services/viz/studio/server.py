@@ -136,8 +136,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         length = int(self.headers.get("Content-Length") or -1)
         if not 0 <= length <= MOST_BYTES:
             self.close_connection = True
-            words = "The request says no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
-            self._send(413, "application/json", json.dumps({"error": words}).encode())
+            message = "The request says no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
+            self._send(413, "application/json", json.dumps({"error": message}).encode())
             return
         body = self.rfile.read(length)
         # What a form of another site can send has none of these types.
@@ -181,8 +181,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return
         except Exception as error:  # whatever a page asks for, the server continues
             say("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
-            words = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
-            self._send(500, "application/json", json.dumps({"error": words}).encode())
+            message = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
+            self._send(500, "application/json", json.dumps({"error": message}).encode())
             return
         if isinstance(found, Message):
             self._send(200, "application/octet-stream", encode(found))
