@@ -21,6 +21,12 @@ def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = ()) -> list[Shape]
     return posed_hand(hand, q, np.zeros(3), upright(hand), colours)
 
 
+def _poses(hand: Hand) -> dict[str, list[Shape]]:
+    """The hand upright in three poses."""
+    poses = {"open": hand.q_open, "half closed": (hand.q_open + hand.q_closed) / 2, "closed": hand.q_closed}
+    return {name: _placed(hand, q) for name, q in poses.items()}
+
+
 def _frame(hand: Hand) -> list[Shape]:
     """The open hand's grasp frame: the heading axis up to the hand centre, and w from the thumb to the others."""
     frame, turn = grasp_frame(hand), upright(hand)
@@ -46,11 +52,9 @@ def _points(shapes: Sequence[Shape]) -> np.ndarray:
 
 def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
     """The hand open, half closed and closed (columns), from the palm, the thumb's side and between (rows)."""
-    poses = {"open": hand.q_open, "half closed": (hand.q_open + hand.q_closed) / 2, "closed": hand.q_closed}
-    up = upright(hand)
-    placed = {name: posed_hand(hand, q, np.zeros(3), up) for name, q in poses.items()}
+    placed = _poses(hand)
     points = np.concatenate([_points(shapes) for shapes in placed.values()])
-    thumb = np.sign(up.apply(hand.keypoints[len(hand.links)])[1])
+    thumb = np.sign(upright(hand).apply(hand.keypoints[len(hand.links)])[1])
     images, labels = [], []
     for view, azimuth in {"palm": 0.0, "between": 50.0, "thumb's side": 95.0}.items():
         angle = thumb * np.radians(azimuth)
@@ -58,33 +62,26 @@ def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
         images += [render_scene(shapes, camera, size) for shapes in placed.values()]
         labels += [f"{name}, {view}" for name in placed]
     title = f"{hand.name} hand: {len(hand.joints)} finger joints, {len(hand.links)} links"
-    return contact_sheet(images, labels, columns=len(poses), title=title)
+    return contact_sheet(images, labels, columns=len(placed), title=title)
 
 
 def hands_sheet(hands: Sequence[Hand], *, size: tuple[int, int] = (300, 300)) -> np.ndarray:
     """A row for each hand: open with its grasp frame, half closed, closed; all on one scale."""
     images, labels = [], []
     for hand in hands:
-        rows = [
-            ("open", [*_placed(hand, hand.q_open), *_frame(hand)]),
-            ("half closed", _placed(hand, (hand.q_open + hand.q_closed) / 2)),
-            ("closed", _placed(hand, hand.q_closed)),
-        ]
-        camera = fit(np.concatenate([_points(shapes) for _, shapes in rows]), _side(hand), size[0] / size[1])
-        images += [render_scene(shapes, camera, size) for _, shapes in rows]
-        labels += [f"{hand.name}, {name}" for name, _ in rows]
+        rows = _poses(hand)
+        rows["open"] += _frame(hand)
+        camera = fit(np.concatenate([_points(shapes) for shapes in rows.values()]), _side(hand), size[0] / size[1])
+        images += [render_scene(shapes, camera, size) for shapes in rows.values()]
+        labels += [f"{hand.name}, {name}" for name in rows]
     title = "heading axis v (blue) into the hand centre, cross-finger axis w (violet) from the thumb to the fingers"
     return contact_sheet(images, labels, columns=3, title=title)
 
 
 def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarray:
     """The hand's three poses, and every joint at both of its limits, with the links that it moves in colour."""
-    rows = [
-        ("open", [*_placed(hand, hand.q_open), *_frame(hand)]),
-        ("half closed", _placed(hand, (hand.q_open + hand.q_closed) / 2)),
-        ("closed", _placed(hand, hand.q_closed)),
-        ("all at zero", _placed(hand, np.clip(0.0, hand.lower, hand.upper))),
-    ]
+    rows = {**_poses(hand), "all at zero": _placed(hand, np.clip(0.0, hand.lower, hand.upper))}
+    rows["open"] += _frame(hand)
     names = [link.name for link in hand.links]
     parents = [names.index(link.parent) if link.parent else -1 for link in hand.links]
     carrier = [i for i, link in enumerate(hand.links) for _ in link.joints]
@@ -96,10 +93,10 @@ def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarra
         for angle in (joint.lower, joint.upper):
             q = hand.q_open.copy()
             q[j] = angle
-            rows.append((f"{joint.name} {angle:.2f}", _placed(hand, q, sorted(moved))))
-    points = np.concatenate([_points(shapes) for _, shapes in rows])
+            rows[f"{joint.name} {angle:.2f}"] = _placed(hand, q, sorted(moved))
+    points = np.concatenate([_points(shapes) for shapes in rows.values()])
     camera = fit(points, _side(hand), size[0] / size[1])
-    images = [render_scene(shapes, camera, size) for _, shapes in rows]
+    images = [render_scene(shapes, camera, size) for shapes in rows.values()]
     reach = max(float(np.linalg.norm(link_origin(link))) for link in hand.links)
     title = f"{hand.name}: {len(hand.joints)} joints, {len(hand.links)} links, {100 * reach:.0f} cm to the last joint"
-    return contact_sheet(images, [label for label, _ in rows], columns=8, title=title)
+    return contact_sheet(images, list(rows), columns=8, title=title)

@@ -18,7 +18,7 @@ from common.hands.mano import VARIABLE, ManoModel
 from services.assets.captures import mano
 from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Sequence, read_or_drop
+from services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
 
 HOLDS = "<date>-subject-01/<session>/meta.yml"
 OBJECTS = (
@@ -57,7 +57,9 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
     if not 0 <= grasped < len(ids) or not 1 <= ids[grasped] <= len(OBJECTS):
         raise Dropped(name, "wrong layout", f"'ycb_grasp_ind' {grasped} names none of the objects {ids}")
     poses = read_archive(folder / "pose.npz")
-    objects, hands = (_poses(name, poses, key, width) for key, width in (("pose_y", 7), ("pose_m", 51)))
+    objects, hands = (
+        array_of(name, "pose.npz", poses, key, "F", "n", width) for key, width in (("pose_y", 7), ("pose_m", 51))
+    )
     if len(objects) != len(hands) or objects.shape[1] != len(ids) or hands.shape[1] != 1:
         raise Dropped(name, "wrong layout", f"'pose_y' {objects.shape} and 'pose_m' {hands.shape} do not fit meta.yml")
     place, hand = objects[:, grasped], hands[:, 0]
@@ -109,13 +111,3 @@ def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
     if betas.shape != (10,):
         raise Dropped(name, "wrong layout", f"mano.yml of {calibration} has {betas.size} 'betas', not 10")
     return betas
-
-
-def _poses(name: str, poses: dict[str, Any], key: str, width: int) -> np.ndarray:
-    """(F, n, width) of an array of `pose.npz`."""
-    if key not in poses:
-        raise Dropped(name, "wrong layout", f"pose.npz has no '{key}'")
-    array = np.asarray(poses[key], float)
-    if array.ndim != 3 or array.shape[2] != width:
-        raise Dropped(name, "wrong layout", f"'{key}' has the shape {array.shape}, not ('F', 'n', {width})")
-    return array

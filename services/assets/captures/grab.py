@@ -18,7 +18,7 @@ from common.hands.mano import ManoModel
 from services.assets.captures import mano
 from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import FINGERS, Dropped, Sequence, read_or_drop
+from services.assets.captures.sequence import FINGERS, Dropped, Sequence, array_of, read_or_drop
 
 HOLDS = "s1/*.npz and the other subjects"
 _LABELS = {"thumb": (53, 55), "index": (41, 43), "middle": (44, 46), "ring": (50, 52), "little": (47, 49)}
@@ -61,9 +61,11 @@ def _sequence(
     if "rhand" not in data and "lhand" in data:
         raise Dropped(name, "left hand", "it has no right hand")
     hand = _entry(name, data, "rhand", "params")
-    turn, shift, fingers = (_array(name, hand, "rhand", key, width) for key, width in _HAND.items())
+    turn, shift, fingers = (array_of(name, "rhand/params", hand, key, "T", width) for key, width in _HAND.items())
     place = _entry(name, data, "object", "params")
-    object_shift, object_turn = (_array(name, place, "object", key, 3) for key in ("transl", "global_orient"))
+    object_shift, object_turn = (
+        array_of(name, "object/params", place, key, "T", 3) for key in ("transl", "global_orient")
+    )
     object_name = str(data.get("obj_name", file.stem.split("_")[0]))
     subject = _template(root, data)
     skeleton = _skeleton(model, subject)
@@ -97,16 +99,6 @@ def _entry(name: str, data: dict[str, Any], *keys: str) -> dict[str, Any]:
             raise Dropped(name, "wrong layout", f"the file has no '{'/'.join(keys)}'")
         data = data[key]
     return data
-
-
-def _array(name: str, values: dict[str, Any], of: str, key: str, width: int) -> np.ndarray:
-    """(T, width) of a body's parameters."""
-    if key not in values:
-        raise Dropped(name, "wrong layout", f"the file has no '{of}/params/{key}'")
-    array = np.array(values[key], float)
-    if array.ndim != 2 or array.shape[1] != width:
-        raise Dropped(name, "wrong layout", f"'{of}/params/{key}' has the shape {array.shape}, not ('T', {width})")
-    return array
 
 
 def _template(root: pathlib.Path, data: dict[str, Any]) -> pathlib.Path | None:

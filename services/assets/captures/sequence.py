@@ -6,7 +6,7 @@ of the hand +z.
 
 import dataclasses
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Items
 from typing import Any
 
@@ -87,3 +87,25 @@ def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> S
         return dropped
     except (CongraspError, OSError) as error:
         return Dropped(name, "unreadable", " ".join(str(error).split()))
+
+
+def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape: int | str) -> np.ndarray:
+    """A copy of an array of floats that a file holds.
+
+    Args:
+      name: of the sequence.
+      where: what holds the array, for the reason.
+      values: what it holds by name.
+      key: name of the array.
+      shape: its sizes; a letter stands for any.
+
+    Raises:
+      Dropped: it is not there, or has another shape.
+    """
+    if key not in values:
+        raise Dropped(name, "wrong layout", f"{where} has no '{key}'")
+    array = np.array(values[key], float)
+    pairs = zip(shape, array.shape, strict=False)
+    if array.ndim != len(shape) or any(wanted != size for wanted, size in pairs if isinstance(wanted, int)):
+        raise Dropped(name, "wrong layout", f"'{key}' of {where} has the shape {array.shape}, not {shape}")
+    return array
