@@ -154,7 +154,7 @@ def test_a_single_frame_is_a_motion(human: GraspMotion, kind: str, tmp_path: pat
     assert export([dataclasses.replace(human, **cut)], kind, tmp_path)[1] < 0.01
 
 
-def test_numbers_that_are_no_poses_are_refused_in_words(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_numbers_that_are_no_poses_are_refused(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     for name, value, words in (
         ("link_position", np.nan, "link_position has values that are not finite"),
         ("object_quaternion", 0.0, "object_quaternion has quaternions that are not of length one"),

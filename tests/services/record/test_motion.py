@@ -77,7 +77,7 @@ def test_what_is_no_motion_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "complaint"),
+    ("name", "change", "message"),
     [
         ("time", lambda x: x[:3], r"table has shape \(12,\), where \(T,\) is \(3,\)"),
         ("object_vertices", lambda x: x[:0], "object_vertices is empty"),
@@ -85,8 +85,8 @@ def test_what_is_no_motion_is_named(tmp_path):
         ("wrist_quaternion", lambda x: x[:, :3], r"wrist_quaternion has shape \(12, 3\), where \(T, 4\) is \(12, 4\)"),
     ],
 )
-def test_arrays_of_the_wrong_shape_are_named(tmp_path, name, change, complaint):
+def test_arrays_of_the_wrong_shape_are_named(tmp_path, name, change, message):
     motion = motion_of_episode(episode())
     save_motion(path := tmp_path / "a.npz", dataclasses.replace(motion, **{name: change(getattr(motion, name))}))
-    with pytest.raises(CongraspError, match=complaint):
+    with pytest.raises(CongraspError, match=message):
         load_motion(path)

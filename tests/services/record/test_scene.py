@@ -185,7 +185,7 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
     assert places == [0.0, pytest.approx(SPACING)]
 
 
-def test_an_unknown_hand_is_said_in_words() -> None:
+def test_an_unknown_hand_is_named_in_the_error() -> None:
     strange = Message(episode().arrays, {**episode().meta, "hand": "tentacle"})
     with pytest.raises(CongraspError, match="tentacle"):
         Converter()(KEY, strange, START)

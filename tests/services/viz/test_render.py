@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.wire.codec import encode
-from services.cli import render as command
+from services.cli.main import load
 from services.record.channels import Entry, opaque_channel
 from services.record.palette import OBJECT
 from services.record.reader import pick_episode
@@ -244,8 +244,9 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
         with pytest.raises(CongraspError, match="holds"):
             pick_episode(tmp_path / "run", index, success=success)
     out = tmp_path / "out.png"
-    assert command.episode(tmp_path / "run", out, index=0, frames=1) == 0
-    assert Image.open(out).size[0] > 400
+    for option in ("--frames", "--moments"):  # the second is its older name
+        assert load("render")(["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", option, "1"])() == 0
+        assert 400 < Image.open(out).size[0] < 600
     frames = render_episode_frames(pick_episode(tmp_path / "run", 0), range(4), (64, 48))
     save_video(tmp_path / "film.mp4", frames, (64, 48), 0.5 / CONTROL_DT)
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 4
