@@ -7,7 +7,6 @@ the object's surface points; nothing else about the object changes.
 import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -15,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from common.errors import CongraspError
 from common.objects.spec import GraspObject
-from services.assets.objects.sources import read_mesh
+from services.assets.objects.sources import load_geometry, read_mesh
 
 LEAST_SHARE = 0.10
 """Least share of the surface that the graspable region must have (paper, section Constraint Setup)."""
@@ -118,11 +117,7 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
     """
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Check the path.")
-    try:
-        mesh: Any = trimesh.load(path, process=False)
-    except Exception as error:  # the readers raise whatever they stumble over
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise CongraspError(f"{path} cannot be read: {reason}.", "Export it as PLY with coloured vertices.") from None
+    mesh = load_geometry(path, "Export it as PLY with coloured vertices.")
     visual = getattr(mesh, "visual", None)
     colours = getattr(visual, "vertex_colors", None) if getattr(visual, "kind", None) == "vertex" else None
     if colours is None and isinstance(mesh, trimesh.PointCloud):

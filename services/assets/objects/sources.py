@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import pathlib
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -113,6 +113,19 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Tri
     if len(mesh.faces) < 4:
         raise CongraspError(f"{path} has no volume: only {len(mesh.faces)} proper triangles.", "Export a closed mesh.")
     return mesh
+
+
+def load_geometry(path: pathlib.Path, remedy: str, **options: Any) -> Any:
+    """What trimesh finds in a file, be it a mesh or a point cloud, as it is.
+
+    Raises:
+      CongraspError: it cannot be read; the line ends with the remedy.
+    """
+    try:
+        return trimesh.load(path, process=False, **options)
+    except Exception as error:  # the readers raise whatever they stumble over
+        reason = (str(error) or type(error).__name__).splitlines()[0].rstrip(" .!")
+        raise CongraspError(f"{path} cannot be read: {reason}.", remedy) from None
 
 
 def _nested(folder: pathlib.Path) -> list[Source]:
