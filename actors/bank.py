@@ -50,7 +50,7 @@ def build_bank(
     Args:
       hand: the hand.
       task: geometry of the approach.
-      objects: N objects, in the hand's size already (`common.objects.pool.sized`).
+      objects: N objects, in the hand's size already (`common.objects.pool.scale_objects`).
       seed: of everything random.
       given: of each object the headings to take instead of sampled ones, if there are any.
 

@@ -19,7 +19,7 @@ from common.config import PhysicsName, RunConfig, run_config_from_json
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.journal import Journal
-from common.objects.pool import load_pool, sized
+from common.objects.pool import load_pool, scale_objects
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
 from common.task.types import Array, Surface
 from common.transport.base import Transport
@@ -104,7 +104,7 @@ class _Actor:
         self._config, self._arrays, self._link, self._transport = config, arrays, link, transport
         self._hand = get_hand(config.task.hand)
         number = zlib.crc32(link.actor.encode())
-        self._objects = sized(self._hand, config.task, load_pool(config.objects, number))
+        self._objects = scale_objects(self._hand, config.task, load_pool(config.objects, number))
         bank = build_bank(self._hand, config.task, self._objects, config.seed + number)
         self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
         self._spec = policy_spec(config.task, config.network)

@@ -218,7 +218,7 @@ def main():
     """Runs one grasp and says how it ended."""
     path = sys.argv[1] if len(sys.argv) > 1 else "policy.onnx"
     grasp = Grasp(onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"]))
-    steps = grasp.task["approach_steps"] + 200  # two seconds after the table is gone
+    steps = grasp.task["approach_steps"] + 200  # two seconds after the table is removed
     heights = []
     for _ in range(steps):
         grasp.step()
@@ -229,7 +229,7 @@ def main():
     print(
         f"{grasp.meta['hand']} hand, policy version {grasp.meta['version']}: "
         f"the cylinder is {'held' if held else 'lost'} "
-        f"two seconds after the table is gone, {1000 * (heights[-1] - removal):+.1f} mm, {links} links in contact"
+        f"two seconds after the table is removed, {1000 * (heights[-1] - removal):+.1f} mm, {links} links in contact"
     )
     return 0 if held else 1
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from common.hands import get_hand
 from services.assets.captures.extract import Surface, approach
 from services.assets.captures.transfer import followed
-from services.cli.objects import find_object
+from services.assets.objects.named import find_object
 from services.export.motion_file import save_motion
 from services.grasp.grasper import grasp
 from services.grasp.wrist_paths import read_wrist_path

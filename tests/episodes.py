@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from common.wire.codec import Message
-from services.record.poses import link_poses
+from services.assets.hands.kinematics import mujoco_link_poses
 
 BLOCKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 """Blocks of the observation that a policy of the paper's constraints gates."""
@@ -36,7 +36,7 @@ def episode(
         shares.append(share)
         wrist = center - wrist_turn.apply(frame.center) - 0.12 * (1 - share) * direction
         q = hand.q_open + 0.4 * share * (hand.q_closed - hand.q_open)
-        position, quaternion = link_poses(hand, q)
+        position, quaternion = mujoco_link_poses(hand, q)
         force = np.zeros((len(hand.links), 3))
         force[tips] = [0.0, 0.0, FORCE * (share == 1.0)]
         turned = wrist_turn * Rotation.from_quat(quaternion, scalar_first=True)

@@ -42,6 +42,7 @@ def _links(
     masses: tuple[float, ...],
     weights: tuple[float, ...],
 ) -> tuple[Link, ...]:
+    """The palm and the four fingers."""
     joints = [
         (Joint(f"{name}_{i}", vector(axis), point, *limit, **_GAINS),)
         for i, (axis, point, limit) in enumerate(zip(axes, points, limits, strict=False))

@@ -75,7 +75,7 @@ def read_hand(path: pathlib.Path) -> Hand:
 
 
 def faults(hand: Hand) -> list[str]:
-    """What is wrong with a hand, in words."""
+    """What is wrong with a hand, one phrase for each fault."""
     found: list[str] = []
     names = [link.name for link in hand.links]
     joints = [joint.name for joint in hand.joints]

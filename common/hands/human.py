@@ -25,6 +25,7 @@ _DIP = (-0.09, 1.571)
 
 
 def _joint(name: str, anchor: Vector, axis: Vector, limits: tuple[float, float]) -> Joint:
+    """A joint from its anatomical limits in degrees."""
     norm = sum(x * x for x in axis) ** 0.5
     unit = (axis[0] / norm, axis[1] / norm, axis[2] / norm)
     return Joint(name, unit, anchor, *limits, **FINGER_GAINS)

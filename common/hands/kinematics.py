@@ -41,6 +41,7 @@ class GraspFrame(NamedTuple):
 
 @functools.cache
 def _chain(hand: Hand) -> _Chain:
+    """The hand's joints by depth."""
     index = {link.name: i for i, link in enumerate(hand.links)}
     parents: list[int] = []
     last: list[int] = []

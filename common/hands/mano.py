@@ -161,15 +161,29 @@ def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
     )
 
 
+def own_mano_model(path: pathlib.Path | None = None) -> ManoModel | None:
+    """The user's MANO file at `path`, or else where the environment variable `CONGRASP_MANO` says; None without either.
+
+    Raises:
+      CongraspError: see `read_mano`.
+    """
+    named = path or os.environ.get(VARIABLE)
+    return read_mano(pathlib.Path(named)) if named else None
+
+
 def own_mano_hand() -> Hand:
-    """The hand of the user's file, which the environment variable `CONGRASP_MANO` names."""
-    path = os.environ.get(VARIABLE)
-    if not path:
+    """The hand of the user's file, which the environment variable `CONGRASP_MANO` names.
+
+    Raises:
+      CongraspError: it names none, or see `read_mano`.
+    """
+    model = own_mano_model()
+    if model is None:
         raise CongraspError(
             "The hand 'mano' needs your own MANO_RIGHT.pkl, which may not come with this package.",
             f"Get it from mano.is.tue.mpg.de and set {VARIABLE}=/path/to/MANO_RIGHT.pkl.",
         )
-    return mano_hand(read_mano(pathlib.Path(path)))
+    return mano_hand(model)
 
 
 def _each(**angles: float) -> dict[str, float]:
@@ -178,4 +192,5 @@ def _each(**angles: float) -> dict[str, float]:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of length one."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -80,6 +80,7 @@ def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
 
 
 def _add_wrist(spec: mujoco.MjSpec, body: mujoco.MjsBody, hand: Hand) -> None:
+    """Adds the six joints of the virtual wrist with their actuators."""
     gains = hand.wrist
     for i, name in enumerate(WRIST_JOINTS):
         slide = i < 3
@@ -99,6 +100,7 @@ def _add_wrist(spec: mujoco.MjSpec, body: mujoco.MjsBody, hand: Hand) -> None:
 
 
 def _add_position_actuator(spec: mujoco.MjSpec, joint: str, kp: float, kv: float, limit: float) -> None:
+    """Adds a position servo of a joint, which stops at `limit`."""
     actuator = spec.add_actuator(
         name=joint,
         target=joint,
@@ -110,6 +112,7 @@ def _add_position_actuator(spec: mujoco.MjSpec, joint: str, kp: float, kv: float
 
 
 def _add_capsules(body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_collision: bool) -> None:
+    """Adds a link's capsules, which share its mass by their volumes."""
     lengths = [np.linalg.norm(np.subtract(c.end, c.start)) + 4 / 3 * c.radius for c in link.capsules]
     shares = np.array([length * c.radius**2 for length, c in zip(lengths, link.capsules, strict=True)])
     for i, (capsule, share) in enumerate(zip(link.capsules, shares / shares.sum(), strict=True)):

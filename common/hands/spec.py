@@ -177,6 +177,7 @@ class Hand:
         return (weights / weights.mean()).astype(np.float32)
 
     def _pose(self, angles: dict[str, float]) -> np.ndarray:
+        """(F,) angles in the order of the joints."""
         return np.array([angles.get(joint.name, 0.0) for joint in self.joints], np.float32)
 
 

@@ -37,19 +37,23 @@ def _family(builder: Callable[[Rng], Draft]) -> Callable[[Rng], Draft]:
 
 
 def _box(half: Vector, center: Vector = (0, 0, 0), part: int = 0) -> Piece:
+    """A box with these half extents."""
     return Piece("box", half, center, part=part)
 
 
 def _ellipsoid(radii: Vector, center: Vector = (0, 0, 0), part: int = 0) -> Piece:
+    """An ellipsoid with these radii."""
     return Piece("ellipsoid", radii, center, part=part)
 
 
 def _cylinder(start: Vector, end: Vector, radius: float, part: int = 0) -> Piece:
+    """A cylinder along z."""
     center, quat, half = _between(start, end)
     return Piece("cylinder", (radius, half, 0), center, quat, part=part)
 
 
 def _capsule(start: Vector, end: Vector, radius: float, part: int = 0) -> Piece:
+    """A capsule along z."""
     center, quat, half = _between(start, end)
     return Piece("capsule", (radius, half, 0), center, quat, part=part)
 
@@ -64,6 +68,7 @@ def _between(start: Vector, end: Vector) -> tuple[Vector, tuple[float, float, fl
 
 
 def _mesh(vertices: np.ndarray) -> Piece:
+    """A convex mesh piece."""
     center = vertices.mean(0)
     return Piece("mesh", (0, 0, 0), tuple(center), vertices=vertices - center)
 

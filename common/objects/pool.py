@@ -42,7 +42,7 @@ def object_scale(hand: Hand, task: TaskConfig) -> float:
     return task.object_scale or hand.object_scale
 
 
-def sized(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> list[GraspObject]:
+def scale_objects(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> list[GraspObject]:
     """Objects in the size in which this hand grasps them."""
     return [obj.scaled(object_scale(hand, task)) for obj in objects]
 

@@ -71,6 +71,7 @@ def family_turns(count: int, seed: int, families: Sequence[str] = ()) -> list[st
 
 
 def _check(seed: int, families: Sequence[str]) -> None:
+    """Raises a CongraspError for a negative seed or an unknown family."""
     if seed < 0:
         raise CongraspError(f"The seed {seed} is negative.", "Seeds start at 0.")
     for family in families:

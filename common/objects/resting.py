@@ -173,11 +173,11 @@ def _lowest_nearby(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
     columns = np.arange(len(best))
     step = 0.1
     for i in range(12):
-        tries = _cone(best, step, count=8, phase=i)
-        heights = _height(pieces, tries.reshape(-1, 3)).reshape(len(tries), -1)
+        directions = _cone(best, step, count=8, phase=i)
+        heights = _height(pieces, directions.reshape(-1, 3)).reshape(len(directions), -1)
         pick = heights.argmin(0)
         lower = heights[pick, columns] < height
-        best = np.where(lower[:, None], tries[pick, columns], best)
+        best = np.where(lower[:, None], directions[pick, columns], best)
         height = np.where(lower, heights[pick, columns], height)
         step *= 0.65
     return best

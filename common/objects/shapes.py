@@ -36,6 +36,7 @@ def hull_of(vertices: np.ndarray) -> ConvexHull:
 
 @functools.lru_cache(maxsize=32)
 def _hull(data: bytes) -> ConvexHull:
+    """The convex hull of points (n, 3), given as bytes of float64."""
     return ConvexHull(np.frombuffer(data).reshape(-1, 3))
 
 
@@ -46,6 +47,7 @@ def triangulate(vertices: np.ndarray) -> trimesh.Trimesh:
 
 @functools.lru_cache(maxsize=32)
 def _triangulated(data: bytes) -> trimesh.Trimesh:
+    """The mesh of such a hull."""
     hull = _hull(data)
     vertices, faces = hull.points, hull.simplices
     corners = vertices[faces]
@@ -203,6 +205,7 @@ def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.cache
 def _template(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a primitive of unit size."""
     if kind == "box":
         mesh = trimesh.creation.box((2, 2, 2))
     elif kind == "cylinder":
@@ -214,18 +217,21 @@ def _template(kind: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _vertices(piece: Piece) -> np.ndarray:
+    """(V, 3) vertices of a mesh piece."""
     if piece.vertices is None:
         raise ValueError(f"a {piece.kind} piece has no vertices")
     return piece.vertices
 
 
 def _sphere(u: np.ndarray) -> np.ndarray:
+    """Points (n, 3) spread evenly over the unit sphere by random numbers (n, 2 or more)."""
     z = 2 * u[:, 0] - 1
     ring, turn = np.sqrt(1 - z**2), 2 * np.pi * u[:, 1]
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], -1)
 
 
 def _propose_box(half: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, 3) on a box of half extents (3,)."""
     areas = np.prod(half) / half
     edges = np.cumsum(areas) / areas.sum()
     axis = np.searchsorted(edges[:2], u[:, 0], side="right")
@@ -242,6 +248,7 @@ def _propose_box(half: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _propose_cylinder(radius: float, half: float, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, 3) on a cylinder along z."""
     share = 2 * half / (2 * half + radius)
     turn = 2 * np.pi * u[:, 1]
     around = np.stack([np.cos(turn), np.sin(turn), np.zeros(len(u))], -1)
@@ -254,6 +261,7 @@ def _propose_cylinder(radius: float, half: float, u: np.ndarray) -> tuple[np.nda
 
 
 def _propose_capsule(radius: float, half: float, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, 3) on a capsule along z."""
     # A sphere's area is uniform along its axis, as is a cylinder's: one coordinate runs over both.
     along = (2 * u[:, 0] - 1) * (radius + half)
     center = np.clip(along, -half, half)

@@ -66,11 +66,6 @@ class GraspObject:
     """What its import mended, or what else the user should know."""
 
     @property
-    def primitive(self) -> bool:
-        """Whether the object has no mesh piece (it then fits into `PRIMITIVE_SLOTS`)."""
-        return all(piece.kind != "mesh" for piece in self.pieces)
-
-    @property
     def non_graspable_points(self) -> np.ndarray:
         """(512,) whether each surface point belongs to O-."""
         return ~self.graspable[self.labels]
@@ -81,6 +76,7 @@ class GraspObject:
             return self
 
         def longer(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+            """A vector times the factor."""
             x, y, z = (factor * length for length in vector)
             return x, y, z
 

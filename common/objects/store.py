@@ -102,6 +102,7 @@ class Catalogue:
 
 
 def _to_message(obj: GraspObject) -> Message:
+    """The object as a message."""
     arrays = {name: np.asarray(getattr(obj, name)) for name in _ARRAYS}
     pieces = obj.pieces
     meshes = [np.zeros((0, 3)) if piece.vertices is None else piece.vertices for piece in pieces]
@@ -130,6 +131,7 @@ def _to_message(obj: GraspObject) -> Message:
 
 
 def _from_message(message: Message) -> GraspObject:
+    """The object of a message; a KeyError, IndexError or ValueError where a part is missing."""
     arrays, meta = message.arrays, message.meta
     ends = np.cumsum(arrays["piece_vertex_count"])
     vertices = np.split(arrays["piece_vertices"], ends[:-1])

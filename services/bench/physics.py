@@ -21,7 +21,7 @@ from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker
 from common.config import PhysicsName
 from common.hands import get_hand
-from common.objects.pool import load_pool, sized
+from common.objects.pool import load_pool, scale_objects
 from common.policy.bundle import PolicyBundle, sample_action
 from services.train.command import untrained
 from services.train.presets import get_preset
@@ -78,7 +78,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
     console = Console()
     config = get_preset("quickstart")
     hand = get_hand(config.task.hand)
-    objects = sized(hand, config.task, load_pool(config.objects))
+    objects = scale_objects(hand, config.task, load_pool(config.objects))
     bank = build_bank(hand, config.task, objects, 0)
     policy = untrained(config)
     table = Table(title=f"{environments} environments, {threads} thread(s), {_STEPS} control steps, {repeats} repeats")

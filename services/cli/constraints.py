@@ -1,156 +1,265 @@
 """Constraint sets of objects: headings, reference poses and wrist trajectories as training draws them, or captured."""
 
 import dataclasses
+import json
 import pathlib
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from common.errors import CongraspError
-from common.objects.spec import GraspObject
-from services.cli.constraints_import import ConstraintsImport
+from services.assets.captures import IMPORTERS
 
-_console = Console(highlight=False)
+if TYPE_CHECKING:
+    from common.hands.spec import Hand
+    from common.objects.spec import GraspObject
+    from common.wire.codec import Message
+    from services.assets.captures.build import Report
+    from services.cli.console import Track
+
+REPORT = "import.json"
+"""File beside imported sets that holds the outcome of each sequence."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ConstraintsGenerate:
-    """Makes the constraint sets of objects and writes one file each, which says what its arrays mean.
+def generate(
+    objects: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
+    count: int = 0,
+    families: tuple[str, ...] = (),
+    first_seed: int = 0,
+    hand: str = "human",
+    references: Literal["closed", "policy"] = "closed",
+    policy: pathlib.Path | None = None,
+    folder: str = "objects",
+    out: pathlib.Path = pathlib.Path("constraints"),
+    seed: int = 0,
+) -> int:
+    """Make the constraint sets of objects and write one file each, which says what its arrays mean.
 
     For the whole surface and for the graspable region O+: 256 headings by the paper's rules, 20 reference poses, and
     wrist trajectories that end at them, from 15 to 25 cm away, replayed through the wrist's controller. 80 % of them
     are for training, and the others are held out.
+
+    Examples: congrasp constraints generate mug:7 box:0; congrasp constraints generate my-objects --references policy
+
+    Args:
+      objects: Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7.
+      count: Besides, this many procedural objects.
+      families: Their families, in turn; all if none is named.
+      first_seed: Seed of the first of them; the others follow.
+      hand: Name of the hand, or its file.
+      references: closed: poses that close the hand around the object; policy: final states of a policy's grasps under
+        headings, as in the paper. Places that the policy does not fill are not allowed.
+      policy: Policy file for its references; by default the hand's pretrained one.
+      folder: Folder of objects.
+      out: Folder for the files.
+      seed: Seed of the constraints.
     """
+    from common.config import TaskConfig
+    from common.hands import get_hand
+    from common.objects.procedural import generate_many
+    from services.assets.objects.named import find_object, objects_of
+    from services.cli.console import tracked
+    from services.grasp.constraint_sets import make_sets, save
 
-    objects: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7."""
-    count: int = 0
-    """Besides, this many procedural objects."""
-    families: tuple[str, ...] = ()
-    """Their families, in turn; all if none is named."""
-    first_seed: int = 0
-    """Seed of the first of them; the others follow."""
-    hand: str = "human"
-    """Name of the hand, or its file."""
-    references: Literal["closed", "policy"] = "closed"
-    """closed: poses that close the hand around the object; policy: final states of a policy's grasps under headings, as
-    in the paper. Places that the policy does not fill are not allowed."""
-    policy: pathlib.Path | None = None
-    """Policy file for its references; by default the hand's, which comes with the package."""
-    folder: str = "objects"
-    """Folder of objects."""
-    out: pathlib.Path = pathlib.Path("constraints")
-    """Folder for the files."""
-    seed: int = 0
-    """Seed of the constraints."""
-
-    def run(self) -> int:
-        """Runs the command; returns its exit code."""
-        from common.config import TaskConfig
-        from common.hands import get_hand
-        from common.objects.procedural import generate_many
-        from services.grasp.constraint_sets import make_sets, save
-
-        if not self.objects and self.count < 1:
-            raise CongraspError("There is no object to make constraints for.", "Name objects, or set --count.")
-        hand = get_hand(self.hand)
-        with _console.status("Preparing objects") as status:
-            objects = [obj for text in self.objects for obj in _find(text, self.folder)]
-            objects += generate_many(self.count, self.first_seed, self.families)
-            status.update("Making constraints")
-            task, bank = TaskConfig(hand=hand.name), None
-            if self.references == "policy":
-                bank = self._grasped(hand.name, objects, lambda text: status.update(f"Grasping: {text}"))
-            for constraints in make_sets(hand, task, objects, self.seed, bank):
-                save(constraints, self.out)
-        what = "The constraint set of 1 object is" if len(objects) == 1 else f"The sets of {len(objects)} objects are"
-        _console.print(f"{what} in {escape(str(self.out))}.", soft_wrap=True)
-        return 0
-
-    def _grasped(self, hand: str, objects: list[GraspObject], progress: Callable[[str], None]) -> Any:
-        """The task set with references from a policy's grasps; says how many there are."""
-        import os
-
-        from common.policy import bundle as bundles
-        from common.policy.pretrained import policy_file
-        from services.evaluate.evaluator import Evaluator
-
-        bundle = bundles.load(policy_file(self.policy, self.hand))
-        if bundle.spec.hand_name != hand:
-            raise CongraspError(
-                f"The policy is for the hand '{bundle.spec.hand_name}', not '{hand}'.",
-                f"Set --hand {bundle.spec.hand_name}.",
-            )
-        evaluator = Evaluator(bundle, objects, threads=os.cpu_count() or 1, seed=self.seed)
-        said = ""
-
-        def tell(filled: int, places: int) -> None:
-            nonlocal said
-            said = f"{filled} of {places} places for reference poses are filled"
-            progress(said)
-
-        bank = evaluator.references(tell)
-        _console.print(f"{said}.")
-        return bank
+    if not objects and count < 1:
+        raise CongraspError("There is no object to make constraints for.", "Name objects, or set --count.")
+    known = get_hand(hand)
+    with tracked() as track:
+        track("Preparing objects", None)
+        found: list[GraspObject] = []
+        for text in objects:
+            path = pathlib.Path(text)
+            found += objects_of(path) if path.exists() else [find_object(text, folder)]
+        found += generate_many(count, first_seed, families)
+        bank = _references(known, policy, found, seed, track) if references == "policy" else None
+        track("Making constraints", None)
+        for constraints in make_sets(known, TaskConfig(hand=known.name), found, seed, bank):
+            save(constraints, out)
+    what = "The constraint set of 1 object is" if len(found) == 1 else f"The sets of {len(found)} objects are"
+    print(f"{what} in {out}.")
+    return 0
 
 
-@dataclasses.dataclass(frozen=True)
-class ConstraintsShow:
-    """Says what a constraint set holds, and draws some of it."""
+def _references(
+    hand: "Hand", policy: pathlib.Path | None, objects: "list[GraspObject]", seed: int, track: "Track"
+) -> Any:
+    """Constraints with references from a policy's grasps; prints how many there are."""
+    import os
 
-    file: Annotated[pathlib.Path, tyro.conf.Positional]
-    """A file of 'congrasp constraints generate'."""
-    png: pathlib.Path | None = None
-    """Picture to write: headings, affordance, trajectories and reference poses."""
-    rest: int = 0
-    """Resting pose of the picture, from 1; 0 takes the one that leaves room for most poses."""
-    seed: int = 0
-    """Draws which constraints the picture shows."""
+    from common.policy import bundle as bundles
+    from common.policy.pretrained import policy_file
+    from services.evaluate.evaluator import Evaluator
 
-    def run(self) -> int:
-        """Runs the command; returns its exit code."""
-        from services.grasp.constraint_sets import describe, load
+    bundle = bundles.load(policy_file(policy, hand.name))
+    if bundle.spec.hand_name != hand.name:
+        raise CongraspError(
+            f"The policy is for the hand '{bundle.spec.hand_name}', not '{hand.name}'.",
+            f"Set --hand {bundle.spec.hand_name}.",
+        )
+    evaluator = Evaluator(bundle, objects, threads=os.cpu_count() or 1, seed=seed)
+    advance, filled = track("Grasping: reference poses", None), (0, 0)
 
-        constraints = load(self.file)
-        rests = len(constraints.arrays["rest"])
-        if not 0 <= self.rest <= rests:
-            raise CongraspError(f"--rest is {self.rest}.", f"The object has the resting poses 1 to {rests}.")
-        rest = self.rest or 1 + int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
-        table = Table(show_header=False, box=None)
-        for key, value in describe(constraints).items():
-            table.add_row(key, escape(value))
-        _console.print(table)
-        if self.png is not None:
-            from services.viz.constraint_sheet import constraint_sheet
-            from services.viz.sheets import save_png
+    def progress(found: int, places: int) -> None:
+        """Remembers and shows how many places are filled."""
+        nonlocal filled
+        filled = found, places
+        advance(found)
 
-            save_png(self.png, constraint_sheet(constraints, rest - 1, self.seed))
-            _console.print(f"The picture is {escape(str(self.png))}.", soft_wrap=True)
-        return 0
+    constraints = evaluator.references(progress)
+    print(f"{filled[0]} of {filled[1]} places for reference poses are filled.")
+    return constraints
 
 
-def _find(text: str, folder: str) -> list[GraspObject]:
-    from services.assets.objects.named import objects_of
-    from services.cli.objects import find_object
+def import_captures(
+    format: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar=f"{{{','.join(IMPORTERS)}}}")],
+    path: Annotated[pathlib.Path, tyro.conf.Positional],
+    meshes: tuple[pathlib.Path, ...] = (),
+    mano: pathlib.Path | None = None,
+    hand: str = "human",
+    headings: Literal["sampled", "demonstrated"] = "sampled",
+    affordance: Literal["auto", "parts", "contacts", "none"] = "auto",
+    beyond: float = 0.1,
+    out: pathlib.Path = pathlib.Path("constraints"),
+    objects: pathlib.Path = pathlib.Path("objects"),
+    seed: int = 0,
+) -> int:
+    """Make constraint sets of captured grasps, by the rules of the paper, and say what was dropped and why.
 
-    path = pathlib.Path(text)
-    return objects_of(path) if path.exists() else [find_object(text, folder)]
+    From each sequence come a reference pose (the `human` hand's finger angles in the grasping frame) and a wrist
+    trajectory to it of 15 waypoints, and, where the object's parts are labelled, which of them may be touched. Only
+    right hands are used. Objects are made of the data set's meshes.
+
+    Examples: congrasp constraints import grab GRAB/; congrasp constraints import myohand data/ --meshes object_sim/
+
+    Args:
+      format: Whose files these are.
+      path: The data set's folder, or one of its files.
+      meshes: Folders with the objects' meshes, where they are not in their place in the data set.
+      mano: Your MANO_RIGHT.pkl, or CONGRASP_MANO; dexycb needs it, and grab and oakink are more exact with it.
+      hand: Hand of the sets. Human finger angles fit no other hand: it follows the captured wrist by its own grasp
+        axes, with the captured headings and affordance, and closes its fingers around the object at the end.
+      headings: sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps.
+      affordance: What O+ is: parts that fingers touch; whatever they touch; or everything. auto: parts where they are
+        labelled.
+      beyond: Radians by which a captured joint may exceed the human hand's limits; it is then moved to the limit. For
+        another hand it does not count.
+      out: Folder for the sets, and for import.json, which holds the outcome of each sequence.
+      objects: Folder for the objects.
+      seed: Of sampled headings and of the split into training and held-out.
+    """
+    import importlib
+
+    from common.hands import get_hand
+    from common.hands.mano import own_mano_model
+    from services.assets.captures.build import Options, import_sets
+    from services.assets.captures.objects import Meshes
+    from services.cli.console import bars
+
+    if format not in IMPORTERS:
+        raise CongraspError(f"There is no format '{format}'.", f"Choose one of: {', '.join(IMPORTERS)}.")
+    if not path.exists():
+        raise CongraspError(f"There is no file or folder {path}.", "Name the data set's folder.")
+    if not beyond >= 0:
+        raise CongraspError(f"--beyond is {beyond}.", "It is in radians, and not negative.")
+    known, options = get_hand(hand), Options(headings, affordance, beyond, seed=seed)
+    importer = importlib.import_module(IMPORTERS[format])
+    with bars() as progress:
+        task = progress.add_task("Reading", total=None)
+        made = import_sets(
+            importer.read(path, Meshes(meshes), own_mano_model(mano)),
+            known,
+            options,
+            format,
+            lambda name: progress.update(task, description=f"Reading {name}", advance=1),
+        )
+    report = made[-1]
+    if not report.kept and not report.dropped:
+        raise CongraspError(f"{path} holds no sequence of {format}.", f"Name the folder that holds {importer.HOLDS}.")
+    about = {"format": format, "path": str(path), "hand": known.name, **dataclasses.asdict(options)}
+    _save(*made, about, out, objects)
+    _print_report(report, known.name, out, objects)
+    return 0 if report.kept else 2
 
 
-SUBCOMMANDS: dict[str, Callable[..., Any]] = {
-    "generate": ConstraintsGenerate,
-    "import": ConstraintsImport,
-    "show": ConstraintsShow,
-}
+def _save(
+    objects: "list[GraspObject]",
+    sets: "list[Message]",
+    report: "Report",
+    about: dict[str, Any],
+    out: pathlib.Path,
+    folder: pathlib.Path,
+) -> None:
+    """Writes objects to their folder, and their sets and the outcome of each sequence to `out`."""
+    from common.files import write_atomically
+    from common.objects.store import Catalogue
+    from services.grasp.constraint_sets import save
+
+    catalogue = Catalogue(folder)
+    for obj, made in zip(objects, sets, strict=True):
+        catalogue.add(obj)
+        save(made, out)
+    rows = {**about, "kept": report.kept, "dropped": report.dropped}
+    write_atomically(out / REPORT, json.dumps(rows, indent=2).encode())
 
 
-def parse(arguments: Sequence[str]) -> Callable[[], int]:
-    """The command that the arguments name, ready to run."""
-    chosen = tyro.extras.subcommand_cli_from_dict(
-        SUBCOMMANDS, prog="congrasp constraints", description=__doc__, args=list(arguments)
-    )
-    return chosen.run
+def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathlib.Path) -> None:
+    """What was kept, what was dropped by which rule, and where it all is."""
+    from services.cli.console import show_table
+
+    kept, dropped = report.kept, report.dropped
+    print(f"{len(kept)} of {len(kept) + len(dropped)} sequences kept.")
+    if dropped:
+        show_table(("dropped", "why", "for example"), [(str(n), rule, example) for rule, n, example in report.rules()])
+    if kept and hand != "human":
+        print(
+            f"A human's finger angles do not fit the hand '{hand}' and were dropped. Heading, affordance and wrist "
+            "trajectory were kept; its fingers close around the object where the trajectory ends."
+        )
+    elif kept:
+        worst = max(kept, key=lambda row: row["residual_rad"])
+        mean = sum(row["residual_rad"] for row in kept) / len(kept)
+        print(
+            f"Finger angles leave {mean:.3f} rad a bone on average, {worst['residual_rad']:.3f} rad at most "
+            f"({worst['sequence']})."
+        )
+    if kept:
+        above = sum(row["clear_of_table"] for row in kept)
+        sets = len({row["object"] for row in kept})
+        print(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")
+        print(f"Constraint sets ({sets}) are in {out}, their objects in {objects}.")
+    print(f"{out / REPORT} holds the outcome of each sequence.")
+
+
+def show(
+    file: Annotated[pathlib.Path, tyro.conf.Positional],
+    png: pathlib.Path | None = None,
+    rest: int = 0,
+    seed: int = 0,
+) -> int:
+    """Print what a constraint set holds, and draw some of it.
+
+    Args:
+      file: A file of 'congrasp constraints generate' or 'import'.
+      png: Picture to write: headings, affordance, trajectories and reference poses.
+      rest: Resting pose of the picture, from 1; 0 takes the one that leaves room for most poses.
+      seed: Draws which constraints the picture shows.
+    """
+    from services.cli.console import show_facts
+    from services.grasp.constraint_sets import describe, load
+
+    constraints = load(file)
+    rests = len(constraints.arrays["rest"])
+    if not 0 <= rest <= rests:
+        raise CongraspError(f"--rest is {rest}.", f"The object has the resting poses 1 to {rests}.")
+    show_facts(describe(constraints))
+    if png is not None:
+        from services.viz.constraint_sheet import constraint_sheet
+        from services.viz.sheets import save_png
+
+        best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
+        save_png(png, constraint_sheet(constraints, rest - 1 if rest else best, seed))
+        print(f"The picture is {png}.")
+    return 0
+
+
+COMMANDS = {"generate": generate, "import": import_captures, "show": show}

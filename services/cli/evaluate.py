@@ -11,7 +11,7 @@ from common.errors import CongraspError
 if TYPE_CHECKING:
     from common.objects.spec import GraspObject
     from common.task.bank import ConstraintBank
-    from services.cli.progress import Track
+    from services.cli.console import Track
 
 Split = Literal["all", "training", "held-out"]
 Table = Literal["single", "composed", "objects", "noise", "all"]
@@ -73,7 +73,7 @@ def evaluate(
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
     from services.assets.objects.named import objects_of
-    from services.cli.progress import tracked
+    from services.cli.console import tracked
     from services.evaluate.noise import LEVELS
     from services.evaluate.scores import TABLES, tables_of, write_json
     from services.evaluate.worlds import objects_in_words
@@ -88,7 +88,7 @@ def evaluate(
     engine = resolve_physics(physics)
     rows = []
     with tracked() as track:
-        given = objects_of(objects, track) if objects else None
+        given = objects_of(objects, track=track) if objects else None
         settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
         bank = None
         if constraints is not None:

@@ -19,9 +19,11 @@ def policy(
     Normalisation is inside; the file also holds the hand, the meaning and order of every input and output, and the
     hand's MuJoCo model. docs/exports.md says how to use it; examples/onnx_grasp.py does.
 
+    Examples: congrasp export policy; congrasp export policy --hand allegro --to stablehlo
+
     Args:
-      policy: The policy file (.safetensors); the shipped one otherwise.
-      hand: Whose shipped policy.
+      policy: The policy file (.safetensors); the pretrained one otherwise.
+      hand: Whose pretrained policy.
       to: The format.
       out: The file to write; policy.onnx or policy.stablehlo.zip otherwise.
     """
@@ -49,6 +51,8 @@ def motion(
     trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for each motion. docs/exports.md says what
     is in each.
 
+    Examples: congrasp export motion grasps/mug/grasp.npz; congrasp export motion runs/mine --success --to ros2
+
     Args:
       paths: Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot takes several.
       to: The format.
@@ -57,15 +61,15 @@ def motion(
       success: Count only episodes that succeeded.
     """
     from services.export.frames import TOLERANCE_MM
-    from services.export.motion import FORMATS, export_motions, pick_motion
+    from services.export.motion_formats import FORMATS, export_motions, pick_motion
 
     if not paths:
         raise CongraspError("No motion was named.", "Name a .npz of 'congrasp grasp', a recording or a run's folder.")
     target = out or pathlib.Path(f"{paths[0].stem}{FORMATS[to] or f'-{to}'}")
     motions = [pick_motion(path, index, success=success) for path in paths]
     error = export_motions(motions, to, target)
-    moments = sum(len(motion.time) for motion in motions)
-    print(f"{target}: {moments} moments, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
+    frames = sum(len(motion.time) for motion in motions)
+    print(f"{target}: {frames} frames, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
     return 0
 
 

@@ -10,7 +10,7 @@ from typing_extensions import Doc
 
 from common.errors import CongraspError
 from common.task.constraints import CONSTRAINTS
-from services.assets.objects.meshes import ImportOptions
+from services.assets.objects.options import ImportOptions
 
 NOT_HELD, BAD_INPUT = 1, 2
 
@@ -66,7 +66,7 @@ def grasp(
 
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
-    from services.cli.progress import bars
+    from services.cli.console import bars
     from services.grasp.grasper import Grasper
     from services.grasp.jobs import SHEET, Result, Settings, find_jobs, run_job, save_summary
 

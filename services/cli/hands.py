@@ -8,16 +8,13 @@ import tyro
 
 def list_hands() -> int:
     """List the hands: those of the package and your own, with joints, masses and whether a policy comes with them."""
-    import numpy as np
-    from rich.console import Console
-    from rich.table import Table
 
     from common.errors import CongraspError
     from common.hands import HANDS, get_hand, hands_folder, own_hands
     from common.policy.pretrained import shipped
+    from services.cli.console import show_table
 
-    table = Table("hand", "joints", "fingers", "mass", "torque", "objects", "policy")
-    missing = []
+    rows, missing = [], []
     own = own_hands()
     for name in [*HANDS, *own]:
         try:
@@ -25,20 +22,18 @@ def list_hands() -> int:
         except CongraspError as error:
             missing.append(str(error))
             continue
-        table.add_row(
+        row = (
             name,
             str(len(hand.joints)),
             str(len(hand.tip_links)),
             f"{sum(link.mass for link in hand.links):.2f} kg",
-            f"{np.max([joint.torque_limit for joint in hand.joints]):.1f} N.m",
+            f"{max(joint.torque_limit for joint in hand.joints):.1f} N.m",
             f"x {hand.object_scale:g}",
-            "shipped" if shipped(name) else "none",
+            "pretrained" if shipped(name) else "none",
         )
-    console = Console(highlight=False)
-    console.print(table)
-    for text in missing:
-        console.print(text, markup=False, soft_wrap=True)
-    console.print(f"Your own hands are the files in {hands_folder()}.", markup=False, soft_wrap=True)
+        rows.append(row)
+    show_table(("hand", "joints", "fingers", "mass", "torque", "objects", "policy"), rows)
+    print("\n".join([*missing, f"Your own hands are the files in {hands_folder()}."]))
     return 0
 
 
@@ -74,6 +69,8 @@ def import_hand(
 
     The result is one JSON file, which every command takes as --hand, by its name or its path. Look at the picture, and
     correct the file where the proposal is wrong: poses, fingertips, gains and capsules are all in it.
+
+    Examples: congrasp hands import hand.urdf; congrasp hands import hand.xml --name mine --palm palm_link
 
     Args:
       file: The hand's URDF (.urdf) or MJCF (.xml), a right or left hand of hinges.

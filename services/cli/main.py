@@ -119,8 +119,6 @@ def run(arguments: list[str]) -> int:
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
     """The command's module as a function from its arguments to the call that they ask for."""
     module = importlib.import_module(f"services.cli.{name}")
-    if hasattr(module, "parse"):
-        return module.parse
     import tyro
 
     prog = f"congrasp {name}"

@@ -1,246 +1,277 @@
 """Objects to grasp: generate them, import meshes, list and show them."""
 
-import dataclasses
 import pathlib
-import sys
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import tyro
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from common.errors import CongraspError
-from common.objects import store
-from common.objects.procedural import FAMILIES, family_turns, generate
-from common.objects.spec import GraspObject
-from common.objects.store import Catalogue
-from common.task.sampling.headings import above, clear_table, feasible, sample_headings
-from services.assets.objects.meshes import ImportOptions, import_source
-from services.assets.objects.sources import SUFFIXES, find_sources
-from services.cli.objects_affordance import ObjectsAffordance
-from services.cli.progress import bars
+from services.assets.objects.options import ImportOptions
 
-_console = Console(highlight=False)
+if TYPE_CHECKING:
+    from common.objects.spec import GraspObject
+
+_COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "yellow": (255, 255, 0)}
 
 
-@dataclasses.dataclass(frozen=True)
-class ObjectsGenerate:
-    """Makes procedural objects and stores them in a folder."""
+def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tuple[str, ...] = ()) -> int:
+    """Make procedural objects and store them in a folder.
 
-    out: str = "objects"
-    """Folder for the objects."""
-    count: int = 24
-    """Number of objects."""
-    seed: int = 0
-    """Seed of the first; the others follow. Training never uses seeds from one million upward."""
-    families: tuple[str, ...] = ()
-    """Families, in turn; all if none is named."""
+    Examples: congrasp objects generate --count 100; congrasp objects generate --families mug knife --out tools
 
-    def run(self) -> int:
-        """Runs the command; returns its exit code."""
-        if self.count < 1:
-            raise CongraspError(f"--count is {self.count}.", "Ask for at least one object.")
-        catalogue = Catalogue(self.out)
-        families = family_turns(self.count, self.seed, self.families)
-        with bars(_console) as progress:
-            task = progress.add_task("Generating", total=self.count)
-            for i, family in enumerate(families):
-                catalogue.add(generate(self.seed + i, family))
-                progress.advance(task)
-        _console.print(f"{self.count} objects are in {escape(self.out)}.")
-        return 0
+    Args:
+      out: Folder for the objects.
+      count: Number of objects.
+      seed: Seed of the first; the others follow. Training never uses seeds from one million upward.
+      families: Families, in turn; all if none is named.
+    """
+    from common.objects import procedural
+    from common.objects.store import Catalogue
+    from services.cli.console import tracked
+
+    if count < 1:
+        raise CongraspError(f"--count is {count}.", "Ask for at least one object.")
+    catalogue = Catalogue(out)
+    turns = procedural.family_turns(count, seed, families)
+    with tracked() as track:
+        advance = track("Generating", count)
+        for i, family in enumerate(turns):
+            catalogue.add(procedural.generate(seed + i, family))
+            advance(i + 1)
+    print(f"{count} objects are in {out}.")
+    return 0
 
 
-@dataclasses.dataclass(frozen=True)
-class ObjectsImport:
-    """Makes objects of meshes: decomposes them, weighs them, finds their resting poses, and stores them in a folder.
+def import_meshes(
+    paths: Annotated[tuple[str, ...], tyro.conf.Positional],
+    out: str = "objects",
+    options: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(),  # noqa: B008
+) -> int:
+    """Make objects of meshes: decompose them, weigh them, find their resting poses, and store them in a folder.
 
     A path is a mesh file (STL, OBJ, PLY, GLB), a folder with `graspable.*` and `non_graspable.*`, a folder with convex
     pieces `contact*` beside `<name>.*` and `<name>_<part>.*`, or a folder of such files and folders.
+
+    Examples: congrasp objects import mug.obj; congrasp objects import scans/ --unit mm --density 300 --out my-objects
+
+    Args:
+      paths: Mesh files and folders.
+      out: Folder for the objects.
+      options: How meshes become objects.
     """
+    from common.objects.store import Catalogue
+    from services.assets.objects.meshes import import_source
+    from services.assets.objects.sources import find_sources
+    from services.cli.console import bars, report_error
 
-    paths: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Mesh files and folders."""
-    out: str = "objects"
-    """Folder for the objects."""
-    options: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=ImportOptions)
-    """How meshes become objects."""
-
-    def run(self) -> int:
-        """Runs the command; returns its exit code: 2 if anything could not be imported."""
-        if not self.paths:
-            raise CongraspError("There is nothing to import.", "Name mesh files or folders.")
-        sources, done, failures = [], 0, 0
-        for path in self.paths:
+    if not paths:
+        raise CongraspError("There is nothing to import.", "Name mesh files or folders.")
+    sources, done, failures = [], 0, 0
+    for path in paths:
+        try:
+            sources += find_sources(path)
+        except CongraspError as error:
+            report_error(error)
+            failures += 1
+    catalogue = Catalogue(out)
+    with bars() as progress:
+        task = progress.add_task("Importing", total=len(sources))
+        for source in sources:
+            progress.update(task, description=f"Importing {source.name}")
             try:
-                sources.extend(find_sources(path))
+                obj = import_source(source, options)
+                catalogue.add(obj)
+                done += 1
+                for note in obj.notes:
+                    print(f"{source.name}: {note}.")
             except CongraspError as error:
-                failures += _complain(error)
-        catalogue = Catalogue(self.out)
-        with bars(_console) as progress:
-            task = progress.add_task("Importing", total=len(sources))
-            for source in sources:
-                progress.update(task, description=f"Importing {escape(source.name)}")
-                try:
-                    obj, notes = import_source(source, self.options)
-                    catalogue.add(obj)
-                    done += 1
-                    for note in notes:
-                        progress.console.print(f"{escape(source.name)}: {escape(note)}.")
-                except CongraspError as error:
-                    failures += _complain(error)
-                progress.advance(task)
-        if done:
-            _console.print(f"{done} of {done + failures} imported; they are in {escape(self.out)}.")
-        return 2 if failures else 0
+                report_error(error)
+                failures += 1
+            progress.advance(task)
+    if done:
+        print(f"{done} of {done + failures} imported; they are in {out}.")
+    return 2 if failures else 0
 
 
-@dataclasses.dataclass(frozen=True)
-class ObjectsList:
-    """Lists the objects of a folder, or the families of the generator."""
+def list_objects(folder: Annotated[str, tyro.conf.Positional] = "objects", families: bool = False) -> int:
+    """List the objects of a folder, or the families of the generator.
 
-    folder: Annotated[str, tyro.conf.Positional] = "objects"
-    """Folder of objects."""
-    families: bool = False
-    """List the generator's families instead."""
+    Args:
+      folder: Folder of objects.
+      families: List the generator's families instead.
+    """
+    from common.objects.procedural import FAMILIES
+    from common.objects.store import Catalogue
+    from services.cli.console import report_error, show_table
 
-    def run(self) -> int:
-        """Runs the command; returns its exit code: 2 if a file is damaged."""
-        if self.families:
-            _console.print("\n".join(FAMILIES))
-            return 0
-        catalogue = Catalogue(self.folder)
-        names, failures = catalogue.list(), 0
-        table = Table("name", "family", "size (cm)", "mass (g)", "pieces", "O+", "O-", "poses")
-        for name in names:
-            try:
-                obj = catalogue.get(name)
-            except CongraspError as error:
-                failures += _complain(error)
-                continue
-            row = (name, obj.family, _size(obj), f"{1000 * obj.mass:.0f}", str(len(obj.pieces)), *_parts(obj))
-            table.add_row(*map(escape, row), str(len(obj.rest_poses)))
-        _console.print(table if names else f"{escape(self.folder)} holds no object.")
-        return 2 if failures else 0
-
-
-@dataclasses.dataclass(frozen=True)
-class ObjectsShow:
-    """Prints the facts of an object, and draws it."""
-
-    object: Annotated[str, tyro.conf.Positional]
-    """A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7."""
-    folder: str = "objects"
-    """Folder of objects."""
-    png: str = ""
-    """Picture to write: labelled surface, convex pieces, headings on the table."""
-
-    def run(self) -> int:
-        """Runs the command; returns its exit code."""
-        obj = find_object(self.object, self.folder)
-        share = obj.graspable[obj.labels].mean()
-        plus_parts, minus_parts = _parts(obj)
-        free, plus = (
-            sample_headings(obj, np.random.default_rng(0), use_affordance=affordance) for affordance in (False, True)
-        )
-        table = Table(show_header=False, box=None)
-        rows = {
-            "family": obj.family,
-            "size": f"{_size(obj)} cm",
-            "mass": f"{1000 * obj.mass:.1f} g",
-            "principal inertia": " ".join(f"{1e6 * v:.1f}" for v in np.linalg.eigvalsh(obj.inertia)) + " kg.mm²",
-            "pieces": ", ".join(_counted([piece.kind for piece in obj.pieces])),
-            "O+": f"{plus_parts} ({share:.0%} of the surface)",
-            "O-": minus_parts or "nothing",
-            "digest": store.digest(obj),
-        }
-        for i, pose in enumerate(obj.rest_poses):
-            counts = []
-            for headings in (free, plus):
-                if headings is None:
-                    counts.append("none")
-                    continue
-                cleared = clear_table(headings, pose)
-                reachable = feasible(cleared, pose)
-                counts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
-            rows[f"resting pose {i + 1}"] = (
-                f"{100 * pose[2]:.1f} cm high; headings within reach {counts[0]}, on O+ {counts[1]}"
-            )
-        for key, value in rows.items():
-            table.add_row(key, escape(value))
-        _console.print(f"[bold]{escape(obj.name)}[/bold]")
-        _console.print(table)
-        if self.png:
-            from services.cli.objects_picture import draw_object
-
-            assert free is not None, "only O+ may be out of reach"
-            draw_object(obj, free, pathlib.Path(self.png))
-            _console.print(f"The picture is {escape(self.png)}.")
+    if families:
+        print("\n".join(FAMILIES))
         return 0
+    catalogue, rows, failures = Catalogue(folder), [], 0
+    names = catalogue.list()
+    for name in names:
+        try:
+            obj = catalogue.get(name)
+        except CongraspError as error:
+            report_error(error)
+            failures += 1
+            continue
+        weight, pieces, poses = f"{1000 * obj.mass:.0f}", str(len(obj.pieces)), str(len(obj.rest_poses))
+        rows.append((name, obj.family, _size(obj), weight, pieces, *_parts(obj), poses))
+    if names:
+        show_table(("name", "family", "size (cm)", "mass (g)", "pieces", "graspable", "avoid", "poses"), rows)
+    else:
+        print(f"{folder} holds no object.")
+    return 2 if failures else 0
 
 
-SUBCOMMANDS: dict[str, Callable[..., Any]] = {
-    "generate": ObjectsGenerate,
-    "import": ObjectsImport,
-    "list": ObjectsList,
-    "show": ObjectsShow,
-    "affordance": ObjectsAffordance,
-}
+def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", png: pathlib.Path | None = None) -> int:
+    """Print the facts of an object, and draw it.
 
+    Examples: congrasp objects show mug:7 --png mug.png; congrasp objects show mug_7 --folder my-objects
 
-def parse(arguments: Sequence[str]) -> Callable[[], int]:
-    """The command that the arguments name, ready to run."""
-    chosen = tyro.extras.subcommand_cli_from_dict(
-        SUBCOMMANDS, prog="congrasp objects", description=__doc__, args=list(arguments)
-    )
-    return chosen.run
-
-
-def find_object(text: str, folder: str = "objects") -> GraspObject:
-    """The object that a user means: an object file, a mesh, FAMILY:SEED, or a name in a folder.
-
-    Raises:
-      CongraspError: there is no such object.
+    Args:
+      object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
+      folder: Folder of objects.
+      png: Picture to write: labelled surface, convex pieces, headings on the table.
     """
-    path = pathlib.Path(text)
-    if path.suffix == store.SUFFIX:
-        return store.load(path)
-    if path.suffix.lower() in SUFFIXES or path.is_dir():
-        sources = find_sources(path)
-        if len(sources) > 1:
-            raise CongraspError(f"{text} holds {len(sources)} objects.", "Name one of them.")
-        return import_source(sources[0], ImportOptions())[0]
-    family, colon, seed = text.partition(":")
-    if colon and seed.isdigit():
-        return generate(int(seed), family)
-    if not Catalogue(folder).path(text).is_file():
-        raise CongraspError(
-            f"There is no object '{text}' in {folder}.",
-            "Name an object of the folder, an object file, a mesh, or FAMILY:SEED such as mug:7.",
-        )
-    return Catalogue(folder).get(text)
+    import numpy as np
 
+    from common.objects.store import digest
+    from common.task.sampling.headings import above, clear_table, feasible, sample_headings
+    from services.assets.objects.named import find_object
+    from services.cli.console import show_facts
 
-def _complain(error: CongraspError) -> int:
-    print(f"congrasp: error: {error}", file=sys.stderr)
-    return 1
-
-
-def _size(obj: GraspObject) -> str:
-    return " x ".join(f"{100 * side:.1f}" for side in np.ptp(obj.visual_vertices, axis=0))
-
-
-def _parts(obj: GraspObject) -> tuple[str, str]:
-    """The names of the parts in O+ and in O-."""
-    plus, minus = (
-        ", ".join(name for name, graspable in zip(obj.part_names, obj.graspable, strict=True) if graspable == wanted)
-        for wanted in (True, False)
+    obj = find_object(object, folder)
+    share = obj.graspable[obj.labels].mean()
+    graspable, avoided = _parts(obj)
+    free, on_graspable = (
+        sample_headings(obj, np.random.default_rng(0), use_affordance=affordance) for affordance in (False, True)
     )
-    return plus, minus
+    kinds = [piece.kind for piece in obj.pieces]
+    facts = {
+        "family": obj.family,
+        "size": f"{_size(obj)} cm",
+        "mass": f"{1000 * obj.mass:.1f} g",
+        "principal inertia": " ".join(f"{1e6 * v:.1f}" for v in np.linalg.eigvalsh(obj.inertia)) + " kg.mm²",
+        "pieces": ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds)),
+        "graspable region": f"{graspable} ({share:.0%} of the surface)",
+        "avoid region": avoided or "nothing",
+        "digest": digest(obj),
+    }
+    for i, pose in enumerate(obj.rest_poses):
+        counts = []
+        for headings in (free, on_graspable):
+            if headings is None:
+                counts.append("none")
+                continue
+            cleared = clear_table(headings, pose)
+            reachable = feasible(cleared, pose)
+            counts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
+        facts[f"resting pose {i + 1}"] = (
+            f"{100 * pose[2]:.1f} cm high; headings within reach {counts[0]}, on the graspable region {counts[1]}"
+        )
+    print(obj.name)
+    show_facts(facts)
+    if png is not None:
+        from services.viz.object_sheet import object_sheet
+        from services.viz.sheets import save_png
+
+        assert free is not None, "only the graspable region may be out of reach"
+        save_png(png, object_sheet(obj, free))
+        print(f"The picture is {png}.")
+    return 0
 
 
-def _counted(words: list[str]) -> list[str]:
-    return [f"{words.count(word)} {word}" for word in dict.fromkeys(words)]
+def set_affordance(
+    object: Annotated[str, tyro.conf.Positional],
+    part_mesh: pathlib.Path | None = None,
+    painted: pathlib.Path | None = None,
+    colour: str = "green",
+    half_space: tuple[float, ...] = (),
+    invert: bool = False,
+    name: str = "",
+    folder: str = "objects",
+) -> int:
+    """Divide an object's surface anew into the graspable region (O+) and the avoid region (O-).
+
+    O+ is what lies on the mesh of a part, what is painted in a colour, or what lies beyond a plane. It must have a
+    tenth of the surface at least. Sets of constraints and evaluation then keep to it.
+
+    Examples: congrasp objects affordance mug_7 --part-mesh handle.ply;
+    congrasp objects affordance mug_7 --half-space 0 0 1 0.02 --name upper-mug
+
+    Args:
+      object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
+      part_mesh: A mesh of the graspable part, in the frame and unit of the object's own file.
+      painted: A PLY file of the object with coloured vertices, in the same frame and unit.
+      colour: Of the graspable region in the painted file: red, green, blue, yellow, or #rrggbb.
+      half_space: Three numbers of a direction and one in metres: O+ is what lies farther than that along the direction.
+        In the object's frame, whose origin is its centre of mass.
+      invert: What was found is the avoid region, and the rest may be grasped.
+      name: Name of the new object; the old one otherwise, which it then replaces.
+      folder: Folder of objects, to which the new one goes.
+    """
+    from common.objects.store import Catalogue
+    from services.assets.objects import affordance
+    from services.assets.objects.named import find_object
+
+    if [part_mesh, painted, half_space or None].count(None) != 2:
+        raise CongraspError(
+            "It must be clear what may be grasped.", "Set one of --part-mesh, --painted and --half-space."
+        )
+    if len(half_space) not in (0, 4):
+        raise CongraspError(
+            f"--half-space has {len(half_space)} numbers, not four.",
+            "Write a direction and a distance in metres, such as 0 0 1 0.02.",
+        )
+    obj = find_object(object, folder)
+    if part_mesh is not None:
+        found = affordance.on_part_mesh(obj, part_mesh)
+    elif painted is not None:
+        found = affordance.painted(obj, painted, _colour(colour))
+    else:
+        found = affordance.in_half_space(obj, half_space[:3], half_space[3])
+    if (found != invert).all():
+        raise CongraspError(
+            f"All of the surface of '{obj.name}' could be grasped, so that nothing is divided.",
+            "Choose a smaller part.",
+        )
+    labelled = affordance.two_parts(obj, found != invert, name)
+    file = Catalogue(folder).add(labelled)
+    share = 1 - labelled.non_graspable_points.mean()
+    print(f"{share:.0%} of the surface of {labelled.name} may be grasped; it is in {file}.")
+    return 0
+
+
+def _size(obj: "GraspObject") -> str:
+    """The sides of its box in cm."""
+    sides = 100 * (obj.visual_vertices.max(0) - obj.visual_vertices.min(0))
+    return " x ".join(f"{side:.1f}" for side in sides)
+
+
+def _parts(obj: "GraspObject") -> tuple[str, str]:
+    """The names of the parts of the graspable and of the avoid region."""
+    named = list(zip(obj.part_names, obj.graspable, strict=True))
+    graspable, avoided = (", ".join(name for name, allowed in named if allowed == wanted) for wanted in (True, False))
+    return graspable, avoided
+
+
+def _colour(text: str) -> tuple[int, int, int]:
+    """Red, green and blue, 0 to 255, of a name or of #rrggbb."""
+    if text in _COLOURS:
+        return _COLOURS[text]
+    try:
+        red, green, blue = bytes.fromhex(text.removeprefix("#")) if text.startswith("#") else b""
+    except ValueError:
+        raise CongraspError(f"--colour is '{text}'.", f"Write #rrggbb, or one of: {', '.join(_COLOURS)}.") from None
+    return red, green, blue
+
+
+COMMANDS = {
+    "generate": generate,
+    "import": import_meshes,
+    "list": list_objects,
+    "show": show,
+    "affordance": set_affordance,
+}

@@ -1,4 +1,4 @@
-"""`congrasp plot`."""
+"""`congrasp plot`: figures of a run or of an evaluation."""
 
 import pathlib
 from typing import Annotated, Literal
@@ -13,8 +13,10 @@ def plot(
 ) -> int:
     """Draw a run's learning curves, reward terms and other metrics, or an evaluation's table, rates and errors.
 
+    Examples: congrasp plot runs/mine; congrasp plot evaluation.json --formats pdf
+
     Args:
-      path: A run's folder, or one MCAP file; a run that still goes on is drawn up to its last half second. Or the JSON
+      path: A run's folder, or one MCAP file; a run that is not over is drawn up to its last half second. Or the JSON
         file of 'congrasp evaluate --json'.
       out: Folder for the figures; 'plots' beside the recordings or the JSON file otherwise.
       formats: Of the files.

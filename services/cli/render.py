@@ -14,7 +14,7 @@ def hand(hand: str = "human", out: pathlib.Path = pathlib.Path("hand.png")) -> i
       out: The PNG file to write.
     """
     from common.hands import get_hand
-    from services.viz.render import hand_sheet
+    from services.viz.hand_sheets import hand_sheet
     from services.viz.sheets import save_png
 
     save_png(out, hand_sheet(get_hand(hand)))
@@ -27,24 +27,27 @@ def episode(
     out: pathlib.Path = pathlib.Path("episode.png"),
     index: int = -1,
     success: bool = False,
-    moments: int = 8,
+    frames: Annotated[int, tyro.conf.arg(aliases=["--moments"])] = 8,
     video: pathlib.Path | None = None,
 ) -> int:
-    """Draw a recorded episode in a few moments, with its constraints: approach arrow, O- in red, waypoints, pose.
+    """Draw frames of a recorded episode with its constraints: approach arrow, avoid region in red, waypoints, pose.
+
+    Examples: congrasp render episode runs/mine --success; congrasp render episode runs/mine --index 0 --video grasp.mp4
 
     Args:
       path: A run's folder, or one MCAP file.
       out: The PNG file to write.
       index: Which of the recorded episodes, from 0; -1 is the last.
       success: Count only episodes that succeeded.
-      moments: Pictures on the sheet.
+      frames: Pictures on the sheet.
       video: Also write the whole episode as an MP4, at half its speed while the table stands.
     """
-    from services.viz.render import episode_sheet, pick_episode, save_episode_video
+    from services.record.reader import pick_episode
+    from services.viz.render import episode_sheet, save_episode_video
     from services.viz.sheets import save_png
 
     chosen = pick_episode(path, index, success=success)
-    save_png(out, episode_sheet(chosen, moments=moments))
+    save_png(out, episode_sheet(chosen, frames=frames))
     print(out)
     if video is not None:
         save_episode_video(video, chosen)

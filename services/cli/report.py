@@ -31,15 +31,17 @@ def report(
     It evaluates the policy by the paper's protocol first, and draws some of those very episodes. With 200 episodes a
     row that takes some minutes on a CPU; a first look: --episodes 16.
 
+    Examples: congrasp report runs/mine; congrasp report --hand allegro --objects my-objects --out allegro.html
+
     Args:
-      source: A run's folder or a policy file; by default a policy that comes with congrasp.
+      source: A run's folder or a policy file; by default a pretrained policy.
       out: The file to write.
       objects: Objects to grasp, as 'congrasp evaluate' takes them; held-out procedural ones by default.
       episodes: Episodes in each row.
-      physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
+      physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
       pool: Number of procedural objects.
       seed: Seed of constraints and episodes.
-      hand: Whose policy of those that come with congrasp.
+      hand: Whose pretrained policy.
     """
     import os
 
@@ -48,9 +50,8 @@ def report(
     from common.objects.pool import HELD_OUT_SEED, load_pool
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
-    from learner.run_directory import POLICY_FILE
     from services.assets.objects.named import objects_of
-    from services.cli.progress import tracked
+    from services.cli.console import tracked
     from services.evaluate.evaluator import Evaluator
     from services.evaluate.failures import failure_sheets
     from services.evaluate.report import Made, Picture, causes_in_words, template, write_report
@@ -58,30 +59,20 @@ def report(
     from services.evaluate.worlds import objects_in_words, two_seconds
     from services.viz.sheets import png_of
 
-    for name, value in (("episodes", episodes), ("pool", pool)):
-        if value < 1:
-            raise CongraspError(f"--{name} is {value}.", "It must be at least 1.")
-    if out.is_dir():
-        raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
+    _check(out, episodes=episodes, pool=pool)
     template()  # what is missing is said now, not after the evaluation
     run_dir = source if source is not None and source.is_dir() else None
-    file = run_dir / POLICY_FILE if run_dir else policy_file(source, hand)
-    if run_dir and not file.is_file():
-        raise CongraspError(f"The folder {run_dir} holds no {POLICY_FILE}.", "Name a run's folder, or a policy file.")
+    file = _policy_of_run(run_dir) if run_dir else policy_file(source, hand)
     policy, engine = bundles.load(file), resolve_physics(physics)
     names = [name for table in TABLES.values() for name in table]
     with tracked() as track:
         curves = list(curves_of(run_dir)) if run_dir else []
-        given = objects_of(objects, track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
-        track("Making constraints", None)
-        evaluator = Evaluator(
-            policy,
-            given,
-            physics=engine,
-            threads=os.cpu_count() or 1,
-            seed=seed,
-            hold_steps=two_seconds(policy.task),
+        given = (
+            objects_of(objects, track=track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
         )
+        track("Making constraints", None)
+        held, threads = two_seconds(policy.task), os.cpu_count() or 1
+        evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)
         names, left_out = evaluator.allowed(names)
         rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
         advance = track("Pictures", len(names))
@@ -89,20 +80,36 @@ def report(
         for name, sheet, causes in failure_sheets(evaluator, policy, names, _PICTURED, _PICTURED):
             sheets.append(Picture(name, png_of(sheet), causes_in_words(causes)))
             advance(len(sheets))
-    flags = [
-        f"--policy {file}" if source else f"--hand {hand}",
-        *([f"--objects {objects}"] if objects else [f"--pool {pool}"]),
-        f"--episodes {episodes} --physics {engine} --seed {seed}",
-    ]
-    command = f"congrasp evaluate --table single composed {' '.join(flags)}"
+    subject = f"--policy {file}" if source else f"--hand {hand}"
+    subject += f" --objects {objects}" if objects else f" --pool {pool}"
+    flags = f"{subject} --episodes {episodes} --physics {engine} --seed {seed}"
+    command = f"congrasp evaluate --table single composed {flags}"
     made = Made(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
     which = f"{len(given)} objects ({objects_in_words(policy, objects)})"
-    conditions = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
-    write_report(out, policy, file.name, rows, conditions, sheets, curves, made)
+    how = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
+    write_report(out, policy, file.name, rows, how, sheets, curves, made)
     for error in left_out:
         print(f"Left out: {error}")
     print(f"The report is in {out}: open it in a browser.")
     return 0
+
+
+def _check(out: pathlib.Path, **counts: int) -> None:
+    """Raises a CongraspError for a count below one, or a folder in place of a file."""
+    for name, value in counts.items():
+        if value < 1:
+            raise CongraspError(f"--{name} is {value}.", "It must be at least 1.")
+    if out.is_dir():
+        raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
+
+
+def _policy_of_run(run_dir: pathlib.Path) -> pathlib.Path:
+    """The policy file of a run's folder; a CongraspError if it has none."""
+    from learner.run_directory import POLICY_FILE
+
+    if not (run_dir / POLICY_FILE).is_file():
+        raise CongraspError(f"The folder {run_dir} holds no {POLICY_FILE}.", "Name a run's folder, or a policy file.")
+    return run_dir / POLICY_FILE
 
 
 def curves_of(run_dir: pathlib.Path) -> "Iterator[Picture]":

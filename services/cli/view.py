@@ -14,14 +14,16 @@ def view(
     insecure: bool = False,
     certs: pathlib.Path | None = None,
 ) -> int:
-    """Ask for a grasp in the browser and see it: aim the arrow, paint what must not be touched, draw the wrist's path.
+    """Ask for a grasp in the browser and see it: set the heading, paint the avoid region, draw the wrist's path.
 
     With --connect it takes the newest weights of a run that is being trained and shows the run: its curves, its actors
-    and their episodes. With --recordings a click on a curve finds the episodes of that moment.
+    and their episodes. With --recordings a click on a curve finds the episodes of that time.
+
+    Examples: congrasp view --objects my-objects; congrasp view --connect tcp/10.0.0.5:7447 --run mine
 
     Args:
       objects: Your own objects: a mesh, a folder of meshes, or what 'congrasp objects import' made.
-      policy: A policy file, read again when it changes; by default those that come with congrasp.
+      policy: A policy file, read again when it changes; by default the pretrained ones.
       connect: A learner's endpoint, such as tcp/10.0.0.5:7447, to attach to.
       run: Name of the run that is attached to.
       recordings: Folder of a run's recordings (*.mcap), of a live run or of one that is over.

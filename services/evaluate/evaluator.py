@@ -17,7 +17,7 @@ from actors.rollout import RolloutWorker, Trace, finished_episodes
 from common.config import PhysicsName, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
-from common.objects.pool import sized
+from common.objects.pool import scale_objects
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle
 from common.task.bank import ConstraintBank, Draw
@@ -58,7 +58,7 @@ class Evaluator:
 
         Args:
           bundle: the policy.
-          objects: what it grasps; they are brought to the size of its hand (`common.objects.pool.sized`).
+          objects: what it grasps; they are brought to the size of its hand (`common.objects.pool.scale_objects`).
           physics: engine; not `auto`.
           batch: worlds that run side by side; 0 chooses by the engine.
           threads: threads of the `native` engine.
@@ -75,7 +75,7 @@ class Evaluator:
         self.task = protocol(base, hold, friction)
         self._hold = hold
         self._hand = get_hand(bundle.spec.hand)
-        self.objects = sized(self._hand, self.task, objects)
+        self.objects = scale_objects(self._hand, self.task, objects)
         self._physics, self._threads, self._seed = physics, threads, seed
         self._batch = batch or _BATCH[physics]
         self._bank = bank or build_bank(self._hand, self.task, self.objects, seed)
@@ -125,7 +125,7 @@ class Evaluator:
         with self._worker(mixture(self.task, [constraint]), episodes) as worker:
             yield self._gather(worker, [constraint], episodes, progress)[constraint]
             for number, objects in enumerate(pools, 1):
-                self.objects = sized(self._hand, self.task, objects)
+                self.objects = scale_objects(self._hand, self.task, objects)
                 self._bank = build_bank(self._hand, self.task, self.objects, self._seed + number)
                 self._referred = False
                 worker.replace_objects(self.objects, self._bank)

@@ -9,7 +9,8 @@ import numpy as np
 
 from common.errors import CongraspError
 from services.evaluate.scores import ERRORS
-from services.viz.plots import COLOURS, INK, QUIET, new_figure, save, style
+from services.record.palette import INK
+from services.viz.plots import COLOURS, QUIET, new_figure, save, style
 
 _TITLES = {
     "heading_rad": ("Heading, direction", "rad"),

@@ -32,6 +32,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     columns = [np.tile(_angles(TO_Y_UP), (count, 1))]
 
     def add(index: int, indent: str) -> None:
+        """Adds a joint and those below it."""
         body = found[index]
         moves = len(body.translation) > 1
         channels = (*_POSITION, *_ROTATION) if moves else _ROTATION
@@ -74,6 +75,7 @@ def _angles(rotation: Rotation) -> np.ndarray:
 
 
 def _row(values: np.ndarray) -> str:
+    """Numbers of a line."""
     return " ".join(f"{value:.7f}" for value in values)
 
 
@@ -92,6 +94,7 @@ def read(path: pathlib.Path) -> list[Track]:
     poses: dict[str, np.ndarray] = {}
 
     def visit(joint: Any, parent: np.ndarray) -> None:
+        """World poses of a joint and those below it."""
         position = np.array([key.Position.to_tuple() for key in joint.Keyframes]) / _CM
         turn = Rotation.from_quat([key.Rotation.to_tuple() for key in joint.Keyframes], scalar_first=True)
         pose = parent @ pose_matrices(position, turn)

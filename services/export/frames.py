@@ -1,7 +1,7 @@
-"""Where every link and the object are at every moment: what each format is made from, and what each is checked by."""
+"""Poses of every link and of the object over time: what each format is made from, and what each is checked by."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,9 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from services.export.motion_file import GraspMotion
+from services.record import palette
 
 OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""
+COLOURS = {"hand": palette.SKIN, OBJECT: palette.OBJECT}
+"""Of links, and of the object."""
 TOLERANCE_MM = 0.1
 """Files whose kinematics differ by more than this are not kept."""
 _LEVER = 0.1  # m; a point this far from a frame's origin shows its rotation
@@ -48,6 +51,30 @@ class Body(NamedTuple):
     """T rotations."""
 
 
+class Capsule(NamedTuple):
+    """A capsule of a link, along the z axis of its own frame."""
+
+    number: int
+    """Among all capsules of the hand."""
+    length: float
+    """m, between the centres of its caps."""
+    radius: float
+    """m."""
+    middle: np.ndarray
+    """(3,) m, in the link's frame."""
+    turn: Rotation
+    """From its frame to the link's."""
+
+
+def capsules(motion: GraspMotion, link: int) -> Iterator[Capsule]:
+    """The capsules of a link by its index."""
+    for k in np.flatnonzero(motion.capsule_link == link):
+        start, end = motion.capsule_ends[k].astype(float)
+        length = float(np.linalg.norm(end - start))
+        turn = Rotation.align_vectors([end - start], [[0, 0, 1]])[0] if length else Rotation.identity()
+        yield Capsule(int(k), length, float(motion.capsule_radius[k]), (start + end) / 2, turn)
+
+
 def bodies(motion: GraspMotion) -> list[Body]:
     """Links in their order, each after its parent, and the object last."""
     turns = [Rotation.from_quat(q, scalar_first=True) for q in motion.link_quaternion.swapaxes(0, 1).astype(float)]
@@ -65,8 +92,8 @@ def bodies(motion: GraspMotion) -> list[Body]:
     return [*found, Body(OBJECT, -1, motion.object_position.astype(float), turn)]
 
 
-def quaternions(rotation: Rotation, *, scalar_first: bool) -> np.ndarray:
-    """(T, 4) without jumps of sign, so that what plays the file can interpolate between neighbours."""
+def continuous_quaternions(rotation: Rotation, *, scalar_first: bool) -> np.ndarray:
+    """(T, 4) without jumps of sign, so that neighbours can be interpolated."""
     q = rotation.as_quat(scalar_first=scalar_first)
     flips = np.sign(np.sum(q[1:] * q[:-1], -1))
     return q * np.cumprod(np.concatenate([[1.0], np.where(flips == 0, 1.0, flips)]))[:, None]
@@ -82,11 +109,11 @@ def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
 def error_mm(motion: GraspMotion, track: Track) -> float:
     """Largest distance in mm between where a point is and where the file has it.
 
-    The points are each frame's origin and three a decimetre away along its axes, at every moment, and the object's
+    The points are each frame's origin and three a decimetre away along its axes, at every time, and the object's
     triangles in its frame.
 
     Raises:
-      CongraspError: the file has other frames or moments than the motion.
+      CongraspError: the file has other bodies or times than the motion.
     """
     turns = Rotation.from_quat(motion.link_quaternion.reshape(-1, 4), scalar_first=True)
     links = pose_matrices(motion.link_position.reshape(-1, 3), turns).reshape(*motion.link_position.shape[:2], 4, 4)
@@ -96,7 +123,7 @@ def error_mm(motion: GraspMotion, track: Track) -> float:
     if odd := sorted(expected.keys() ^ track.poses.keys()):
         raise CongraspError(f"The file lacks or should not have the frame '{odd[0]}'.")
     if track.time.shape != motion.time.shape or np.abs(track.time - motion.time).max() > _SAME_TIME:
-        raise CongraspError("The file has other moments than the motion.")
+        raise CongraspError("The file has other times than the motion.")
     points = np.concatenate([np.zeros((1, 3)), _LEVER * np.eye(3)])
     points = np.concatenate([points, np.ones((4, 1))], 1).T
     distances = [np.linalg.norm(((expected[name] - track.poses[name]) @ points)[:, :3], axis=1) for name in expected]

@@ -1,4 +1,4 @@
-"""Binary glTF 2.0 with an animation; written here, read back by pygltflib.
+"""Binary glTF 2.0 with an animation; written by pygltflib, read back as the standard says and, its meshes, by trimesh.
 
 One node a link, nested as the hand is, with translation and rotation (glTF forbids matrices on animated nodes). glTF
 is y-up: a root node turns the world, so that everything below it keeps congrasp's z-up coordinates.
@@ -6,181 +6,155 @@ is y-up: a root node turns the world, so that everything below it keeps congrasp
 
 import json
 import pathlib
-import struct
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pygltflib as gltf
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from services.export.frames import FROM_Y_UP, OBJECT, TO_Y_UP, Body, Track, bodies, facts, pose_matrices, quaternions
+from services.export.frames import (
+    COLOURS,
+    FROM_Y_UP,
+    OBJECT,
+    TO_Y_UP,
+    Track,
+    bodies,
+    capsules,
+    continuous_quaternions,
+    facts,
+    pose_matrices,
+)
 from services.export.motion_file import GraspMotion
 
-_FLOAT, _UNSIGNED = 5126, 5125
-_VERTICES, _INDICES = 34962, 34963
-_COLOURS = {"hand": (0.70, 0.73, 0.79, 1.0), OBJECT: (0.95, 0.62, 0.24, 1.0)}
 _SECTIONS = (12, 12)
-_KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-
-
-class _Buffer:
-    """The binary chunk under construction, and the JSON that describes it."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def add(self, values: np.ndarray, kind: int, target: int | None = None, *, bounds: bool = False) -> int:
-        """Index of a new accessor for values (n,) or (n, 3) or (n, 4)."""
-        values = np.ascontiguousarray(values, "<f4" if kind == _FLOAT else "<u4")
-        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes}
-        self.views.append(view if target is None else {**view, "target": target})
-        self.data += values.tobytes()
-        width = 1 if values.ndim == 1 else values.shape[1]
-        accessor: dict[str, Any] = {
-            "bufferView": len(self.views) - 1,
-            "componentType": kind,
-            "count": len(values),
-            "type": _KINDS[width],
-        }
-        if bounds:
-            accessor["min"] = np.atleast_1d(values.min(0)).tolist()
-            accessor["max"] = np.atleast_1d(values.max(0)).tolist()
-        self.accessors.append(accessor)
-        return len(self.accessors) - 1
+_KINDS = {1: gltf.SCALAR, 3: gltf.VEC3, 4: gltf.VEC4}
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     """Writes one motion."""
     (motion,) = motions
-    buffer, meshes, found = _Buffer(), [], bodies(motion)
-    nodes: list[dict[str, Any]] = [
-        {
-            "name": "world",
-            "rotation": TO_Y_UP.as_quat().tolist(),
-            "children": [],
-            "extras": facts(motion, frame="this node's frame: z up", unit="m", quaternion="x, y, z, w"),
-        }
+    file, data, grasp = gltf.GLTF2(), bytearray(), gltf.Animation(name="grasp")
+    about = facts(motion, frame="this node's frame: z up", unit="m", quaternion="x, y, z, w")
+    file.asset.generator = "congrasp"
+    file.nodes.append(gltf.Node(name="world", rotation=TO_Y_UP.as_quat().tolist(), extras=about))
+    file.materials = [
+        gltf.Material(
+            name=name,
+            pbrMetallicRoughness=gltf.PbrMetallicRoughness(baseColorFactor=[*colour, 1.0], metallicFactor=0.0),
+        )
+        for name, colour in COLOURS.items()
     ]
-    time = buffer.add(motion.time, _FLOAT, bounds=True)
-    samplers: list[dict[str, Any]] = []
-    channels: list[dict[str, Any]] = []
-    for i, body in enumerate(found):
-        node = _node(body)
-        mesh = _object_mesh(motion) if body.name == OBJECT else _link_mesh(motion, i)
-        if mesh is not None:
-            meshes.append(_mesh(buffer, body.name, mesh))
-            node["mesh"] = len(meshes) - 1
-        nodes.append(node)
-        nodes[body.parent + 1].setdefault("children", []).append(len(nodes) - 1)
-        tracks = {"rotation": quaternions(body.rotation, scalar_first=False)}
+    time = _add(file, data, motion.time, bounds=True)
+    for i, body in enumerate(bodies(motion)):
+        number, first = len(file.nodes), body.rotation[0].as_quat()
+        node = gltf.Node(name=body.name, translation=body.translation[0].tolist(), rotation=first.tolist())
+        file.nodes.append(node)
+        file.nodes[body.parent + 1].children.append(number)
+        shape = _object_mesh(motion) if body.name == OBJECT else _link_mesh(motion, i)
+        if shape is not None:
+            node.mesh = len(file.meshes)
+            file.meshes.append(gltf.Mesh(name=body.name, primitives=[_primitive(file, data, body.name, shape)]))
+        tracks = {"rotation": continuous_quaternions(body.rotation, scalar_first=False)}
         if len(body.translation) > 1:
             tracks["translation"] = body.translation
-        for target, values in tracks.items():
-            samplers.append({"input": time, "output": buffer.add(values, _FLOAT), "interpolation": "LINEAR"})
-            channels.append({"sampler": len(samplers) - 1, "target": {"node": len(nodes) - 1, "path": target}})
-    document = {
-        "asset": {"version": "2.0", "generator": "congrasp"},
-        "scene": 0,
-        "scenes": [{"name": motion.object, "nodes": [0]}],
-        "nodes": nodes,
-        "meshes": meshes,
-        "materials": [
-            {"name": name, "pbrMetallicRoughness": {"baseColorFactor": colour, "metallicFactor": 0.0}}
-            for name, colour in _COLOURS.items()
-        ],
-        "animations": [{"name": "grasp", "samplers": samplers, "channels": channels}],
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": len(buffer.data)}],
-    }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", bytes(buffer.data), b"\0")
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+        for name, values in tracks.items():
+            target = gltf.AnimationChannelTarget(node=number, path=name)
+            grasp.channels.append(gltf.AnimationChannel(sampler=len(grasp.samplers), target=target))
+            grasp.samplers.append(gltf.AnimationSampler(input=time, output=_add(file, data, values)))
+    file.animations = [grasp]
+    file.scene, file.scenes = 0, [gltf.Scene(name=motion.object, nodes=[0])]
+    file.buffers = [gltf.Buffer(byteLength=len(data))]
+    file.set_binary_blob(bytes(data))
+    file.save_binary(str(path))
 
 
-def _chunk(kind: bytes, data: bytes, padding: bytes) -> bytes:
-    data += padding * (-len(data) % 4)
-    return struct.pack("<I4s", len(data), kind) + data
+def _add(
+    file: gltf.GLTF2, data: bytearray, values: np.ndarray, target: int | None = None, *, bounds: bool = False
+) -> int:
+    """Appends values (n,), (n, 3) or (n, 4) to the buffer; integers are indices. Returns the new accessor's number."""
+    whole = np.issubdtype(values.dtype, np.integer)
+    values = np.ascontiguousarray(values, "<u4" if whole else "<f4")
+    view = gltf.BufferView(buffer=0, byteOffset=len(data), byteLength=values.nbytes, target=target)
+    accessor = gltf.Accessor(
+        bufferView=len(file.bufferViews),
+        componentType=gltf.UNSIGNED_INT if whole else gltf.FLOAT,
+        count=len(values),
+        type=_KINDS[1 if values.ndim == 1 else values.shape[1]],
+    )
+    if bounds:
+        accessor.min, accessor.max = (np.atleast_1d(end).tolist() for end in (values.min(0), values.max(0)))
+    file.bufferViews.append(view)
+    file.accessors.append(accessor)
+    data += values.tobytes()
+    return len(file.accessors) - 1
 
 
-def _node(body: Body) -> dict[str, Any]:
-    first = body.rotation[0].as_quat()
-    return {"name": body.name, "translation": body.translation[0].tolist(), "rotation": first.tolist()}
+def _primitive(file: gltf.GLTF2, data: bytearray, name: str, mesh: trimesh.Trimesh) -> gltf.Primitive:
+    """A body's mesh with normals and its material."""
+    normals = mesh.vertex_normals
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(lengths > 0.5, normals / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])  # of unused vertices
+    attributes = gltf.Attributes(
+        POSITION=_add(file, data, mesh.vertices, gltf.ARRAY_BUFFER, bounds=True),
+        NORMAL=_add(file, data, normals, gltf.ARRAY_BUFFER),
+    )
+    indices = _add(file, data, mesh.faces.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
+    material = list(COLOURS).index(OBJECT if name == OBJECT else "hand")
+    return gltf.Primitive(attributes=attributes, indices=indices, material=material)
 
 
 def _link_mesh(motion: GraspMotion, link: int) -> Any:
     """The link's capsules in its frame; None if it has none."""
     parts = []
-    for k in np.flatnonzero(motion.capsule_link == link):
-        (start, end), radius = motion.capsule_ends[k].astype(float), float(motion.capsule_radius[k])
-        length = float(np.linalg.norm(end - start))
+    for _, length, radius, middle, turn in capsules(motion, link):
         part = trimesh.creation.capsule(length, radius, _SECTIONS)
-        part.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], end - start) if length else np.eye(4))
-        # trimesh centres a capsule at its middle.
-        part.apply_translation((start + end) / 2 - part.bounds.mean(0))
-        parts.append(part)
+        part.apply_translation(-part.bounds.mean(0))
+        parts.append(part.apply_transform(pose_matrices(middle[None], turn)[0]))
     return trimesh.util.concatenate(parts) if parts else None
 
 
 def _object_mesh(motion: GraspMotion) -> trimesh.Trimesh:
+    """The object's mesh in its frame."""
     return trimesh.Trimesh(motion.object_vertices, motion.object_faces, process=False)
 
 
-def _mesh(buffer: _Buffer, name: str, mesh: trimesh.Trimesh) -> dict[str, Any]:
-    normals = mesh.vertex_normals
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where(lengths > 0.5, normals / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])  # of unused vertices
-    attributes = {
-        "POSITION": buffer.add(mesh.vertices, _FLOAT, _VERTICES, bounds=True),
-        "NORMAL": buffer.add(normals, _FLOAT, _VERTICES),
-    }
-    material = list(_COLOURS).index(OBJECT if name == OBJECT else "hand")
-    indices = buffer.add(mesh.faces.ravel(), _UNSIGNED, _INDICES)
-    return {"name": name, "primitives": [{"attributes": attributes, "indices": indices, "material": material}]}
-
-
 def read(path: pathlib.Path) -> list[Track]:
-    """What pygltflib finds in a file: its first animation, played at its keyframes."""
-    from pygltflib import GLTF2
-
-    file = GLTF2().load_binary(str(path))
-    assert file is not None
-    blob = file.binary_blob()
+    """The first animation at its keyframes, by the standard's layout, and the object's mesh as trimesh loads it."""
+    content = path.read_bytes()
+    size = int.from_bytes(content[12:16], "little")
+    document, blob = json.loads(content[20 : 20 + size]), content[28 + size :]
+    nodes, (animation, *_) = document["nodes"], document["animations"]
 
     def values(index: int) -> np.ndarray:
-        accessor = file.accessors[index]
-        view = file.bufferViews[accessor.bufferView]
-        width = {kind: n for n, kind in _KINDS.items()}[accessor.type]
-        start = view.byteOffset + (accessor.byteOffset or 0)
-        kind = {_FLOAT: "<f4", _UNSIGNED: "<u4"}[accessor.componentType]
-        flat = np.frombuffer(blob, kind, accessor.count * width, start)
-        return flat.reshape(accessor.count, width) if width > 1 else flat
+        """(n, width) float32 of an accessor."""
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = {kind: width for width, kind in _KINDS.items()}[accessor["type"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        return np.frombuffer(blob, "<f4", accessor["count"] * width, start).reshape(-1, width)
 
-    animation = file.animations[0]
-    time = values(animation.samplers[0].input)
-    local: dict[int, dict[str, np.ndarray]] = {
-        i: {"translation": np.array([node.translation or [0, 0, 0]]), "rotation": np.array([node.rotation])}
-        for i, node in enumerate(file.nodes)
-    }
-    for channel in animation.channels:
-        sampler = animation.samplers[channel.sampler]
-        local[channel.target.node][channel.target.path] = values(sampler.output)
+    time = values(animation["samplers"][0]["input"])[:, 0]
+    local = [
+        {"translation": np.array([node.get("translation", [0, 0, 0])]), "rotation": np.array([node["rotation"]])}
+        for node in nodes
+    ]
+    for channel in animation["channels"]:
+        target = channel["target"]
+        local[target["node"]][target["path"]] = values(animation["samplers"][channel["sampler"]]["output"])
     poses: dict[str, np.ndarray] = {}
 
     def visit(index: int, parent: np.ndarray) -> None:
-        track = {name: np.broadcast_to(v, (len(time), v.shape[1])) for name, v in local[index].items()}
-        poses[file.nodes[index].name] = parent @ pose_matrices(
-            track["translation"], Rotation.from_quat(track["rotation"])
-        )
-        for child in file.nodes[index].children or []:
-            visit(child, poses[file.nodes[index].name])
+        """World poses of a node and those below it."""
+        place, turn = (np.broadcast_to(v, (len(time), v.shape[1])) for v in local[index].values())
+        name = nodes[index]["name"]
+        poses[name] = parent @ pose_matrices(place, Rotation.from_quat(turn))
+        for child in nodes[index].get("children", []):
+            visit(child, poses[name])
 
-    for root in file.scenes[file.scene].nodes:
+    for root in document["scenes"][document["scene"]]["nodes"]:
         visit(root, FROM_Y_UP)
     del poses["world"]
-    mesh = next(file.meshes[node.mesh] for node in file.nodes if node.name == OBJECT)
-    corners = values(mesh.primitives[0].attributes.POSITION)[values(mesh.primitives[0].indices)]
-    return [Track(time, poses, corners.reshape(-1, 3, 3))]
+    mesh = trimesh.load_scene(path, process=False).geometry[OBJECT]
+    return [Track(time, poses, np.asarray(mesh.triangles))]

@@ -78,11 +78,13 @@ def export_layout(recording: pathlib.Path, path: pathlib.Path) -> int:
 
 
 def _plot(title: str, paths: Sequence[str]) -> fl.PlotPanel | None:
+    """A plot of some paths, if there are any."""
     series = [fl.PlotSeries(value=path, label=path.rpartition(".")[2], enabled=True) for path in paths]
     return fl.PlotPanel(title=title, config=fl.PlotConfig(paths=series, show_legend=True)) if series else None
 
 
 def _scene(actors: Sequence[str]) -> fl.ThreeDeePanel:
+    """The 3-D panel with the actors' scenes."""
     topics = {
         f"/episode/{actor}/{part}": fl.BaseRendererSceneUpdateTopicSettings(visible=number < _ACTORS)
         for number, actor in enumerate(actors)
@@ -101,5 +103,6 @@ def _scene(actors: Sequence[str]) -> fl.ThreeDeePanel:
 
 
 def _split(direction: str, items: Sequence[tuple[float, fl.Content]]) -> fl.Content:
+    """Panels side by side or below one another, with their shares of the space."""
     kept = [fl.SplitItem(proportion=share, content=content) for share, content in items]
     return fl.SplitContainer(direction="row" if direction == "row" else "column", items=kept)

@@ -1,4 +1,4 @@
-"""A LeRobot dataset, version 3.0: one episode a motion; written with pyarrow, put together again from its own layout.
+"""A LeRobot dataset, version 3.0: one episode a motion; written with pyarrow, read back by its own layout.
 
 `observation.state` is what the robot feels (finger joints, then the wrist's pose), `observation.environment_state` the
 object's pose, `action` the finger targets and the wrist's pose one step later. The hand is in `meta/hand.urdf`.
@@ -82,10 +82,12 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 
 
 def _task(motion: GraspMotion) -> str:
+    """A motion's task as a sentence."""
     return f"Grasp the object {motion.object} under {' and '.join(motion.constraints)}."
 
 
 def _columns(motion: GraspMotion, episode: int, tasks: Sequence[str]) -> dict[str, np.ndarray]:
+    """A motion's columns (T, ...) by name."""
     count = len(motion.time)
     wrist = np.concatenate([motion.wrist_position, motion.wrist_quaternion], 1)
     return {
@@ -101,6 +103,7 @@ def _columns(motion: GraspMotion, episode: int, tasks: Sequence[str]) -> dict[st
 
 
 def _column(values: np.ndarray) -> pa.Array:
+    """Values (T,) or (T, n) as a column."""
     if values.ndim == 1:
         return pa.array(values)
     return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
@@ -118,6 +121,7 @@ def _tasks_table(tasks: Sequence[str]) -> pa.Table:
 
 
 def _statistics(values: np.ndarray) -> dict[str, list[float]]:
+    """Statistics of a column, in the names of the format."""
     columns = values.reshape(len(values), -1).astype(float)
     return {
         "min": columns.min(0).tolist(),
@@ -130,11 +134,13 @@ def _statistics(values: np.ndarray) -> dict[str, list[float]]:
 
 
 def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
+    """Writes a table, and its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table, path, compression="snappy")
 
 
 def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int) -> dict[str, Any]:
+    """What the data set holds: features with their shapes and names, counts, where files are."""
     joints = motion.joint_names.tolist()
     wrist = [f"wrist_{name}" for name in _POSE]
     names = {
@@ -175,24 +181,27 @@ def read(path: pathlib.Path) -> list[Track]:
         table = pq.read_table(path / info["data_path"].format(**place))
         rows = table.filter(pc.equal(table["episode_index"], episode["episode_index"])).sort_by("index")
         state = _named(info, rows, _STATE)
-        thing = _named(info, rows, _OBJECT)
+        environment = _named(info, rows, _OBJECT)
         angles = {name: state[name] for name in state if not name.startswith("wrist_")}
         poses = forward_kinematics(urdf, angles, _pose(state, "wrist"))
-        poses[OBJECT] = _pose(thing, "object")
+        poses[OBJECT] = _pose(environment, "object")
         kept = {name: pose for name, pose in poses.items() if name in _links(path) or name == OBJECT}
         tracks.append(Track(rows["frame_index"].to_numpy() / info["fps"], kept))
     return tracks
 
 
 def _links(path: pathlib.Path) -> list[str]:
+    """Names of the hand's links."""
     return json.loads((path / "meta" / "congrasp.json").read_text())["links"]
 
 
 def _named(info: Mapping[str, Any], rows: pa.Table, feature: str) -> dict[str, np.ndarray]:
+    """(T,) columns of a feature by the names of its parts."""
     values = np.array(rows[feature].to_pylist(), float)
     return dict(zip(info["features"][feature]["names"], values.T, strict=True))
 
 
 def _pose(values: Mapping[str, np.ndarray], prefix: str) -> np.ndarray:
+    """(T, 4, 4) of the columns with a prefix."""
     position, quaternion = np.split(np.stack([values[f"{prefix}_{name}"] for name in _POSE], -1), [3], -1)
     return pose_matrices(position, Rotation.from_quat(quaternion, scalar_first=True))

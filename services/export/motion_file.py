@@ -1,7 +1,7 @@
 """A grasp motion as one NPZ file that says itself what its numbers mean; what exports and other programs start from.
 
 Metres, radians, seconds, newtons; quaternions are (w, x, y, z) and turn a body's frame into the world. The world's z
-axis points up and the table's top is at z = 0. T moments, F finger joints, L links, C capsules, K waypoints.
+axis points up and the table's top is at z = 0. T frames, F finger joints, L links, C capsules, K waypoints.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ _OLDER = {"pose_joints": "pose_q"}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GraspMotion:
-    """A hand that approaches an object, closes, and holds it after the table is gone.
+    """A hand that approaches an object, closes, and holds it after table removal.
 
     What is no array is kept as JSON under the name `meta`, beside the meaning of every array.
     """
@@ -39,9 +39,9 @@ class GraspMotion:
     object: str
     """Name of the object."""
     success: bool
-    """Whether the object was held a quarter of a second after the table went; `metrics["held"]`: to the end."""
+    """Whether the object was held a quarter of a second after table removal; `metrics["held"]`: to the end."""
     control_dt: float
-    """Seconds between two moments."""
+    """Seconds between two frames."""
     constraints: tuple[str, ...]
     """Names of the active constraints, weakest first."""
     metrics: dict[str, float]

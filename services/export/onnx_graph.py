@@ -26,14 +26,17 @@ class _Graph:
         self.constants: list[Any] = []
 
     def constant(self, name: str, value: Any, dtype: Any = np.float32) -> str:
+        """Adds a constant."""
         self.constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
         return name
 
     def node(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> str:
+        """Adds a node."""
         self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
         return output
 
     def dense(self, layers: Mapping[str, Any], layer: str, x: str, output: str) -> str:
+        """Adds a layer of the network."""
         kernel = self.constant(f"{layer}.kernel", layers[layer]["kernel"])
         return self.node("Gemm", [x, kernel, self.constant(f"{layer}.bias", layers[layer]["bias"])], output)
 
@@ -67,6 +70,7 @@ def policy_model(bundle: PolicyBundle, meta: Mapping[str, Any]) -> onnx.ModelPro
     graph.dense(layers, "output", x, "action")
 
     def port(name: str, size: int) -> Any:
+        """An input or output (batch, size)."""
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
 
     model = helper.make_model(
@@ -87,6 +91,7 @@ def policy_model(bundle: PolicyBundle, meta: Mapping[str, Any]) -> onnx.ModelPro
 
 
 def _slice(graph: _Graph, x: str, start: int, end: int, output: str) -> str:
+    """Columns `start` to `end` of x."""
     bounds = [graph.constant(f"{output}.{name}", [value], np.int64) for name, value in (("start", start), ("end", end))]
     axes = graph.constant(f"{output}.axes", [1], np.int64)
     return graph.node("Slice", [x, *bounds, axes], output)

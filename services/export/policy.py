@@ -105,9 +105,9 @@ def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
 def sample_observations(bundle: PolicyBundle, count: int, seed: int = 0) -> np.ndarray:
     """(count, D) observations as the policy knows them and beyond: three times as spread, masks drawn at random."""
     rng = np.random.default_rng(seed)
-    seen = bundle.observation
-    spread = np.sqrt(np.asarray(seen.m2) / max(float(seen.count), 1.0)) + 1e-3
-    drawn = np.asarray(seen.mean) + 3.0 * spread * rng.normal(size=(count, len(spread)))
+    known = bundle.observation
+    spread = np.sqrt(np.asarray(known.m2) / max(float(known.count), 1.0)) + 1e-3
+    drawn = np.asarray(known.mean) + 3.0 * spread * rng.normal(size=(count, len(spread)))
     names = gated(bundle.spec.layout)
     start, mask = 0, rng.integers(0, 2, (count, len(names)))
     for name, size in bundle.spec.layout:
@@ -149,12 +149,14 @@ def export_policy(bundle: PolicyBundle, kind: str, path: pathlib.Path) -> float:
 
 
 def _onnx(bundle: PolicyBundle) -> bytes:
+    """The policy as an ONNX file's content."""
     from services.export.onnx_graph import policy_model
 
     return policy_model(bundle, describe(bundle)).SerializeToString()
 
 
 def _run_onnx(encoded: bytes, observations: np.ndarray) -> np.ndarray:
+    """(n, A) actions of such a file for observations (n, D)."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(encoded, providers=["CPUExecutionProvider"])
@@ -178,6 +180,7 @@ def _stablehlo(bundle: PolicyBundle) -> bytes:
 
 
 def _run_stablehlo(encoded: bytes, observations: np.ndarray) -> np.ndarray:
+    """(n, A) actions of such an archive for observations (n, D)."""
     with zipfile.ZipFile(io.BytesIO(encoded)) as archive:
         exported = jax.export.deserialize(bytearray(archive.read("policy.jax")))
     return np.asarray(exported.call(observations))

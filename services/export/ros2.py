@@ -1,7 +1,7 @@
 """A ROS 2 bag (MCAP): written by rosbags, read back by mcap and mcap-ros2-support.
 
-Topics: `/robot_description` (URDF), `/joint_trajectory` (all moments, finger joints), `/wrist_trajectory` (all moments,
-the palm in the world), `/joint_states`, `/tf` (moment by moment) and `/object` (a marker with the mesh).
+Topics: `/robot_description` (URDF), `/joint_trajectory` (all frames, finger joints), `/wrist_trajectory` (all frames,
+the palm in the world), `/joint_states`, `/tf` (frame by frame) and `/object` (a marker with the mesh).
 """
 
 import json
@@ -13,99 +13,56 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
-from services.export.frames import OBJECT, Body, Track, bodies, facts, pose_matrices
+from services.export.frames import COLOURS, OBJECT, Body, Track, bodies, facts, pose_matrices
 from services.export.motion_file import GraspMotion
 from services.export.urdf import forward_kinematics, hand_urdf
 
 _WORLD = "world"
 _START = 10**9  # ns; TF takes a stamp of zero for "whenever"
-_COLOUR = (0.95, 0.62, 0.24, 1.0)
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     """Writes one motion as a bag, which is a folder; it begins at one second."""
-    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
     (motion,) = motions
     store = get_typestore(Stores.ROS2_HUMBLE)
     make = _Messages(store.types)
-    found, dt = bodies(motion), motion.control_dt
-    joints = motion.joint_names.tolist()
-    velocity = np.gradient(motion.joint_position, dt, axis=0) if len(motion.time) > 1 else 0 * motion.joint_position
-    palm = next(i for i, body in enumerate(found) if body.parent < 0)
-    root = str(motion.link_names[palm])
     since = [round(1e9 * t) for t in motion.time]
     stamps = [_START + t for t in since]
+    found = bodies(motion)
     frames = [_transforms(make, found, t, stamp) for t, stamp in enumerate(stamps)]
-    never = QosTime(0x7FFFFFFF, 0xFFFFFFFF)
-    latched = Qos(
-        QosHistory.KEEP_LAST,
-        1,
-        QosReliability.RELIABLE,
-        QosDurability.TRANSIENT_LOCAL,
-        never,
-        never,
-        QosLiveliness.AUTOMATIC,
-        never,
-        False,
-    )
+    palm = next(i for i, body in enumerate(found) if body.parent < 0)
+    wrist = [frame.transforms[palm].transform for frame in frames]
+    trajectory, states = _joint_messages(make, motion, since, found[palm].name)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         about = facts(motion, frame=f"{_WORLD}: z up; TF frames are the links", unit="m, rad, s", quaternion="by name")
         bag.set_custom_data("congrasp", json.dumps(about))
 
         def send(topic: str, kind: str, messages: Sequence[Any], *, once: bool = False) -> None:
-            channel = bag.add_connection(topic, kind, typestore=store, offered_qos_profiles=[latched] if once else [])
+            """Writes messages at the motion's times; those that come `once` are kept for late subscribers."""
+            qos = [_latched()] if once else []
+            channel = bag.add_connection(topic, kind, typestore=store, offered_qos_profiles=qos)
             for stamp, message in zip(stamps, messages, strict=False):
                 bag.write(channel, stamp, store.serialize_cdr(message, kind))
 
         send("/robot_description", "std_msgs/msg/String", [make("std_msgs/String", data=hand_urdf(motion))], once=True)
-        points = [
-            make(
-                "trajectory_msgs/JointTrajectoryPoint",
-                positions=motion.joint_position[t].astype(float),
-                velocities=velocity[t].astype(float),
-                accelerations=np.zeros(0),
-                effort=np.zeros(0),
-                time_from_start=make.duration(since[t]),
-            )
-            for t in range(len(since))
-        ]
-        trajectory = make(
-            "trajectory_msgs/JointTrajectory", header=make.header(0, root), joint_names=joints, points=points
-        )
         send("/joint_trajectory", "trajectory_msgs/msg/JointTrajectory", [trajectory], once=True)
-        wrist = make(
-            "trajectory_msgs/MultiDOFJointTrajectory",
-            header=make.header(0, _WORLD),
-            joint_names=[root],
-            points=[
-                make(
-                    "trajectory_msgs/MultiDOFJointTrajectoryPoint",
-                    transforms=[frame.transforms[palm].transform],
-                    velocities=[],
-                    accelerations=[],
-                    time_from_start=make.duration(ns),
-                )
-                for frame, ns in zip(frames, since, strict=True)
-            ],
-        )
-        send("/wrist_trajectory", "trajectory_msgs/msg/MultiDOFJointTrajectory", [wrist], once=True)
+        path_of_wrist = _wrist_trajectory(make, wrist, since, found[palm].name)
+        send("/wrist_trajectory", "trajectory_msgs/msg/MultiDOFJointTrajectory", [path_of_wrist], once=True)
         send("/object", "visualization_msgs/msg/Marker", [_marker(make, motion)], once=True)
-        states = [
-            make(
-                "sensor_msgs/JointState",
-                header=make.header(stamp, root),
-                name=joints,
-                position=motion.joint_position[t].astype(float),
-                velocity=velocity[t].astype(float),
-                effort=np.zeros(0),
-            )
-            for t, stamp in enumerate(stamps)
-        ]
         send("/joint_states", "sensor_msgs/msg/JointState", states)
         send("/tf", "tf2_msgs/msg/TFMessage", frames)
+
+
+def _latched() -> Any:
+    """Quality of service of a topic whose last message late subscribers get."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    never = QosTime(0x7FFFFFFF, 0xFFFFFFFF)
+    durable = (QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL)
+    return Qos(*durable, never, never, QosLiveliness.AUTOMATIC, never, False)
 
 
 class _Messages:
@@ -119,20 +76,72 @@ class _Messages:
         return self._types[f"{package}/msg/{name}"](**fields)
 
     def header(self, stamp: int, frame: str) -> Any:
+        """A header with a time in ns."""
         time = self("builtin_interfaces/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
         return self("std_msgs/Header", stamp=time, frame_id=frame)
 
     def duration(self, ns: int) -> Any:
+        """A duration of so many ns."""
         return self("builtin_interfaces/Duration", sec=ns // 10**9, nanosec=ns % 10**9)
 
     def vector(self, values: np.ndarray, kind: str = "Vector3") -> Any:
+        """A vector (3,)."""
         return self(f"geometry_msgs/{kind}", **dict(zip("xyz", map(float, values), strict=True)))
 
     def quaternion(self, values: Sequence[float]) -> Any:
+        """A quaternion x, y, z, w."""
         return self("geometry_msgs/Quaternion", **dict(zip("xyzw", map(float, values), strict=True)))
 
 
+def _joint_messages(make: _Messages, motion: GraspMotion, since: Sequence[int], root: str) -> tuple[Any, list[Any]]:
+    """The finger joints as one trajectory, and as a state for each frame; `since`: ns from the start."""
+    names = motion.joint_names.tolist()
+    position = motion.joint_position.astype(float)
+    velocity = np.gradient(position, motion.control_dt, axis=0) if len(position) > 1 else 0 * position
+    points = [
+        make(
+            "trajectory_msgs/JointTrajectoryPoint",
+            positions=position[t],
+            velocities=velocity[t],
+            accelerations=np.zeros(0),
+            effort=np.zeros(0),
+            time_from_start=make.duration(ns),
+        )
+        for t, ns in enumerate(since)
+    ]
+    states = [
+        make(
+            "sensor_msgs/JointState",
+            header=make.header(_START + ns, root),
+            name=names,
+            position=position[t],
+            velocity=velocity[t],
+            effort=np.zeros(0),
+        )
+        for t, ns in enumerate(since)
+    ]
+    header = make.header(0, root)
+    return make("trajectory_msgs/JointTrajectory", header=header, joint_names=names, points=points), states
+
+
+def _wrist_trajectory(make: _Messages, wrist: Sequence[Any], since: Sequence[int], root: str) -> Any:
+    """The palm's transforms in the world as one trajectory."""
+    points = [
+        make(
+            "trajectory_msgs/MultiDOFJointTrajectoryPoint",
+            transforms=[transform],
+            velocities=[],
+            accelerations=[],
+            time_from_start=make.duration(ns),
+        )
+        for transform, ns in zip(wrist, since, strict=True)
+    ]
+    header = make.header(0, _WORLD)
+    return make("trajectory_msgs/MultiDOFJointTrajectory", header=header, joint_names=[root], points=points)
+
+
 def _transforms(make: _Messages, found: Sequence[Body], t: int, stamp: int) -> Any:
+    """TF of all bodies at frame t."""
     transforms = []
     for body in found:
         turn = body.rotation[t].as_quat()
@@ -152,6 +161,7 @@ def _transforms(make: _Messages, found: Sequence[Body], t: int, stamp: int) -> A
 
 
 def _marker(make: _Messages, motion: GraspMotion) -> Any:
+    """The object's mesh as a marker."""
     corners = motion.object_vertices[motion.object_faces.ravel()]
     image = make("sensor_msgs/CompressedImage", header=make.header(0, ""), format="", data=np.zeros(0, np.uint8))
     return make(
@@ -163,7 +173,7 @@ def _marker(make: _Messages, motion: GraspMotion) -> Any:
         action=0,
         pose=make("geometry_msgs/Pose", position=make.vector(np.zeros(3), "Point"), orientation=_upright(make)),
         scale=make.vector(np.ones(3)),
-        color=make("std_msgs/ColorRGBA", **dict(zip("rgba", _COLOUR, strict=True))),
+        color=make("std_msgs/ColorRGBA", **dict(zip("rgba", (*COLOURS[OBJECT], 1.0), strict=True))),
         lifetime=make.duration(0),
         frame_locked=True,
         points=[make.vector(corner, "Point") for corner in corners],
@@ -179,11 +189,12 @@ def _marker(make: _Messages, motion: GraspMotion) -> Any:
 
 
 def _upright(make: _Messages) -> Any:
+    """The identity."""
     return make.quaternion([0.0, 0.0, 0.0, 1.0])
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """What mcap-ros2-support decodes: poses by joint trajectory and URDF, having seen that TF says the same."""
+    """What mcap-ros2-support decodes: poses by joint trajectory and URDF, after a check that TF says the same."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
@@ -198,6 +209,7 @@ def read(path: pathlib.Path) -> list[Track]:
     tf: dict[str, np.ndarray] = {}
 
     def visit(name: str) -> np.ndarray:
+        """World poses (T, 4, 4) of a frame by TF."""
         if name not in tf:
             parent = first[name].header.frame_id
             tf[name] = local[name] if parent == _WORLD else visit(parent) @ local[name]

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from services.export.frames import pose_matrices
+from services.export.frames import capsules, pose_matrices
 from services.export.motion_file import GraspMotion
 
 _MASS, _INERTIA = "0.01", "1e-6"
@@ -47,6 +47,7 @@ def hand_urdf(motion: GraspMotion) -> str:
 
 
 def _link(robot: ET.Element, name: str) -> ET.Element:
+    """Adds a link with a mass."""
     link = ET.SubElement(robot, "link", name=name)
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "mass", value=_MASS)
@@ -55,6 +56,7 @@ def _link(robot: ET.Element, name: str) -> ET.Element:
 
 
 def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, offset: np.ndarray) -> ET.Element:
+    """Adds a joint at an offset (3,) in its parent's frame."""
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
@@ -64,28 +66,28 @@ def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, off
 
 def _add_capsules(link: ET.Element, motion: GraspMotion, index: int) -> None:
     """Each capsule as a cylinder and two spheres, which is what URDF has."""
-    for k in np.flatnonzero(motion.capsule_link == index):
-        (start, end), radius = motion.capsule_ends[k].astype(float), _number(motion.capsule_radius[k])
-        length = float(np.linalg.norm(end - start))
-        for end_point in (start, end):
-            ET.SubElement(_visual(link, end_point, np.zeros(3)), "sphere", radius=radius)
+    for number, length, radius, middle, turn in capsules(motion, index):
+        for end in motion.capsule_ends[number]:
+            ET.SubElement(_visual(link, end, np.zeros(3)), "sphere", radius=_number(radius))
         if length:
-            turn = Rotation.align_vectors([end - start], [[0, 0, 1]])[0]
-            visual = _visual(link, (start + end) / 2, turn.as_euler("xyz"))
-            ET.SubElement(visual, "cylinder", radius=radius, length=_number(length))
+            visual = _visual(link, middle, turn.as_euler("xyz"))
+            ET.SubElement(visual, "cylinder", radius=_number(radius), length=_number(length))
 
 
 def _visual(link: ET.Element, position: np.ndarray, angles: np.ndarray) -> ET.Element:
+    """Adds a shape at a position (3,) with angles (3,); returns its geometry."""
     visual = ET.SubElement(link, "visual")
     ET.SubElement(visual, "origin", xyz=_numbers(position), rpy=_numbers(angles))
     return ET.SubElement(visual, "geometry")
 
 
 def _number(value: float) -> str:
+    """Nine digits."""
     return f"{value:.9g}"
 
 
 def _numbers(values: np.ndarray) -> str:
+    """Numbers of a vector."""
     return " ".join(map(_number, values))
 
 

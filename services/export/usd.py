@@ -1,142 +1,138 @@
-"""USD as text (.usda) with time samples; written here, read back by Pixar's own library.
+"""USD as text (.usda) with time samples; written by Pixar's own library, read back from the text without it.
 
 One Xform a link, nested as the hand is; capsules are USD's own, the object is a mesh.
 """
 
+import ast
 import json
 import pathlib
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
 
-from services.export.frames import OBJECT, Track, bodies, facts, identifiers, quaternions
+from services.export.frames import (
+    COLOURS,
+    OBJECT,
+    Track,
+    bodies,
+    capsules,
+    continuous_quaternions,
+    facts,
+    identifiers,
+    pose_matrices,
+)
 from services.export.motion_file import GraspMotion
 
-_COLOURS = {"hand": (0.70, 0.73, 0.79), OBJECT: (0.95, 0.62, 0.24)}
 _NAME = "congrasp:name"
+_DOUBLE = UsdGeom.XformOp.PrecisionDouble
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     """Writes one motion."""
     (motion,) = motions
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(len(motion.time) - 1)
+    stage.SetTimeCodesPerSecond(1 / motion.control_dt)
+    stage.SetFramesPerSecond(1 / motion.control_dt)
     about = facts(motion, frame="z up (upAxis)", unit="m (metersPerUnit = 1)", quaternion="w, x, y, z")
-    head = [
-        "#usda 1.0",
-        "(",
-        '    defaultPrim = "grasp"',
-        "    metersPerUnit = 1",
-        '    upAxis = "Z"',
-        "    startTimeCode = 0",
-        f"    endTimeCode = {len(motion.time) - 1}",
-        f"    timeCodesPerSecond = {_number(1 / motion.control_dt)}",
-        f"    framesPerSecond = {_number(1 / motion.control_dt)}",
-        f"    customLayerData = {{ string congrasp = {json.dumps(json.dumps(about))} }}",
-        ")",
-        'def Xform "grasp"',
-        "{",
-    ]
-    found = bodies(motion)
-    names = identifiers([body.name for body in found])
-    lines: list[str] = []
-
-    def add(index: int, indent: str) -> None:
-        body = found[index]
-        inner = indent + "    "
-        turns = map(_quaternion, quaternions(body.rotation, scalar_first=True))
-        lines.extend([f'{indent}def Xform "{names[index]}"', f"{indent}{{"])
-        lines.append(f"{inner}custom string {_NAME} = {json.dumps(body.name)}")
-        if len(body.translation) > 1:
-            samples = _samples(map(_tuple, body.translation))
-            lines.append(f"{inner}double3 xformOp:translate.timeSamples = {samples}")
+    stage.GetRootLayer().customLayerData = {"congrasp": json.dumps(about)}
+    root = UsdGeom.Xform.Define(stage, "/grasp")
+    stage.SetDefaultPrim(root.GetPrim())
+    found, paths = bodies(motion), [root.GetPath()]
+    for i, (body, name) in enumerate(zip(found, identifiers([body.name for body in found]), strict=True)):
+        xform = UsdGeom.Xform.Define(stage, paths[body.parent + 1].AppendChild(name))
+        paths.append(xform.GetPath())
+        xform.GetPrim().CreateAttribute(_NAME, Sdf.ValueTypeNames.String, True).Set(body.name)
+        translate, orient = xform.AddTranslateOp(_DOUBLE), xform.AddOrientOp(_DOUBLE)
+        if len(body.translation) == 1:
+            translate.Set(Gf.Vec3d(*body.translation[0]))
+        for t, turn in enumerate(continuous_quaternions(body.rotation, scalar_first=True)):
+            orient.Set(Gf.Quatd(*turn), t)
+            if len(body.translation) > 1:
+                translate.Set(Gf.Vec3d(*body.translation[t]), t)
+        if body.name == OBJECT:
+            _add_mesh(stage, paths[-1], motion)
         else:
-            lines.append(f"{inner}double3 xformOp:translate = {_tuple(body.translation[0])}")
-        lines.append(f"{inner}quatd xformOp:orient.timeSamples = {_samples(turns)}")
-        lines.append(f'{inner}uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]')
-        lines.extend(inner + line for line in (_mesh(motion) if body.name == OBJECT else _capsules(motion, index)))
-        for child, other in enumerate(found):
-            if other.parent == index:
-                add(child, inner)
-        lines.append(f"{indent}}}")
-
-    for index, body in enumerate(found):
-        if body.parent < 0:
-            add(index, "    ")
-    path.write_text("\n".join([*head, *lines, "}", ""]), encoding="utf-8")
+            _add_capsules(stage, paths[-1], motion, i)
+    stage.Save()
 
 
-def _number(value: float) -> str:
-    return f"{value:.9g}"
+def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link: int) -> None:
+    """The link's capsules in its frame."""
+    for number, length, radius, middle, turn in capsules(motion, link):
+        capsule = UsdGeom.Capsule.Define(stage, parent.AppendChild(f"capsule_{number}"))
+        capsule.CreateAxisAttr(UsdGeom.Tokens.z)
+        capsule.CreateHeightAttr(length)
+        capsule.CreateRadiusAttr(radius)
+        capsule.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(capsule, Usd.TimeCode.Default()))
+        capsule.CreateDisplayColorAttr([COLOURS["hand"]])
+        capsule.AddTranslateOp(_DOUBLE).Set(Gf.Vec3d(*middle))
+        capsule.AddOrientOp(_DOUBLE).Set(Gf.Quatd(*turn.as_quat(scalar_first=True)))
 
 
-def _tuple(values: Iterable[float]) -> str:
-    return f"({', '.join(map(_number, values))})"
-
-
-def _quaternion(values: Iterable[float]) -> str:
-    """In full, because readers take the angle from the first number's arc cosine."""
-    return f"({', '.join(f'{value:.17g}' for value in values)})"
-
-
-def _samples(values: Iterable[str]) -> str:
-    return f"{{ {', '.join(f'{i}: {value}' for i, value in enumerate(values))} }}"
-
-
-def _capsules(motion: GraspMotion, link: int) -> list[str]:
-    lines = []
-    for k in np.flatnonzero(motion.capsule_link == link):
-        (start, end), radius = motion.capsule_ends[k].astype(float), float(motion.capsule_radius[k])
-        along = end - start
-        length = float(np.linalg.norm(along))
-        turn = Rotation.align_vectors([along], [[0, 0, 1]])[0] if length else Rotation.identity()
-        half = length / 2 + radius
-        lines += [
-            f'def Capsule "capsule_{k}"',
-            "{",
-            '    uniform token axis = "Z"',
-            f"    double height = {_number(length)}",
-            f"    double radius = {_number(radius)}",
-            f"    float3[] extent = [{_tuple([-radius, -radius, -half])}, {_tuple([radius, radius, half])}]",
-            f"    color3f[] primvars:displayColor = [{_tuple(_COLOURS['hand'])}]",
-            f"    double3 xformOp:translate = {_tuple((start + end) / 2)}",
-            f"    quatd xformOp:orient = {_quaternion(turn.as_quat(scalar_first=True))}",
-            '    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]',
-            "}",
-        ]
-    return lines
-
-
-def _mesh(motion: GraspMotion) -> list[str]:
-    vertices, faces = motion.object_vertices, motion.object_faces
-    return [
-        'def Mesh "mesh"',
-        "{",
-        '    uniform token subdivisionScheme = "none"',
-        f"    float3[] extent = [{_tuple(vertices.min(0))}, {_tuple(vertices.max(0))}]",
-        f"    color3f[] primvars:displayColor = [{_tuple(_COLOURS[OBJECT])}]",
-        f"    int[] faceVertexCounts = [{', '.join(['3'] * len(faces))}]",
-        f"    int[] faceVertexIndices = [{', '.join(map(str, faces.ravel()))}]",
-        f"    point3f[] points = [{', '.join(map(_tuple, vertices))}]",
-        "}",
-    ]
+def _add_mesh(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion) -> None:
+    """The object's mesh in its frame."""
+    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(motion.object_vertices, np.float32))
+    mesh = UsdGeom.Mesh.Define(stage, parent.AppendChild("mesh"))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreatePointsAttr(points)
+    mesh.CreateFaceVertexCountsAttr([3] * len(motion.object_faces))
+    mesh.CreateFaceVertexIndicesAttr(motion.object_faces.ravel().tolist())
+    mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    mesh.CreateDisplayColorAttr([COLOURS[OBJECT]])
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """What Pixar's library works out at the time codes of a file."""
-    from pxr import Usd, UsdGeom
+    """What the text says, put together from the root to the tips."""
+    layer = _parse(path.read_text(encoding="utf-8"))
+    assert layer["upAxis"] == "Z" and layer["metersPerUnit"] == 1
+    codes = np.arange(layer["startTimeCode"], layer["endTimeCode"] + 1)
+    poses: dict[str, np.ndarray] = {}
+    corners: list[np.ndarray] = []
 
-    stage = Usd.Stage.Open(str(path))
-    to_metres = UsdGeom.GetStageMetersPerUnit(stage)
-    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
-    codes = np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1)
-    named = {prim.GetAttribute(_NAME).Get(): prim for prim in stage.Traverse() if prim.HasAttribute(_NAME)}
-    poses = {name: np.zeros((len(codes), 4, 4)) for name in named}
-    for i, code in enumerate(codes):
-        cache = UsdGeom.XformCache(float(code))
-        for name, prim in named.items():
-            poses[name][i] = np.array(cache.GetLocalToWorldTransform(prim)).T  # USD's vectors are rows
-            poses[name][i, :3, 3] *= to_metres
-    mesh = UsdGeom.Mesh(named[OBJECT].GetChild("mesh"))
-    vertices = to_metres * np.array(mesh.GetPointsAttr().Get(), float)
-    triangles = vertices[np.array(mesh.GetFaceVertexIndicesAttr().Get())].reshape(-1, 3, 3)
-    return [Track(codes / stage.GetTimeCodesPerSecond(), poses, triangles)]
+    def visit(prim: dict[str, Any], parent: np.ndarray) -> None:
+        """World poses of a prim and those below it, and the triangles of meshes."""
+        if _NAME in prim:
+            assert prim["xformOpOrder"] == ["xformOp:translate", "xformOp:orient"]
+            place, turn = (_samples(prim, name, len(codes)) for name in prim["xformOpOrder"])
+            parent = poses[prim[_NAME]] = parent @ pose_matrices(place, Rotation.from_quat(turn, scalar_first=True))
+        elif "faceVertexIndices" in prim:
+            corners.append(np.array(prim["points"])[prim["faceVertexIndices"]].reshape(-1, 3, 3))
+        for name, child in prim.items():
+            if name.startswith("/"):
+                visit(child, parent)
+
+    visit(layer, np.eye(4))
+    return [Track(codes / layer["timeCodesPerSecond"], poses, np.concatenate(corners))]
+
+
+def _samples(prim: dict[str, Any], name: str, count: int) -> np.ndarray:
+    """(T, n) values of an attribute at every time code."""
+    samples = prim.get(f"{name}.timeSamples", {})
+    return np.array([samples[str(t)] if samples else prim[name] for t in range(count)], float)
+
+
+def _parse(text: str) -> dict[str, Any]:
+    """A layer's text as nested dictionaries: attributes by name, time samples by code, prims by `/name`."""
+    layer: dict[str, Any] = {}
+    open_blocks, prim = [layer], ""
+    for line in map(str.strip, text.splitlines()):
+        found = re.match(r"(?:[\w\[\]]+ )*([\w:.]+) = (.*)", line) or re.match(r"(\d+): (.*),", line)
+        if definition := re.match(r'def \w+ "(\w+)"', line):
+            prim = f"/{definition[1]}"
+        elif line == "}":
+            open_blocks.pop()
+        elif line == "{" or (found and found[2] == "{"):
+            block: dict[str, Any] = {}
+            open_blocks[-1][found[1] if found else prim] = block
+            open_blocks.append(block)
+        elif found:
+            open_blocks[-1][found[1]] = ast.literal_eval(found[2])
+    return layer

@@ -12,7 +12,7 @@ from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands.spec import Hand
 from common.objects import store
-from common.objects.pool import object_scale, sized
+from common.objects.pool import object_scale, scale_objects
 from common.objects.spec import GraspObject
 from common.task.bank import ConstraintBank
 from common.wire.codec import Message, decode, encode
@@ -60,7 +60,7 @@ def make_sets(
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
-    fitting = sized(hand, task, objects)
+    fitting = scale_objects(hand, task, objects)
     bank = ConstraintBank(*(np.asarray(field) for field in bank or build_bank(hand, task, fitting, seed)))
     scale = object_scale(hand, task)
     return [

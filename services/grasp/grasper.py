@@ -32,8 +32,8 @@ from common.task.constraints import CONSTRAINTS, goal_of, optional, require_know
 from common.task.constraints.priority import contradictions, explain
 from common.task.types import Goal, Surface
 from common.wire.codec import Message
-from services.assets.objects.meshes import ImportOptions
 from services.assets.objects.named import one_object
+from services.assets.objects.options import ImportOptions
 from services.export.motion_file import GraspMotion, motion_of_episode
 from services.grasp.approaches import headings, prescribed, valid_rests
 from services.grasp.parse import read_request

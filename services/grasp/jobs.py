@@ -14,9 +14,11 @@ from common.errors import CongraspError
 from common.files import write_atomically
 from common.objects import store
 from common.objects.spec import GraspObject
-from services.assets.objects.meshes import ImportOptions, check_options, import_source
+from services.assets.objects.meshes import import_source
+from services.assets.objects.named import objects_at
+from services.assets.objects.options import ImportOptions, check_options
 from services.assets.objects.sizes import size_in_words
-from services.assets.objects.sources import Source, find_sources
+from services.assets.objects.sources import Source
 from services.grasp.files import OBJECT, THUMBNAIL, VIDEO, finished, key_of, save_grasp
 from services.grasp.grasper import Grasper, Progress
 from services.grasp.parse import numbered, read_request
@@ -45,7 +47,7 @@ class Job:
     def load(self, options: ImportOptions) -> GraspObject:
         """The object; of an object file the scale is all that the options change."""
         check_options(options)
-        return import_source(self.source, options)[0] if self.source else store.load(self.path).scaled(options.scale)
+        return import_source(self.source, options) if self.source else store.load(self.path).scaled(options.scale)
 
 
 class Settings(NamedTuple):
@@ -99,11 +101,7 @@ def find_jobs(paths: Sequence[pathlib.Path]) -> tuple[list[Job], list[Result]]:
     errors: list[Result] = []
     for path in paths:
         try:
-            files = [path] if path.suffix == store.SUFFIX else sorted(path.glob(f"*{store.SUFFIX}"))
-            if files:
-                jobs += [Job(file.stem, file, None) for file in files]
-            else:
-                jobs += [Job(source.name, source.path, source) for source in find_sources(path)]
+            jobs += [Job(*found) for found in objects_at(path)]
         except CongraspError as error:
             errors.append(Result(path.name, {}, str(error)))
     return [dataclasses.replace(job, name=name) for job, name in zip(jobs, _distinct(jobs), strict=True)], errors

@@ -15,7 +15,7 @@ episode: T control steps of one world. Arrays: `link_position` (T, L, 3), `link_
 
 Topics of a recording: `/metrics/<role>/<name>`, `/version/<role>/<name>`, `/events/<role>/<name>`, `/rollout/<actor>`,
 and for each actor `/episode/<actor>/` with `tf` (frames of all links and the object), `scene` (hand, object,
-constraints; once an episode), `surface` (O+ and O- points), `hand/<link>` (points of each link in its frame, for
-viewers that draw no scenes), `contacts` (table and forces), `signals` (rewards, forces, joints) and `raw` (the
-message).
+constraints; once an episode), `surface` (points of the graspable and the avoid region), `hand/<link>` (points of each
+link in its frame, for viewers that draw no scenes), `contacts` (table and forces), `signals` (rewards, forces, joints)
+and `raw` (the message).
 """

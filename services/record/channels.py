@@ -126,11 +126,13 @@ def _merge(fields: dict[str, Any], value: Mapping[str, Any]) -> bool:
 
 
 def _kind(item: Any) -> str:
+    """The JSON type of a value."""
     if isinstance(item, bool):
         return "boolean"
     return "number" if isinstance(item, int | float) else "string"
 
 
 def _schema(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """The JSON schema of known fields."""
     properties = {name: _schema(kind) if isinstance(kind, dict) else {"type": kind} for name, kind in fields.items()}
     return {"type": "object", "properties": properties}

@@ -43,22 +43,27 @@ class Converter:
         return list(self._kinds[kind](role, name, plain, now))
 
     def _metrics(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """Numbers of an update or a rollout."""
         values = {key: float(value) for key, value in message.meta["values"].items()}
         yield self._json.entry(f"/metrics/{role}/{name}", now, {**_scalars(message.meta), "values": nest(values)})
 
     def _version(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """A published version."""
         yield self._json.entry(f"/version/{role}/{name}", now, _scalars(message.meta))
 
     def _event(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """A line of the log."""
         level = _LEVELS.get(str(message.meta["level"]).lower(), Log.UNKNOWN)
         log = Log(level=level, message=str(message.meta["text"]), name=f"{role}/{name}")
         log.timestamp.FromNanoseconds(round(1e9 * float(message.meta.get("time", now / 1e9))))
         yield Entry(protobuf_channel(f"/events/{role}/{name}", Log), now, log.SerializeToString())
 
     def _rollout(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """A rollout as it came."""
         yield Entry(opaque_channel(f"/rollout/{name}", ROLLOUT_SCHEMA), now, encode(message))
 
     def _episode(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """An episode's scene, step by step."""
         # An episode that comes while the one before it still plays waits for its end.
         start = max(now, self._ends.get(name, 0))
         slot = self._slots.setdefault(name, len(self._slots))
@@ -67,4 +72,5 @@ class Converter:
 
 
 def _scalars(meta: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a message's meta data is a plain value."""
     return {key: value for key, value in meta.items() if isinstance(value, bool | int | float | str)}

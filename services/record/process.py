@@ -54,7 +54,7 @@ def record_run(
         if server is not None:
             console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")
         sinks = [server] if server else []
-        recorder = stack.enter_context(Recorder(transport, run, out, name="record", sinks=sinks, complain=warn))
+        recorder = stack.enter_context(Recorder(transport, run, out, name="record", sinks=sinks, warn=warn))
         transport.declare_alive(Keys(run).alive("recorder", process_name("recorder"), secrets.token_hex(4)))
         try:
             with console.status(_state(recorder)) as status:

@@ -89,6 +89,11 @@ def read_records(path: pathlib.Path, wanted: Callable[[str], bool] = lambda topi
             return  # cut off here; everything before has been given
 
 
+def is_episode(topic: str) -> bool:
+    """Whether a topic is that of an actor's whole episodes."""
+    return topic.startswith("/episode/") and topic.endswith("/raw")
+
+
 def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Every metric of a run's recordings, by `<role>/<name>/<metric>`.
 
@@ -113,7 +118,32 @@ def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]
 
 def read_episodes(path: pathlib.Path) -> Iterator[Message]:
     """The recorded episodes at `path`, a file or a folder, as the actors sent them, in the order of recording."""
-    return _messages(path, EPISODE_SCHEMA, lambda topic: topic.startswith("/episode/") and topic.endswith("/raw"))
+    return _messages(path, EPISODE_SCHEMA, is_episode)
+
+
+def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Message:
+    """One of the recorded episodes at `path`.
+
+    Args:
+      path: a file or a folder.
+      index: from 0; -1 is the last.
+      success: count only episodes that succeeded.
+
+    Raises:
+      CongraspError: there is none of this index; the line says how many there are.
+    """
+    last: collections.deque[Message] = collections.deque(maxlen=max(1, -index))
+    count = 0
+    for episode in read_episodes(path):
+        if episode.meta["success"] or not success:
+            last.append(episode)
+            count += 1
+            if count == index + 1:
+                break
+    if not -count <= index < count:
+        kind = "successful episodes" if success else "episodes"
+        raise CongraspError(f"{path} holds {count} {kind}, not one with index {index}.")
+    return last[0 if index < 0 else -1]
 
 
 def read_rollouts(path: pathlib.Path) -> Iterator[Message]:
@@ -125,6 +155,7 @@ def read_rollouts(path: pathlib.Path) -> Iterator[Message]:
 
 
 def _messages(path: pathlib.Path, schema: str, wanted: Callable[[str], bool]) -> Iterator[Message]:
+    """Decoded messages of one schema on the wanted topics."""
     for file in log_files(path):
         for record in read_records(file, wanted):
             if record.schema == schema:

@@ -31,7 +31,7 @@ class Recorder:
     Attributes:
       messages: log messages recorded.
       damaged: messages that were not what their key says, and were left out.
-      error: why recording stopped, in words; empty while it goes on.
+      error: why recording stopped; empty while it continues.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Recorder:
         depth: int = 512,
         max_bytes: int = 256 << 20,
         max_seconds: float = 600.0,
-        complain: Callable[[str], None] = lambda text: print(f"congrasp: {text}", file=sys.stderr, flush=True),
+        warn: Callable[[str], None] = lambda text: print(f"congrasp: {text}", file=sys.stderr, flush=True),
     ):
         """Subscribes; `start` begins to write.
 
@@ -58,13 +58,13 @@ class Recorder:
           depth: messages kept when they come faster than they are written; then the oldest are dropped.
           max_bytes: see `LogWriter`.
           max_seconds: see `LogWriter`.
-          complain: told in one line what goes wrong.
+          warn: takes a line about what goes wrong.
         """
         self._writer = (
             LogWriter(directory, name, run=run, max_bytes=max_bytes, max_seconds=max_seconds) if directory else None
         )
         self._subscription = transport.subscribe(Keys(run).logs, depth=depth)
-        self._sinks, self._complain = tuple(sinks), complain
+        self._sinks, self._warn = tuple(sinks), warn
         self._convert = Converter()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True, name="recorder")
@@ -108,6 +108,7 @@ class Recorder:
         self.close()
 
     def _work(self) -> None:
+        """Receives, writes and flushes until it is told to stop."""
         flushed = time.monotonic()
         while True:
             received = self._subscription.receive(0.0 if self._stop.is_set() else 0.1)
@@ -121,12 +122,13 @@ class Recorder:
         self._on_disk(lambda writer: writer.close())
 
     def _take(self, key: str, message: Message) -> None:
+        """Converts and writes one message; one that is not what its key says is counted and left out."""
         try:
             entries = self._convert(key, message, time.time_ns())
-        except Exception as error:  # whatever a peer sends, this thread goes on
+        except Exception as error:  # whatever a peer sends, this thread continues
             self.damaged += 1
             if self.damaged == 1:
-                self._complain(f"a log message on '{key}' was left out ({type(error).__name__}: {error})")
+                self._warn(f"a log message on '{key}' was left out ({type(error).__name__}: {error})")
             return
         self.messages += 1
         for entry in entries:
@@ -135,7 +137,7 @@ class Recorder:
         self._on_disk(lambda writer: writer.write(*entries))
 
     def _on_disk(self, action: Callable[[LogWriter], object]) -> None:
-        """Does something with the writer; when that fails, recording stops and the run goes on."""
+        """Does something with the writer; when that fails, recording stops and the run continues."""
         if self._writer is None or self.error:
             return
         try:
@@ -150,4 +152,4 @@ class Recorder:
                 "what was recorded before is kept and the run goes on."
             )
             self._writer.abandon()
-            self._complain(self.error)
+            self._warn(self.error)

@@ -21,18 +21,18 @@ from common.hands import get_hand
 from common.hands.mjcf import WRIST_JOINTS
 from common.hands.spec import Capsule, Hand, Link, link_origin
 from common.wire.codec import Message, encode
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
 from services.record.goals import active_blocks
-from services.record.poses import link_poses
+from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, SKIN, TABLE, WAYPOINT
 
 EPISODE_SCHEMA = "congrasp.Episode"
 SPACING = 0.8
 """Metres between two actors' frames in the world."""
 Colour = tuple[float, float, float, float]
-_SKIN, _GHOST = (0.70, 0.73, 0.79, 1.0), (0.22, 0.40, 0.86, 0.25)
-_OBJECT, _TABLE = (0.95, 0.62, 0.24, 1.0), (0.80, 0.79, 0.77, 1.0)
-_PLUS, _MINUS = (0.20, 0.65, 0.32, 1.0), (0.80, 0.16, 0.16, 1.0)
-_HEADING, _WAYPOINT, _FORCE = (0.22, 0.40, 0.86, 1.0), (0.53, 0.30, 0.75, 1.0), (0.93, 0.26, 0.21, 1.0)
+_SKIN, _GHOST, _OBJECT, _TABLE = (*SKIN, 1.0), (*HEADING, 0.25), (*OBJECT, 1.0), (*TABLE, 1.0)
+_GRASPABLE, _AVOID = (*GRASPABLE, 1.0), (*AVOID, 1.0)
+_HEADING, _WAYPOINT, _FORCE = (*HEADING, 1.0), (*WAYPOINT, 1.0), (0.93, 0.26, 0.21, 1.0)
 _AXES = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.7, 0.2, 1.0), (0.2, 0.3, 0.9, 1.0))
 _ARROW = 0.10  # length of the approach arrow, m
 _FORCE_LENGTH, _FORCE_MAX = 0.01, 0.10  # m per newton, and the longest arrow
@@ -79,6 +79,7 @@ def duration(episode: Message) -> int:
 
 
 def _protobuf(topic: str, time: int, message: Any, *, latched: bool = False) -> Entry:
+    """An entry of one of Foxglove's messages."""
     kind: Any = type(message)
     return Entry(protobuf_channel(topic, kind, latched=latched), time, message.SerializeToString())
 
@@ -86,6 +87,7 @@ def _protobuf(topic: str, time: int, message: Any, *, latched: bool = False) -> 
 def _transforms(
     hand: Hand, actor: str, arrays: Mapping[str, np.ndarray], i: int, slot: int, now: int
 ) -> FrameTransforms:
+    """Frames of the actor, its links and its object at step i."""
     message = FrameTransforms()
     poses = [("world", actor, np.array([SPACING * slot, 0.0, 0.0]), _NO_TURN)]
     for k, link in enumerate(hand.links):
@@ -124,6 +126,7 @@ def _static_scene(
 
 
 def _label(meta: Mapping[str, Any]) -> str:
+    """What is written above the object."""
     return f"{meta['object']}, version {meta['version']}, {'success' if meta['success'] else 'no success'}"
 
 
@@ -147,7 +150,7 @@ def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mappin
         for axis, colour in zip(wrist.as_matrix().T, _AXES, strict=True):
             _add_arrow(entity, origin, axis, 0.05, 0.003, colour)
         if active.get("pose_finger"):
-            position, quaternion = link_poses(hand, arrays["goal/pose_q"])
+            position, quaternion = mujoco_link_poses(hand, arrays["goal/pose_q"])
             for k, link in enumerate(hand.links):
                 turn = wrist * Rotation.from_quat(quaternion[k], scalar_first=True)
                 for capsule in link.capsules:
@@ -156,8 +159,8 @@ def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mappin
 
 
 def _surface(actor: str, arrays: Mapping[str, np.ndarray], now: int) -> PointCloud:
-    """The object's surface points: O+ green, O- red."""
-    colours = np.where(arrays["surface_minus"][:, None], np.multiply(_MINUS, 255), np.multiply(_PLUS, 255))
+    """The object's surface points: graspable region green, avoid region red."""
+    colours = np.where(arrays["surface_minus"][:, None], np.multiply(_AVOID, 255), np.multiply(_GRASPABLE, 255))
     return _cloud(f"{actor}/object", arrays["surface_points"], colours, now)
 
 
@@ -260,6 +263,7 @@ def _add_capsule(
 
 
 def _add_sphere(entity: SceneEntity, center: np.ndarray, radius: float, colour: Colour) -> None:
+    """Adds a ball."""
     sphere = entity.spheres.add()
     _set_vector(sphere.pose.position, center)
     sphere.pose.orientation.w = 1.0
@@ -270,6 +274,7 @@ def _add_sphere(entity: SceneEntity, center: np.ndarray, radius: float, colour: 
 def _add_arrow(
     entity: SceneEntity, start: np.ndarray, direction: np.ndarray, length: float, width: float, colour: Colour
 ) -> None:
+    """Adds an arrow of some length and width (m) along a unit direction."""
     arrow = entity.arrows.add(
         shaft_length=0.7 * length, shaft_diameter=width, head_length=0.3 * length, head_diameter=2 * width
     )
@@ -284,12 +289,15 @@ def _turn_onto(axis: list[float], direction: np.ndarray) -> np.ndarray:
 
 
 def _set_vector(target: Any, value: Any) -> None:
+    """Sets x, y and z."""
     target.x, target.y, target.z = map(float, value)
 
 
 def _set_quaternion(target: Any, value: Any) -> None:
+    """Sets w, x, y and z."""
     target.w, target.x, target.y, target.z = map(float, value)
 
 
 def _set_colour(target: Any, value: Colour) -> None:
+    """Sets red, green, blue and alpha."""
     target.r, target.g, target.b, target.a = value

@@ -78,6 +78,7 @@ class LogWriter:
             self._writer.add_message(channel, entry.time, entry.data, entry.time, sequence)
 
     def _is_over(self, file: IO[bytes], time: int) -> bool:
+        """Whether an entry of this time (ns) belongs into the next file."""
         # A clock that was set back must not keep a file open for ever.
         return file.tell() > self._max_bytes or abs(time - self._first) > self._max_ns
 
@@ -113,6 +114,7 @@ class LogWriter:
                 file.close()
 
     def _begin(self, time: int) -> None:
+        """Opens a new file under a name that no other recorder has taken."""
         stamp = datetime.datetime.fromtimestamp(time / 1e9, datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
         while self._file is None:
             self._path = self._directory / f"{self._name}-{stamp}-{self._number:03d}.mcap{PART}"
@@ -135,6 +137,7 @@ class LogWriter:
         self._writer.flush()
 
     def _register(self, channel: Channel) -> int:
+        """The file's id of a channel, whose schema is written with it."""
         known = (channel.schema_name, channel.schema)
         if known not in self._schemas:
             self._schemas[known] = self._writer.register_schema(

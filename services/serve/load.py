@@ -80,11 +80,11 @@ def example_episode(seed: int, hand: str = "human") -> dict[str, Any]:
     from common.config import TaskConfig
     from common.hands import get_hand
     from common.objects import procedural
-    from common.objects.pool import sized
+    from common.objects.pool import scale_objects
 
     task = TaskConfig(hand=hand, constraints=("heading",))
     found = get_hand(hand)
-    (obj,) = sized(found, task, [procedural.generate(seed)])
+    (obj,) = scale_objects(found, task, [procedural.generate(seed)])
     begun = initial.sample(found, task, build_bank(found, task, [obj], seed), jax.random.key(seed), 1)
     world = {name: np.asarray(value)[0] for name, value in begun.world._asdict().items()}
     pose = world["object_position"], world["object_quaternion"]

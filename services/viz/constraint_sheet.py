@@ -6,20 +6,11 @@ from scipy.spatial.transform import Rotation
 from common.hands import get_hand
 from common.task.sampling.headings import INWARD
 from common.wire.codec import Message
+from services.record.palette import HEADING, OBJECT, WAYPOINT
 from services.viz.raycast import Shape
-from services.viz.render import (
-    APPROACH,
-    OBJECT,
-    OBJECT_MINUS,
-    SKIN,
-    WAYPOINT,
-    arrow,
-    beads,
-    fit,
-    posed_hand,
-    table_shape,
-)
+from services.viz.render import OBJECT_AVOID
 from services.viz.shade import render_scene
+from services.viz.shapes import arrow, beads, fit, posed_hand, table_shape
 from services.viz.sheets import contact_sheet
 
 _ARROWS, _PATHS = 14, 4
@@ -31,7 +22,8 @@ _SIZE = (460, 360)
 def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.ndarray:
     """Six pictures of the object in one of its resting poses, with some of its constraints drawn by the seed.
 
-    Approach arrows end before the surface, two centimetres short of the heading positions; O- is dark red.
+    Approach arrows end before the surface, two centimetres short of the heading positions;
+    the avoid region is dark red.
 
     Returns:
       (H, W, 3) uint8.
@@ -43,30 +35,34 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
     hand = get_hand(meta.get("hand_reference", meta["hand"]))
 
     def some(which: np.ndarray, count: int) -> np.ndarray:
+        """At most `count` of those that are true, drawn."""
         found = np.flatnonzero(which)
         return rng.permutation(found)[:count]
 
     def headings(v: int) -> list[Shape]:
+        """Arrows of a region's headings."""
         shapes = []
         for h in some(arrays["heading/allowed"][v, rest], _ARROWS):
             direction = turn.apply(arrays["heading/direction"][v, h])
             tip = turn.apply(arrays["heading/position"][v, h]) + place[:3] - (INWARD + _GAP) * direction
-            shapes += arrow(tip - _ARROW_LENGTH * direction, tip, 0.0016, APPROACH)
+            shapes += arrow(tip - _ARROW_LENGTH * direction, tip, 0.0016, HEADING)
         return shapes
 
     def paths(v: int, chosen: np.ndarray) -> list[Shape]:
+        """Strings of a region's trajectories."""
         return [beads(turn.apply(arrays["trajectory/position"][v, m]) + place[:3], 0.003, WAYPOINT) for m in chosen]
 
     def grasp(v: int, chosen: np.ndarray) -> list[Shape]:
+        """Hands of a region's reference poses."""
         shapes: list[Shape] = []
         for m in chosen:
             wrist = turn * Rotation.from_quat(arrays["pose/quaternion"][v, m], scalar_first=True)
             position = turn.apply(arrays["pose/position"][v, m]) + place[:3]
-            shapes += posed_hand(hand, arrays["pose/q"][v, m], position, wrist, SKIN)
+            shapes += posed_hand(hand, arrays["pose/q"][v, m], position, wrist)
         return shapes
 
-    minus = arrays["surface/minus"]
-    thing = Shape(
+    avoid = arrays["surface/minus"]
+    body = Shape(
         "mesh",
         (0, 0, 0),
         OBJECT,
@@ -75,26 +71,26 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
         vertices=arrays["visual/vertices"],
         faces=arrays["visual/faces"],
         paint_points=arrays["surface/points"],
-        paint_colours=np.where(minus[:, None], OBJECT_MINUS, OBJECT),
+        paint_colours=np.where(avoid[:, None], OBJECT_AVOID, OBJECT),
     )
     clear = arrays["pose/allowed"][:, rest]
-    whole, plus = some(clear[0], _PATHS), some(clear[1], _PATHS)
+    whole, region = some(clear[0], _PATHS), some(clear[1], _PATHS)
     panels = {
         f"headings, {int(arrays['heading/allowed'][0, rest].sum())} allowed": headings(0),
-        f"headings on O+, {int(arrays['heading/allowed'][1, rest].sum())} allowed": headings(1),
+        f"headings on the graspable region, {int(arrays['heading/allowed'][1, rest].sum())} allowed": headings(1),
         f"wrist trajectories, {int(clear[0].sum())} allowed": paths(0, whole),
         "reference pose and its trajectory": grasp(0, whole[:1]) + paths(0, whole[:1]),
         "another reference pose": grasp(0, whole[1:2]),
-        "reference pose on O+ and its trajectory": grasp(1, plus[:1]) + paths(1, plus[:1]),
+        "reference pose on the graspable region and its trajectory": grasp(1, region[:1]) + paths(1, region[:1]),
     }
     solid = turn.apply(arrays["visual/vertices"]) + place[:3]
     images = []
     for shapes in panels.values():
         extent = np.concatenate([solid, *(_extent(shape) for shape in shapes)])
         camera = fit(extent, np.array(_VIEW), _SIZE[0] / _SIZE[1])
-        images.append(render_scene([*shapes, thing, table_shape(place[:3])], camera, _SIZE))
-    title = f"{meta['object']}, {meta['hand']} hand, resting pose {rest + 1} of {len(arrays['rest'])}; O- in dark red"
-    return contact_sheet(images, list(panels), columns=3, title=title)
+        images.append(render_scene([*shapes, body, table_shape(place[:3])], camera, _SIZE))
+    title = f"{meta['object']}, {meta['hand']} hand, resting pose {rest + 1} of {len(arrays['rest'])}"
+    return contact_sheet(images, list(panels), columns=3, title=f"{title}; avoid region in dark red")
 
 
 def _extent(shape: Shape) -> np.ndarray:

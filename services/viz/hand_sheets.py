@@ -3,27 +3,28 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand, link_origin
-from services.record.poses import link_poses
+from services.record.palette import HEADING, OBJECT, SKIN, WAYPOINT
 from services.viz.raycast import Shape
-from services.viz.render import APPROACH, SKIN, WAYPOINT, arrow, beads, fit, hand_shapes, shape_points, upright
 from services.viz.shade import render_scene
+from services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, upright
 from services.viz.sheets import contact_sheet
 
-MOVED = (0.95, 0.62, 0.24)
 _VIEW = np.array([0.75, 0.65, 0.35])
 
 
 def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = ()) -> list[Shape]:
     """The hand upright with finger angles (F,), some of its links in another colour."""
-    turn = upright(hand)
-    position, quaternion = link_poses(hand, q)
-    turned = (turn * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
-    colours = [MOVED if i in moved else SKIN for i in range(len(hand.links))]
-    return hand_shapes(hand, turn.apply(position), turned, colours)
+    colours = [OBJECT if i in moved else SKIN for i in range(len(hand.links))]
+    return posed_hand(hand, q, np.zeros(3), upright(hand), colours)
+
+
+def _poses(hand: Hand) -> dict[str, list[Shape]]:
+    """The hand upright in three poses."""
+    poses = {"open": hand.q_open, "half closed": (hand.q_open + hand.q_closed) / 2, "closed": hand.q_closed}
+    return {name: _placed(hand, q) for name, q in poses.items()}
 
 
 def _frame(hand: Hand) -> list[Shape]:
@@ -33,7 +34,7 @@ def _frame(hand: Hand) -> list[Shape]:
     ends = frame.center + np.outer([-0.5, 0.5], frame.opening * frame.cross)
     forward = turn.apply(np.array([frame.center - reach * frame.heading, frame.center]))
     return [
-        *arrow(forward[0], forward[1], 0.0028, APPROACH),
+        *arrow(forward[0], forward[1], 0.0028, HEADING),
         beads(turn.apply(ends), 0.005, WAYPOINT),
     ]
 
@@ -45,33 +46,42 @@ def _side(hand: Hand) -> np.ndarray:
 
 
 def _points(shapes: Sequence[Shape]) -> np.ndarray:
+    """(n, 3) points that a picture of the shapes must hold."""
     return np.concatenate([shape_points(shape) for shape in shapes])
+
+
+def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
+    """The hand open, half closed and closed (columns), from the palm, the thumb's side and between (rows)."""
+    placed = _poses(hand)
+    points = np.concatenate([_points(shapes) for shapes in placed.values()])
+    thumb = np.sign(upright(hand).apply(hand.keypoints[len(hand.links)])[1])
+    images, labels = [], []
+    for view, azimuth in {"palm": 0.0, "between": 50.0, "thumb's side": 95.0}.items():
+        angle = thumb * np.radians(azimuth)
+        camera = fit(points, np.array([np.cos(angle), np.sin(angle), 0.25]), size[0] / size[1])
+        images += [render_scene(shapes, camera, size) for shapes in placed.values()]
+        labels += [f"{name}, {view}" for name in placed]
+    title = f"{hand.name} hand: {len(hand.joints)} finger joints, {len(hand.links)} links"
+    return contact_sheet(images, labels, columns=len(placed), title=title)
 
 
 def hands_sheet(hands: Sequence[Hand], *, size: tuple[int, int] = (300, 300)) -> np.ndarray:
     """A row for each hand: open with its grasp frame, half closed, closed; all on one scale."""
     images, labels = [], []
     for hand in hands:
-        rows = [
-            ("open", [*_placed(hand, hand.q_open), *_frame(hand)]),
-            ("half closed", _placed(hand, (hand.q_open + hand.q_closed) / 2)),
-            ("closed", _placed(hand, hand.q_closed)),
-        ]
-        camera = fit(np.concatenate([_points(shapes) for _, shapes in rows]), _side(hand), size[0] / size[1])
-        images += [render_scene(shapes, camera, size) for _, shapes in rows]
-        labels += [f"{hand.name}, {name}" for name, _ in rows]
+        rows = _poses(hand)
+        rows["open"] += _frame(hand)
+        camera = fit(np.concatenate([_points(shapes) for shapes in rows.values()]), _side(hand), size[0] / size[1])
+        images += [render_scene(shapes, camera, size) for shapes in rows.values()]
+        labels += [f"{hand.name}, {name}" for name in rows]
     title = "heading axis v (blue) into the hand centre, cross-finger axis w (violet) from the thumb to the fingers"
     return contact_sheet(images, labels, columns=3, title=title)
 
 
 def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarray:
     """The hand's three poses, and every joint at both of its limits, with the links that it moves in colour."""
-    rows = [
-        ("open", [*_placed(hand, hand.q_open), *_frame(hand)]),
-        ("half closed", _placed(hand, (hand.q_open + hand.q_closed) / 2)),
-        ("closed", _placed(hand, hand.q_closed)),
-        ("all at zero", _placed(hand, np.clip(0.0, hand.lower, hand.upper))),
-    ]
+    rows = {**_poses(hand), "all at zero": _placed(hand, np.clip(0.0, hand.lower, hand.upper))}
+    rows["open"] += _frame(hand)
     names = [link.name for link in hand.links]
     parents = [names.index(link.parent) if link.parent else -1 for link in hand.links]
     carrier = [i for i, link in enumerate(hand.links) for _ in link.joints]
@@ -83,10 +93,10 @@ def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarra
         for angle in (joint.lower, joint.upper):
             q = hand.q_open.copy()
             q[j] = angle
-            rows.append((f"{joint.name} {angle:.2f}", _placed(hand, q, sorted(moved))))
-    points = np.concatenate([_points(shapes) for _, shapes in rows])
+            rows[f"{joint.name} {angle:.2f}"] = _placed(hand, q, sorted(moved))
+    points = np.concatenate([_points(shapes) for shapes in rows.values()])
     camera = fit(points, _side(hand), size[0] / size[1])
-    images = [render_scene(shapes, camera, size) for _, shapes in rows]
+    images = [render_scene(shapes, camera, size) for shapes in rows.values()]
     reach = max(float(np.linalg.norm(link_origin(link))) for link in hand.links)
     title = f"{hand.name}: {len(hand.joints)} joints, {len(hand.links)} links, {100 * reach:.0f} cm to the last joint"
-    return contact_sheet(images, [label for label, _ in rows], columns=8, title=title)
+    return contact_sheet(images, list(rows), columns=8, title=title)

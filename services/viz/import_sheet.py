@@ -9,12 +9,13 @@ from scipy.spatial.transform import Rotation
 from common.hands.spec import Hand
 from common.objects.shapes import tessellate
 from common.objects.spec import GraspObject
-from services.assets.objects.repair import MAX_FACES
+from services.assets.objects.repair import with_few_faces
 from services.assets.objects.sizes import length, size_in_words
 from services.assets.objects.sources import Source, read_mesh
+from services.record.palette import OBJECT, PIECES
 from services.viz.raster import Raster
 from services.viz.raycast import Shape
-from services.viz.render import OBJECT, SKIN, fit, posed_hand, shape_points, upright
+from services.viz.shapes import fit, posed_hand, shape_points, upright
 from services.viz.sheets import contact_sheet
 
 Body = tuple[np.ndarray, np.ndarray, tuple[float, float, float]]
@@ -24,7 +25,6 @@ _VIEW = (0.9, -0.6, 0.45)
 _GAP = 0.03  # m between the hand and the object
 _LARGEST, _SMALLEST = 1.5, 0.01  # m; a mesh beyond is drawn at another scale before its import
 _LARGE_FILE = 30 << 20  # bytes
-_COLOURS = ((0.90, 0.45, 0.36), (0.35, 0.63, 0.78), (0.95, 0.72, 0.30), (0.45, 0.70, 0.48), (0.66, 0.52, 0.78))
 
 
 def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -> np.ndarray:
@@ -53,7 +53,7 @@ def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -
     pieces = enumerate(map(tessellate, obj.pieces))
     count = len(obj.pieces)
     parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [
-        (rest.apply(vertices), faces, _COLOURS[i % len(_COLOURS)]) for i, (vertices, faces) in pieces
+        (rest.apply(vertices), faces, PIECES[i % len(PIECES)]) for i, (vertices, faces) in pieces
     ]
     raster = Raster()
     images = []
@@ -70,7 +70,7 @@ def mesh_of_file(source: Source) -> trimesh.Trimesh | None:
     if sum(path.stat().st_size for path in files) > _LARGE_FILE:
         return None
     whole: Any = trimesh.util.concatenate([read_mesh(path) for path in files])
-    return whole if len(whole.faces) <= MAX_FACES else whole.simplify_quadric_decimation(face_count=MAX_FACES)
+    return with_few_faces(whole)
 
 
 def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
@@ -82,8 +82,8 @@ def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
         Shape("mesh", (0, 0, 0), colour, vertices=vertices - middle, faces=faces) for vertices, faces, colour in bodies
     ]
     turn = upright(hand)
-    standing = posed_hand(hand, hand.q_open, np.zeros(3), turn, SKIN)
+    standing = posed_hand(hand, hand.q_open, np.zeros(3), turn)
     own = np.concatenate([shape_points(shape) for shape in standing])
     side = (high[1] - low[1]) / 2 + _GAP - own[:, 1].min()
     place = np.array([-own[:, 0].mean(), side, -own[:, 2].min()])
-    return shapes + posed_hand(hand, hand.q_open, place, turn, SKIN)
+    return shapes + posed_hand(hand, hand.q_open, place, turn)

@@ -10,11 +10,12 @@ import numpy as np
 
 from common.errors import CongraspError
 from common.files import write_atomically
+from services.record.palette import INK
 from services.record.reader import read_metrics
 
 Series = Mapping[str, tuple[np.ndarray, np.ndarray]]
 _COLUMNS = 4
-INK, QUIET, _GRID = "#262b35", "#6b7280", "#e3e6ea"
+QUIET, _GRID = "#6b7280", "#e3e6ea"
 COLOURS = ("#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a", "#c2478f", "#6b7280")
 _LEGEND = 8
 """Lines of one panel that a legend still names."""
@@ -70,7 +71,7 @@ def plot_run(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str] = ("p
       The files written, each figure in each format.
 
     Raises:
-      CongraspError: there are no metrics, matplotlib is absent, or a file cannot be written.
+      CongraspError: there are no metrics, or a file cannot be written.
     """
     series = read_metrics(path)
     if not series:
@@ -99,15 +100,9 @@ def encoded(figure: Any, kind: str = "png") -> bytes:
 
 
 def new_figure(width: float, height: float, title: str) -> Any:
-    """An empty figure of so many inches.
+    """An empty figure of so many inches."""
+    from matplotlib.figure import Figure
 
-    Raises:
-      CongraspError: matplotlib is absent.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise CongraspError("Figures need the package 'matplotlib'.", "Run: pip install 'congrasp[viz]'") from None
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     figure.suptitle(title, x=0.01, ha="left", color=INK, fontsize=15, fontweight="bold")
     return figure
@@ -176,6 +171,7 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def _curve(axes: Any, steps: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
+    """Draws a metric; a long one smoothed, over itself."""
     window = len(values) // 40
     if window < 3:
         marker = "o" if len(values) < 20 else ""
@@ -191,15 +187,18 @@ def _metric(name: str) -> str:
 
 
 def _label(name: str, panel: Panel) -> str:
+    """The line's name in a legend."""
     role, process, metric = name.split("/", 2)
     return f"{role} {process}" if len(panel.metrics) == 1 else metric.replace("_", " ")
 
 
 def _panels(metrics: Sequence[str], prefix: str, unit: str) -> list[Panel]:
+    """A panel for each metric with a prefix."""
     return [_panel(metric, prefix, unit) for metric in metrics if metric.startswith(prefix)]
 
 
 def _panel(metric: str, prefix: str = "", unit: str = "") -> Panel:
+    """A panel of one metric, with the unit that its name implies."""
     words = metric.removeprefix(prefix)
     found = next((unit for end, unit in _UNITS.items() if metric.endswith(end)), unit)
     return Panel(words.replace("/", ": ").replace("_", " ").capitalize(), found, (metric,))

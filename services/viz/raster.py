@@ -12,16 +12,13 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from services.viz.raycast import Camera, Shape, painted
+from services.viz.raycast import GAMMA, Camera, Shape, background, painted
 from services.viz.smooth import SmoothNormals
 
 SAMPLES = 2
 """Samples along each side of a pixel."""
-_KEY = np.array([-0.45, -0.55, 1.0])  # towards the lamp: right, away from the camera, up
 _KEY_STRENGTH, _SKY_STRENGTH, _BOUNCE, _SHINE = 0.70, 0.42, 0.06, 0.25
 _SHADOW, _SOFT = 0.55, 0.006  # how dark a shadow is, and how wide its border, as a share of the picture's height
-_GAMMA = 2.2
-_TOP, _BOTTOM = np.array([0.93, 0.945, 0.965]), np.array([0.80, 0.82, 0.85])  # background, sRGB
 _NEAR = 0.01  # m
 
 
@@ -68,12 +65,14 @@ class Raster:
         return (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8)
 
     def _patch(self, shape: Shape) -> Patch:
+        """A shape's triangles in the world."""
         local = self._local(shape)
         turn = Rotation.from_quat(shape.quaternion, scalar_first=True).as_matrix().astype(np.float32)
         place = np.asarray(shape.position, np.float32)
         return local._replace(corners=local.corners @ turn.T + place, normals=local.normals @ turn.T)
 
     def _local(self, shape: Shape) -> Patch:
+        """A shape's triangles in its own frame; those of meshes are remembered."""
         if shape.kind != "mesh":
             corners, normals = _round(shape.size[0], shape.size[1] if shape.kind == "capsule" else 0.0)
             return Patch(corners, normals, _even(shape.colour, corners), True)
@@ -93,11 +92,13 @@ class Raster:
 
 
 def _even(colour: tuple[float, float, float], corners: np.ndarray) -> np.ndarray:
+    """One colour for every corner."""
     return np.broadcast_to(_linear(np.asarray(colour)), corners.shape)
 
 
 def _linear(colour: np.ndarray) -> np.ndarray:
-    return (colour**_GAMMA).astype(np.float32)
+    """sRGB as linear light."""
+    return (colour**GAMMA).astype(np.float32)
 
 
 @functools.lru_cache(maxsize=128)
@@ -118,13 +119,11 @@ class _Frame:
         self._camera, self._width, self._height = camera, width, height
         self._axes = camera.axes()
         self._focus = height / 2 / np.tan(np.radians(camera.field_of_view) / 2)
-        right = self._axes[0]
-        key = _KEY @ np.stack([right, np.cross([0.0, 0.0, 1.0], right), [0.0, 0.0, 1.0]])
-        self._key = (key / np.linalg.norm(key)).astype(np.float32)
+        self._key = camera.key_light().astype(np.float32)
         self._nearness = np.zeros(width * height, np.float32)
         """One over the depth of what each sample shows."""
         share = np.linspace(1, 0, height, dtype=np.float32)[:, None, None]
-        self.image = np.broadcast_to(share * _TOP + (1 - share) * _BOTTOM, (height, width, 3)).reshape(-1, 3)
+        self.image = np.broadcast_to(background(share), (height, width, 3)).reshape(-1, 3)
 
     def finer(self) -> "_Frame":
         """The same picture with more samples."""
@@ -233,7 +232,7 @@ class _Frame:
         total = _KEY_STRENGTH * light * np.clip(normal @ self._key, 0, None)
         total += _SKY_STRENGTH * (0.6 + 0.4 * normal[:, 2]) * (0.5 + 0.5 * np.asarray(light)) + _BOUNCE
         gloss = shine * _SHINE * np.clip(_dot(normal, half), 0, None) ** 60
-        return np.clip(albedo * total[:, None] + gloss[:, None], 0, 1) ** (1 / _GAMMA)
+        return np.clip(albedo * total[:, None] + gloss[:, None], 0, 1) ** (1 / GAMMA)
 
 
 class _Cover(NamedTuple):
@@ -270,8 +269,10 @@ def _expand(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n,) dot products of rows."""
     return np.einsum("ij,ij->i", a, b)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Rows of length one."""
     return vectors / (np.sqrt(_dot(vectors, vectors)) + 1e-12)[:, None]

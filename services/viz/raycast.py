@@ -24,6 +24,10 @@ _TYPES = {
     "mesh": mujoco.mjtGeom.mjGEOM_MESH,
 }
 _SOLID, _GLASS = 0, 1  # geom groups
+GAMMA = 2.2
+"""sRGB is about linear light to the power of one over this."""
+_KEY = np.array([-0.45, -0.55, 1.0])  # towards the key light: right, away from the camera, up
+_TOP, _BOTTOM = np.array([0.93, 0.945, 0.965]), np.array([0.80, 0.82, 0.85])  # background, sRGB
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +70,12 @@ class Camera:
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right = right / np.linalg.norm(right)
         return np.stack([right, np.cross(right, forward), forward])
+
+    def key_light(self) -> np.ndarray:
+        """(3,) unit direction towards the key light, which stays at the camera's left."""
+        right = self.axes()[0]
+        key = _KEY @ np.stack([right, np.cross([0.0, 0.0, 1.0], right), [0.0, 0.0, 1.0]])
+        return key / np.linalg.norm(key)
 
     def rays(self, x: np.ndarray, y: np.ndarray, width: int, height: int) -> np.ndarray:
         """(n, 3) unit directions through places (n,) of a picture, in pixels from its upper left corner."""
@@ -136,6 +146,7 @@ class Scene:
 
     @functools.cached_property
     def _smooth(self) -> dict[int, SmoothNormals]:
+        """Smooth normals of the meshes by their indices."""
         meshes = {i: shape for i, shape in enumerate(self.shapes) if shape.kind == "mesh"}
         return {i: SmoothNormals(np.asarray(s.vertices), np.asarray(s.faces)) for i, s in meshes.items()}
 
@@ -168,6 +179,11 @@ class Scene:
             if i in self._paint:
                 colour[here] = painted(self._paint[i], np.asarray(shape.paint_colours), local)
         return colour, normal
+
+
+def background(share: np.ndarray) -> np.ndarray:
+    """(..., 3) sRGB at heights (..., 1) from zero, below, to one."""
+    return share * _TOP + (1 - share) * _BOTTOM
 
 
 def painted(tree: cKDTree, colours: np.ndarray, point: np.ndarray) -> np.ndarray:

@@ -9,20 +9,17 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from services.viz.raycast import THREADS, Camera, Hits, Scene, Shape
+from services.viz.raycast import GAMMA, THREADS, Camera, Hits, Scene, Shape, background
 
 SAMPLES = 2
 """Rays along each side of a pixel that lies on an edge."""
 _FAR = 4.0  # distance of the lamps from what they light, m
 _SKIN = 4e-4  # how far before the surface shadow rays may end, m
-_KEY = np.array([-0.45, -0.55, 1.0])  # towards the key light: right, away from the camera, up
 _KEY_SIZE = 0.14
 _KEY_STRENGTH, _SKY_STRENGTH, _BOUNCE, _SHINE = 0.72, 0.46, 0.05, 0.35
 _KEY_LAMPS, _SKY_LAMPS = 16, 32
 _SETS, _EDGE_SETS = 16, 4  # into how many sets the lamps are split, for pixels and for samples of edges
 _ALIKE = 0.8  # cosine between normals that may share their light
-_GAMMA = 2.2
-_TOP, _BOTTOM = np.array([0.93, 0.945, 0.965]), np.array([0.80, 0.82, 0.85])  # background, sRGB
 
 
 def render_scene(shapes: list[Shape], camera: Camera, size: tuple[int, int] = (640, 480)) -> np.ndarray:
@@ -52,9 +49,7 @@ class _Picture:
         self.scene, self._camera, self._width, self._height = scene, camera, width, height
         self._row, self._column = np.divmod(np.arange(width * height), width)
         self.rays = camera.rays(self._column + 0.5, self._row + 0.5, width, height)
-        right = camera.axes()[0]
-        key = _KEY @ np.stack([right, np.cross([0.0, 0.0, 1.0], right), [0.0, 0.0, 1.0]])
-        self._key = key / np.linalg.norm(key)
+        self._key = camera.key_light()
         self._keys, self._sky = _disc(self._key, _KEY_LAMPS, _KEY_SIZE), _dome(_SKY_LAMPS)
 
     def render(self) -> np.ndarray:
@@ -86,8 +81,7 @@ class _Picture:
 
     def _colour(self, rays: np.ndarray, solid: Hits, glass: Hits, light: np.ndarray) -> np.ndarray:
         """(n, 3) sRGB of rays (n, 3), with the light (n, 2) of the solid shapes; glass is lit by everything."""
-        share = np.clip(0.5 + 0.9 * rays[:, 2:], 0, 1)
-        colour = share * _TOP + (1 - share) * _BOTTOM
+        colour = background(np.clip(0.5 + 0.9 * rays[:, 2:], 0, 1))
         seen = solid.what >= 0
         colour[seen] = self._shade(solid.at(seen), rays[seen], light[seen])
         seen = glass.what >= 0
@@ -106,7 +100,7 @@ class _Picture:
         total = _KEY_STRENGTH * light[:, 0] * np.clip(normal @ self._key, 0, None)
         total += _SKY_STRENGTH * light[:, 1] * 2 * np.clip(_facing(normal, self._sky), 0, None).mean(1)
         total += _BOUNCE * (1 - normal[:, 2])
-        return np.clip(albedo**_GAMMA * total[:, None] + gloss[:, None], 0, 1) ** (1 / _GAMMA)
+        return np.clip(albedo**GAMMA * total[:, None] + gloss[:, None], 0, 1) ** (1 / GAMMA)
 
     def _grid_light(self, hits: Hits) -> np.ndarray:
         """(pixels, 2) light of a whole picture's pixels, zero in the background."""
@@ -151,6 +145,7 @@ class _Picture:
         key, sky, whole = np.zeros(len(start)), np.full(len(start), 1e-9), np.full(len(start), 1e-9)
 
         def judge(thread: int) -> None:
+            """Lights the points of every so many'th set of lamps."""
             for one in range(thread, sets, THREADS):
                 mine = np.flatnonzero(lamp_set == one)
                 towards = mine[hits.normal[mine] @ self._key > 0]

@@ -10,8 +10,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from common.errors import CongraspError
 from common.files import write_atomically
+from services.record.palette import INK
 
-_INK, _QUIET, _PAPER = (38, 43, 53), (96, 103, 116), (251, 251, 252)
+_QUIET, _PAPER = (96, 103, 116), (251, 251, 252)
 _MARGIN, _LABEL, _TITLE = 10, 24, 44  # pixels
 
 
@@ -36,7 +37,7 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
     draw = ImageDraw.Draw(sheet)
     if title:
         font = _font(title, 19, sheet.width - 2 * _MARGIN)
-        draw.text((_MARGIN + 2, _TITLE // 2), title, _INK, font, anchor="lm")
+        draw.text((_MARGIN + 2, _TITLE // 2), title, INK, font, anchor="lm")
     for i, (image, label) in enumerate(zip(images, labels, strict=True)):
         x, y = _MARGIN + i % columns * (width + _MARGIN), top + i // columns * (height + _LABEL)
         sheet.paste(Image.fromarray(image), (x, y))
@@ -45,6 +46,7 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
 
 
 def _font(text: str, size: int, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The largest font up to a size in which a text fits a width in pixels."""
     font = ImageFont.load_default(size)
     while size > 8 and font.getlength(text) > width:
         size -= 1

@@ -1,6 +1,7 @@
 """Smooth normals of a triangle mesh at points that a ray caster found on it, which reports flat ones."""
 
 import numpy as np
+import trimesh
 from scipy.spatial import cKDTree
 
 CREASE = np.cos(np.radians(35.0))
@@ -50,8 +51,8 @@ class SmoothNormals:
         offset = (normal * point).sum(1)
         key = np.column_stack([normal * 10, offset / self.scale * 10, point / self.scale])
         near = self.tree.query(key, k=min(self._NEAREST, self.reach))[1].reshape(len(point), -1)
-        a, b, c = np.moveaxis(self.corners[near], -2, 0)
-        weights = _barycentric(point[:, None], a, b, c)
+        triangles, points = self.corners[near.ravel()], np.repeat(point, near.shape[1], axis=0)
+        weights = trimesh.triangles.points_to_barycentric(triangles, points).reshape(*near.shape, 3)
         best = np.argmax(weights.min(-1), 1)
         rows = np.arange(len(point))
         face = near[rows, best]
@@ -62,13 +63,3 @@ class SmoothNormals:
         found = weights.min(-1).max(1) > -0.05
         smooth = np.where(found[:, None], smooth, normal)
         return smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
-
-
-def _barycentric(point: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """(..., 3) barycentric coordinates of points in the planes of triangles, all (..., 3)."""
-    u, v, w = b - a, c - a, point - a
-    uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
-    wu, wv = (w * u).sum(-1), (w * v).sum(-1)
-    det = uu * vv - uv * uv
-    second, third = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
-    return np.stack([1 - second - third, second, third], -1)

@@ -19,8 +19,8 @@ from common.hands.mano import VARIABLE
 from common.hands.mjcf import add_hand, overlapping
 from common.hands.spec import link_origin
 from common.objects import procedural
-from common.objects.pool import sized
-from services.record import poses
+from common.objects.pool import scale_objects
+from services.assets.hands.kinematics import mujoco_link_poses
 from tests.mano_file import mano_pickle
 
 ROBOTS = ("allegro", "sharpa")
@@ -51,7 +51,7 @@ def hand(request, tmp_path_factory, monkeypatch):
 
 def _tips(hand, q):
     """Fingertips (tips, 3) in the wrist frame by MuJoCo, thumb first."""
-    position, quaternion = poses.link_poses(hand, q)
+    position, quaternion = mujoco_link_poses(hand, q)
     carriers = list(hand.tip_links)
     reach = np.array([np.subtract(hand.links[i].tip, link_origin(hand.links[i])) for i in carriers])
     return position[carriers] + Rotation.from_quat(quaternion[carriers], scalar_first=True).apply(reach)
@@ -159,7 +159,7 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
     """Frame, limits, gains and torques: fingers that close around a cylinder in the hand's middle carry 400 g."""
     found = next(obj for i in range(99) if 0.02 < (obj := procedural.generate(i, "cylinder")).pieces[0].size[0] < 0.03)
     task = TaskConfig(hand=hand.name)
-    (cylinder,) = sized(hand, task, [found])
+    (cylinder,) = scale_objects(hand, task, [found])
     frame = grasp_frame(hand)
     tips = _tips(hand, hand.q_open + 0.5 * (hand.q_closed - hand.q_open))
     center = 0.5 * (tips[0] + tips[1:].mean(0)) - 0.01 * frame.heading
@@ -214,8 +214,8 @@ def test_scaled_objects_keep_their_density():
     for a, b in zip(larger.pieces, obj.pieces, strict=True):
         np.testing.assert_allclose([*a.size, *a.pos], 1.4 * np.array([*b.size, *b.pos]))
     hand = get_hand("allegro")
-    assert sized(hand, TaskConfig(), [obj])[0].mass == larger.mass
-    assert sized(hand, TaskConfig(object_scale=1.0), [obj])[0] is obj
+    assert scale_objects(hand, TaskConfig(), [obj])[0].mass == larger.mass
+    assert scale_objects(hand, TaskConfig(object_scale=1.0), [obj])[0] is obj
 
 
 def test_a_hand_that_does_not_exist_is_one_line_with_those_that_do():

@@ -7,7 +7,10 @@ from PIL import Image
 
 from common.errors import CongraspError
 from common.objects.store import Catalogue, digest
-from services.cli.objects import find_object, parse
+from services.assets.objects.named import find_object
+from services.cli.main import load
+
+parse = load("objects")
 
 
 def test_generate_list_and_show(tmp_path, capsys):
@@ -74,5 +77,6 @@ def test_bad_arguments_are_named(tmp_path):
         parse(["import"])()
     with pytest.raises(CongraspError, match="no folder"):
         parse(["list", str(tmp_path / "none")])()
-    with pytest.raises(CongraspError, match="picture cannot be written"):
-        parse(["show", "box:1", "--png", str(tmp_path / "none" / "x.png")])()
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(CongraspError, match=r"x\.png could not be written"):
+        parse(["show", "box:1", "--png", str(tmp_path / "file" / "x.png")])()

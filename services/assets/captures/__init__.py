@@ -1,5 +1,14 @@
 """Importers: captured grasps of public data sets become constraint sets.
 
-A module for each format (`grab`, `oakink`, `dexycb`, `myohand`) yields `Sequence`s, `extract` turns each into a
-`Demonstration` by the paper's rules or says why not, and `build` gathers them into objects and constraint sets.
+A module for each format yields `Sequence`s, `extract` turns each into a `Demonstration` by the paper's rules or says
+why not, and `build` gathers them into objects and constraint sets.
 """
+
+IMPORTERS = {
+    "grab": "services.assets.captures.grab",
+    "oakink": "services.assets.captures.oakink",
+    "dexycb": "services.assets.captures.dexycb",
+    "myohand": "services.assets.captures.myohand",
+}
+"""Module of each format. It has `read(path, meshes, mano)`, which yields `Sequence`s and what was `Dropped`, and
+`HOLDS`, which says what a folder of the data set holds."""

@@ -29,6 +29,7 @@ def read_archive(path: pathlib.Path) -> dict[str, Any]:
 
 
 def _read(data: bytes, name: str) -> Any:
+    """One array of an archive from its bytes."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

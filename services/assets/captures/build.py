@@ -3,7 +3,6 @@
 import collections
 import dataclasses
 import pathlib
-import re
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
@@ -27,6 +26,7 @@ from services.assets.captures.sequence import Dropped, Sequence
 from services.assets.captures.transfer import demonstrated_headings, transferred
 from services.assets.objects.affordance import near_points, relabelled, two_parts
 from services.assets.objects.meshes import UNLABELLED
+from services.assets.objects.sources import safe_name
 from services.grasp.constraint_sets import set_of
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
@@ -53,7 +53,7 @@ class Options:
 
 @dataclasses.dataclass
 class Report:
-    """What became of each sequence."""
+    """The outcome of each sequence."""
 
     kept: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     dropped: list[dict[str, str]] = dataclasses.field(default_factory=list)
@@ -142,9 +142,10 @@ def import_sets(
 def _shape(
     sequence: Sequence, shapes: dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
 ) -> tuple[GraspObject, Surface]:
+    """The object of a sequence's mesh and its surface, imported once."""
     if sequence.mesh not in shapes:
         try:
-            obj = load_object(sequence.mesh, _name(sequence.object_name))
+            obj = load_object(sequence.mesh, safe_name(sequence.object_name))
             # Without labelled parts the whole surface may be grasped.
             obj = dataclasses.replace(obj, graspable=np.ones_like(obj.graspable))
             shapes[sequence.mesh] = obj, Surface(obj)
@@ -165,18 +166,18 @@ def _labelled(
         return obj
     if affordance == "contacts":
         touched = near_points(obj, demonstration.contact, _TOUCHED)
-        return _with_region(sequence, lambda: two_parts(obj, touched, _name(f"{obj.name}-{sequence.name}")))
+        return _with_region(sequence, lambda: two_parts(obj, touched, safe_name(f"{obj.name}-{sequence.name}")))
     if not names:
         raise Dropped(sequence.name, "no labelled parts", f"the parts of '{sequence.object_name}' are not labelled")
     labels = _nearest(clouds, obj.points)
     counts = np.bincount(_nearest(clouds, demonstration.contact), minlength=len(names))
-    plus = counts >= _VERTICES
-    if not plus.any():
+    graspable = counts >= _VERTICES
+    if not graspable.any():
         reason = f"fingers touch no part in {_VERTICES} points ({counts.max()} at most)"
         raise Dropped(sequence.name, "no part touched", reason)
-    touched_names = [name for name, touched in zip(names, plus, strict=True) if touched]
-    name = obj.name if plus.all() else _name("-".join([obj.name, *touched_names]))
-    return _with_region(sequence, lambda: relabelled(obj, labels, names, [bool(part) for part in plus], name))
+    touched_names = [name for name, touched in zip(names, graspable, strict=True) if touched]
+    name = obj.name if graspable.all() else safe_name("-".join([obj.name, *touched_names]))
+    return _with_region(sequence, lambda: relabelled(obj, labels, names, [bool(part) for part in graspable], name))
 
 
 def _parts(sequence: Sequence, obj: GraspObject) -> tuple[list[str], list[np.ndarray]]:
@@ -189,6 +190,7 @@ def _parts(sequence: Sequence, obj: GraspObject) -> tuple[list[str], list[np.nda
 
 
 def _with_region(sequence: Sequence, make: Callable[[], GraspObject]) -> GraspObject:
+    """The object that `make` returns; the sequence is dropped where its graspable region is too small."""
     try:
         return make()
     except CongraspError as error:
@@ -218,7 +220,7 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
         posed = transferred(hand, demonstrations, fitting, scale)
     q, position, quaternion = (values.astype(np.float32) for values in posed)
     clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, np.stack([fields["rest"]] * len(position))))
-    nearer = _ends_nearer_to_plus(position[:, -1], fields["points"], fields["minus"])
+    nearer = _ends_nearer_to_graspable(position[:, -1], fields["points"], fields["minus"])
     row = ConstraintBank(
         **{name: value for name, value in fields.items() if not name.startswith("chosen")},
         pose_q=_twice(q),
@@ -238,16 +240,11 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
 
 
 def _twice(values: np.ndarray) -> np.ndarray:
-    """The same for both variants (2, ...): the whole surface, and O+."""
+    """The same for both regions (2, ...): the whole surface, and the graspable region."""
     return np.stack([values, values])
 
 
-def _ends_nearer_to_plus(wrist: np.ndarray, points: np.ndarray, minus: np.ndarray) -> np.ndarray:
-    """(M,) bool: wrist positions (M, 3) that agree with the affordance (`common.constraints.priority`)."""
+def _ends_nearer_to_graspable(wrist: np.ndarray, points: np.ndarray, avoid: np.ndarray) -> np.ndarray:
+    """(M,) bool: wrist positions (M, 3) that agree with the affordance (`common.task.constraints.priority`)."""
     away = np.linalg.norm(points[None] - wrist[:, None], axis=-1)
-    return away[:, ~minus].min(-1, initial=np.inf) < away[:, minus].min(-1, initial=np.inf)
-
-
-def _name(text: str) -> str:
-    """A text as the name of an object."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object"
+    return away[:, ~avoid].min(-1, initial=np.inf) < away[:, avoid].min(-1, initial=np.inf)

@@ -18,8 +18,9 @@ from common.hands.mano import VARIABLE, ManoModel
 from services.assets.captures import mano
 from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Sequence
+from services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
 
+HOLDS = "<date>-subject-01/<session>/meta.yml"
 OBJECTS = (
     *("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle"),
     *("007_tuna_fish_can", "008_pudding_box", "009_gelatin_box", "010_potted_meat_can", "011_banana"),
@@ -43,15 +44,11 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
     found = meshes.beside(root / "models")
     for file in sorted(path.glob("**/meta.yml")):
         name = f"{file.parent.parent.name}/{file.parent.name}"
-        try:
-            yield _sequence(name, file.parent, root, found, model)
-        except Dropped as dropped:
-            yield dropped
-        except (CongraspError, yaml.YAMLError, OSError) as error:
-            yield Dropped(name, "unreadable", " ".join(str(error).split()))
+        yield read_or_drop(name, _sequence, name, file.parent, root, found, model)
 
 
 def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel) -> Sequence:
+    """The sequence of a session's folder."""
     meta = _yaml(name, folder / "meta.yml")
     sides = _value(name, meta, "mano_sides")
     if sides != ["right"]:
@@ -60,7 +57,9 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
     if not 0 <= grasped < len(ids) or not 1 <= ids[grasped] <= len(OBJECTS):
         raise Dropped(name, "wrong layout", f"'ycb_grasp_ind' {grasped} names none of the objects {ids}")
     poses = read_archive(folder / "pose.npz")
-    objects, hands = (_poses(name, poses, key, width) for key, width in (("pose_y", 7), ("pose_m", 51)))
+    objects, hands = (
+        array_of(name, "pose.npz", poses, key, "F", "n", width) for key, width in (("pose_y", 7), ("pose_m", 51))
+    )
     if len(objects) != len(hands) or objects.shape[1] != len(ids) or hands.shape[1] != 1:
         raise Dropped(name, "wrong layout", f"'pose_y' {objects.shape} and 'pose_m' {hands.shape} do not fit meta.yml")
     place, hand = objects[:, grasped], hands[:, 0]
@@ -86,32 +85,29 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
 
 
 def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
+    """The settings in a YAML file."""
     if not path.is_file():
         raise Dropped(name, "wrong layout", f"there is no {path.name} in {path.parent}")
-    content = yaml.safe_load(path.read_text())
+    try:
+        content = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise Dropped(name, "unreadable", " ".join(str(error).split())) from None
     if not isinstance(content, dict):
         raise Dropped(name, "wrong layout", f"{path} holds no settings")
     return content
 
 
 def _value(name: str, meta: dict[str, Any], key: str) -> Any:
+    """A value of `meta.yml`."""
     if key not in meta:
         raise Dropped(name, "wrong layout", f"meta.yml has no '{key}'")
     return meta[key]
 
 
 def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
+    """(10,) shape parameters of a calibration."""
     content = _yaml(name, root / "calibration" / f"mano_{calibration}" / "mano.yml")
     betas = np.array(content.get("betas", []), float)
     if betas.shape != (10,):
         raise Dropped(name, "wrong layout", f"mano.yml of {calibration} has {betas.size} 'betas', not 10")
     return betas
-
-
-def _poses(name: str, poses: dict[str, Any], key: str, width: int) -> np.ndarray:
-    if key not in poses:
-        raise Dropped(name, "wrong layout", f"pose.npz has no '{key}'")
-    array = np.asarray(poses[key], float)
-    if array.ndim != 3 or array.shape[2] != width:
-        raise Dropped(name, "wrong layout", f"'{key}' has the shape {array.shape}, not ('F', 'n', {width})")
-    return array

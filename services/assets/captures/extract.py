@@ -19,6 +19,7 @@ from common.hands.human import HUMAN
 from common.objects.spec import GraspObject
 from services.assets.captures.fit import Fit, fit
 from services.assets.captures.sequence import FINGERS, Dropped, Sequence
+from services.export.frames import continuous_quaternions
 
 STABLE = 5
 """Frames that thumb and another finger must touch in a row."""
@@ -166,6 +167,7 @@ def in_object_frame(sequence: Sequence, obj: GraspObject) -> tuple[np.ndarray, n
 
 
 def _grasping_frame(sequence: Sequence, surface: Surface, skin: np.ndarray) -> int:
+    """The frame in which the hand has grasped: named by the data set, or the first of stable contact."""
     if sequence.grasp is not None:
         if not sequence.present[sequence.grasp]:
             reason = f"hand or object is missing in its grasping frame {sequence.grasp}"
@@ -218,12 +220,14 @@ def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame:
 
 
 def _fit(sequence: Sequence, frame: int) -> Fit:
+    """Finger angles of a frame: the capture's own, or fitted to its joints."""
     if sequence.q is not None:
         return Fit(np.asarray(sequence.q[frame], float), 0.0, 0.0)
     return fit(sequence.joints[frame])
 
 
 def _check_limits(name: str, q: np.ndarray, beyond: float) -> None:
+    """Drops a sequence whose joints exceed their limits by more than `beyond` rad."""
     excess = np.maximum(HUMAN.lower - q, q - HUMAN.upper)
     worst = int(excess.argmax())
     if excess[worst] > beyond:
@@ -244,6 +248,7 @@ def _truncated(path: np.ndarray, turns: np.ndarray, far: np.ndarray) -> tuple[np
 
 
 def _check_complexity(name: str, path: np.ndarray, turns: Rotation) -> None:
+    """Drops a sequence whose path (n, 3) has too much of a detour or turns too much."""
     length = np.linalg.norm(np.diff(path, axis=0), axis=-1).sum()
     straight = np.linalg.norm(path[-1] - path[0])
     if length > DETOUR * straight:
@@ -263,11 +268,4 @@ def _resampled(path: np.ndarray, turns: Rotation, waypoints: int) -> tuple[np.nd
     length, path, turns = length[keep], path[keep], turns[keep]
     wanted = np.linspace(length[0], length[-1], waypoints)
     position = np.stack([np.interp(wanted, length, axis) for axis in path.T], -1)
-    return position, continuous(Slerp(length, turns)(wanted))
-
-
-def continuous(turns: Rotation) -> np.ndarray:
-    """(K, 4) quaternions w x y z of rotations along a path, without a change of sign between neighbours."""
-    quaternion = turns.as_quat(scalar_first=True)
-    signs = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
-    return quaternion * np.cumprod([1.0, *signs])[:, None]
+    return position, continuous_quaternions(Slerp(length, turns)(wanted), scalar_first=True)

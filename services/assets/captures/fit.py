@@ -37,6 +37,7 @@ class _Finger(NamedTuple):
 
 @functools.cache
 def _fingers() -> tuple[_Finger, ...]:
+    """The `human` hand's fingers in the order of `FINGERS`."""
     names = [joint.name for joint in HUMAN.joints]
     found = []
     for finger in FINGERS:
@@ -72,6 +73,7 @@ def fit(joints: np.ndarray) -> Fit:
     for finger, wanted in zip(_fingers(), _directions(joints), strict=True):
 
         def residual(angles: np.ndarray, finger: _Finger = finger, wanted: np.ndarray = wanted) -> np.ndarray:
+            """(9,) by which the bones' directions differ from those wanted."""
             return (_directions(_points(finger, angles)) - wanted).ravel()
 
         q[finger.first :][: len(finger.axes)] = least_squares(residual, np.zeros(len(finger.axes)), method="lm").x

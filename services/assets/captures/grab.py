@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
 from common.hands.mano import ManoModel
 from services.assets.captures import mano
 from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import FINGERS, Dropped, Sequence
+from services.assets.captures.sequence import FINGERS, Dropped, Sequence, array_of, read_or_drop
 
+HOLDS = "s1/*.npz and the other subjects"
 _LABELS = {"thumb": (53, 55), "index": (41, 43), "middle": (44, 46), "ring": (50, 52), "little": (47, 49)}
 """First and last contact label of each right finger."""
 
@@ -32,12 +32,7 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
     files = sorted(file for file in path.glob("**/s*/*.npz")) if path.is_dir() else [path]
     named = _grasping_frames(root)
     for file in files:
-        try:
-            yield _sequence(file, root, found, model, named)
-        except Dropped as dropped:
-            yield dropped
-        except CongraspError as error:
-            yield Dropped(file.stem, "unreadable", str(error))
+        yield read_or_drop(file.stem, _sequence, file, root, found, model, named)
 
 
 def _root(path: pathlib.Path) -> pathlib.Path:
@@ -60,18 +55,21 @@ def _grasping_frames(root: pathlib.Path) -> dict[tuple[str, str], int]:
 def _sequence(
     file: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel | None, named: dict[tuple[str, str], int]
 ) -> Sequence:
+    """The sequence of a file."""
     name = f"{file.parent.name}/{file.stem}"
     data = read_archive(file)
     if "rhand" not in data and "lhand" in data:
         raise Dropped(name, "left hand", "it has no right hand")
     hand = _entry(name, data, "rhand", "params")
-    turn, shift, fingers = (_array(name, hand, "rhand", key, width) for key, width in _HAND.items())
+    turn, shift, fingers = (array_of(name, "rhand/params", hand, key, "T", width) for key, width in _HAND.items())
     place = _entry(name, data, "object", "params")
-    object_shift, object_turn = (_array(name, place, "object", key, 3) for key in ("transl", "global_orient"))
+    object_shift, object_turn = (
+        array_of(name, "object/params", place, key, "T", 3) for key in ("transl", "global_orient")
+    )
     object_name = str(data.get("obj_name", file.stem.split("_")[0]))
     subject = _template(root, data)
     skeleton = _skeleton(model, subject)
-    frames = len(turn)
+    frames, grasp = len(turn), named.get((file.parent.name, file.stem))
     present = np.isfinite(np.concatenate([turn, shift, fingers], 1)).all(-1)
     present &= np.isfinite(np.concatenate([object_shift, object_turn], 1)).all(-1)
     for values in (turn, shift, fingers, object_shift, object_turn):
@@ -86,7 +84,7 @@ def _sequence(
         object_position=object_shift,
         object_rotation=np.swapaxes(Rotation.from_rotvec(object_turn).as_matrix(), -1, -2),
         present=present,
-        grasp=_grasp(named.get((file.parent.name, file.stem)), frames),
+        grasp=grasp if grasp is not None and grasp < frames else None,
         touching=_touching(data, frames),
     )
 
@@ -95,20 +93,12 @@ _HAND = {"global_orient": 3, "transl": 3, "fullpose": 45}
 
 
 def _entry(name: str, data: dict[str, Any], *keys: str) -> dict[str, Any]:
+    """The dictionary under some keys."""
     for key in keys:
         if not isinstance(data, dict) or key not in data:
             raise Dropped(name, "wrong layout", f"the file has no '{'/'.join(keys)}'")
         data = data[key]
     return data
-
-
-def _array(name: str, values: dict[str, Any], of: str, key: str, width: int) -> np.ndarray:
-    if key not in values:
-        raise Dropped(name, "wrong layout", f"the file has no '{of}/params/{key}'")
-    array = np.array(values[key], float)
-    if array.ndim != 2 or array.shape[1] != width:
-        raise Dropped(name, "wrong layout", f"'{of}/params/{key}' has the shape {array.shape}, not ('T', {width})")
-    return array
 
 
 def _template(root: pathlib.Path, data: dict[str, Any]) -> pathlib.Path | None:
@@ -120,11 +110,8 @@ def _template(root: pathlib.Path, data: dict[str, Any]) -> pathlib.Path | None:
 
 @functools.lru_cache(maxsize=32)
 def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> mano.Skeleton:
+    """A subject's skeleton, by the template of the hand at rest."""
     return mano.skeleton(model, template=template)
-
-
-def _grasp(named: int | None, frames: int) -> int | None:
-    return named if named is not None and named < frames else None
 
 
 def _touching(data: dict[str, Any], frames: int) -> np.ndarray | None:

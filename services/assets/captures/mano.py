@@ -6,10 +6,8 @@ MANO file the bones are those of the `human` hand; then a thumb, whose rest dire
 
 import dataclasses
 import pathlib
-from typing import Any
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
@@ -17,6 +15,7 @@ from common.hands.human import HUMAN
 from common.hands.mano import MANO_FINGERS, TIP_VERTICES, ManoModel
 from services.assets.captures.fit import joint_positions
 from services.assets.captures.sequence import FINGERS
+from services.assets.objects.sources import load_geometry
 
 TO_HUMAN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Vectors of MANO's wrist frame in that of the human hand."""
@@ -76,13 +75,12 @@ def read_vertices(path: pathlib.Path) -> np.ndarray:
     """(n, 3) vertices of a mesh or a point cloud, in the file's order.
 
     Raises:
-      CongraspError: it cannot be read.
+      CongraspError: it cannot be read, or holds several.
     """
-    try:
-        found: Any = trimesh.load(path, process=False, maintain_order=True)
-        return np.asarray(found.vertices, float)
-    except Exception as error:  # the readers raise whatever they stumble over
-        raise CongraspError(f"{path} cannot be read: {' '.join(str(error).split())}.", "Get the file again.") from None
+    found = load_geometry(path, "Get the file again.", maintain_order=True)
+    if not hasattr(found, "vertices"):
+        raise CongraspError(f"{path} holds no single mesh or point cloud.", "Get the file again.")
+    return np.asarray(found.vertices, float)
 
 
 def axis_angles(vectors: np.ndarray) -> np.ndarray:

@@ -13,14 +13,13 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
 from common.hands.mano import ManoModel
 from services.assets.captures.archive import read_archive
 from services.assets.captures.fit import joint_positions
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Sequence
+from services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
 
-_KEYS = {"time": 0, "robot": 29, "object": 7}
+HOLDS = "MyoHand_<object>_<action>.npz"
 _BASE = np.array([0.1, -0.55, 0.32])
 _ELBOW = np.array([0.002797970, 0.304212085, -0.000513865])
 """The forearm's origin in the base."""
@@ -35,12 +34,7 @@ _LARGEST = 2 * np.pi
 def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None = None) -> Iterator[Sequence | Dropped]:
     """The sequences of a file, or of all NPZ files of a folder; MANO has no part in them."""
     for file in sorted(path.glob("**/*.npz")) if path.is_dir() else [path]:
-        try:
-            yield _sequence(file, meshes)
-        except Dropped as dropped:
-            yield dropped
-        except CongraspError as error:
-            yield Dropped(file.stem, "unreadable", str(error))
+        yield read_or_drop(file.stem, _sequence, file, meshes)
 
 
 def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
@@ -53,17 +47,14 @@ def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
 
 
 def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
+    """The sequence of a file."""
     name = file.stem
     arrays = read_archive(file)
-    for key, width in _KEYS.items():
-        if key not in arrays:
-            raise Dropped(name, "wrong layout", f"the file has no '{key}'")
-        shape = arrays[key].shape
-        if len(shape) != (2 if width else 1) or (width and shape[1] != width) or len(arrays["time"]) != shape[0]:
-            raise Dropped(
-                name, "wrong layout", f"'{key}' has the shape {shape}, not {('T', width) if width else ('T',)}"
-            )
-    robot, pose = arrays["robot"].astype(float), arrays["object"].astype(float)
+    time = array_of(name, "the file", arrays, "time", "T")
+    robot, pose = (array_of(name, "the file", arrays, key, "T", width) for key, width in (("robot", 29), ("object", 7)))
+    if not len(time) == len(robot) == len(pose):
+        lengths = f"{len(time)}, {len(robot)} and {len(pose)}"
+        raise Dropped(name, "wrong layout", f"'time', 'robot' and 'object' have {lengths} frames")
     present = np.isfinite(robot).all(-1) & np.isfinite(pose).all(-1)
     norm = np.linalg.norm(pose[:, 3:], axis=-1)
     present &= np.abs(norm - 1) < 0.05

@@ -2,7 +2,7 @@
 
 `anno/seq_all.json` lists [sequence, subject, frame, camera]; `anno/general_info/<those joined by __>.pkl` holds
 `hand_anno` (`hand_pose (16, 4)` quaternions (w, x, y, z), `hand_shape (10,)`, and `hand_tsl (3,)`, which is the wrist
-itself) and `obj_anno (4, 4)`. The same moments are annotated for several cameras, of which one is taken; frames are
+itself) and `obj_anno (4, 4)`. The same frames are annotated for several cameras, of which one is taken; frames are
 sorted. An object's mesh is centred on its bounding box before the annotated pose moves it.
 `OakBase/<category>/<object>` holds `part_*.ply` with `part_*.json`.
 """
@@ -22,9 +22,10 @@ from common.hands.mano import ManoModel
 from common.pickles import read_pickle
 from services.assets.captures import mano
 from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Part, Sequence
+from services.assets.captures.sequence import Dropped, Part, Sequence, read_or_drop
 from services.assets.objects.sources import read_mesh
 
+HOLDS = "anno/seq_all.json"
 _Frames = list[tuple[int, str]]
 
 
@@ -41,12 +42,8 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
     found = meshes.beside(root / "obj", path / "obj")
     names = _names(path)
     for (name, _), frames in sorted(_sequences(json.loads(index.read_text())).items()):
-        try:
-            yield _sequence(name, frames, root / "anno" / "general_info", found, model, names, path)
-        except Dropped as dropped:
-            yield dropped
-        except CongraspError as error:
-            yield Dropped(name, "unreadable", str(error))
+        folder = root / "anno" / "general_info"
+        yield read_or_drop(name, _sequence, name, frames, folder, found, model, names, path)
 
 
 def _sequences(rows: list[list[Any]]) -> dict[tuple[str, int], _Frames]:
@@ -75,6 +72,7 @@ def _sequence(
     names: dict[str, str],
     root: pathlib.Path,
 ) -> Sequence:
+    """The sequence of some frames' annotations."""
     object_id = name.split("_")[0]
     object_name = names.get(object_id, object_id)
     mesh = meshes.find(name, object_id if meshes.has(object_id) else object_name)
@@ -125,6 +123,7 @@ def _frame(name: str, file: pathlib.Path) -> tuple[np.ndarray, ...] | None:
 
 
 def _shaped(name: str, file: pathlib.Path, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An array of this shape."""
     array = np.asarray(value, float)
     if array.size != np.prod(shape):
         raise Dropped(name, "wrong layout", f"'{key}' of {file.name} has the shape {array.shape}, not {shape}")

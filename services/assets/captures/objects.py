@@ -6,7 +6,8 @@ import pathlib
 from common.errors import CongraspError
 from common.objects.spec import GraspObject
 from services.assets.captures.sequence import Dropped
-from services.assets.objects.meshes import ImportOptions, import_source
+from services.assets.objects.meshes import import_source
+from services.assets.objects.options import ImportOptions
 from services.assets.objects.sources import SUFFIXES, find_sources
 
 
@@ -42,6 +43,7 @@ class Meshes:
         return found
 
     def _look(self, name: str, inside: str) -> pathlib.Path | None:
+        """The first mesh of a name."""
         for folder in self.folders:
             for suffix in SUFFIXES:
                 if (file := folder / f"{name}{suffix}").is_file():
@@ -62,5 +64,4 @@ def load_object(mesh: pathlib.Path, name: str) -> GraspObject:
     sources = find_sources(mesh)
     if len(sources) > 1:
         raise CongraspError(f"{mesh} holds {len(sources)} objects.", "Name the folder of one, or its file.")
-    obj, _ = import_source(dataclasses.replace(sources[0], name=name), ImportOptions(unit="m"))
-    return obj
+    return import_source(dataclasses.replace(sources[0], name=name), ImportOptions(unit="m"))

@@ -6,9 +6,13 @@ of the hand +z.
 
 import dataclasses
 import pathlib
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Items
+from typing import Any
 
 import numpy as np
+
+from common.errors import CongraspError
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
@@ -19,7 +23,7 @@ class Dropped(Exception):
     Attributes:
       name: the sequence's.
       rule: what excludes it, in two or three words, to count by.
-      reason: why, in words, without a full stop.
+      reason: why, as a sentence without a full stop.
     """
 
     def __init__(self, name: str, rule: str, reason: str):
@@ -73,3 +77,35 @@ class Sequence:
                 raise Dropped(self.name, "wrong layout", f"{field} has {len(values)} frames, but there are {frames}")
             if not np.isfinite(values[self.present]).all():
                 raise Dropped(self.name, "not finite", f"{field} holds values that are not finite")
+
+
+def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> Sequence | Dropped:
+    """What `read(*arguments)` returns, or why the sequence of this name cannot be used."""
+    try:
+        return read(*arguments)
+    except Dropped as dropped:
+        return dropped
+    except (CongraspError, OSError) as error:
+        return Dropped(name, "unreadable", " ".join(str(error).split()))
+
+
+def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape: int | str) -> np.ndarray:
+    """A copy of an array of floats that a file holds.
+
+    Args:
+      name: of the sequence.
+      where: what holds the array, for the reason.
+      values: what it holds by name.
+      key: name of the array.
+      shape: its sizes; a letter stands for any.
+
+    Raises:
+      Dropped: it is not there, or has another shape.
+    """
+    if key not in values:
+        raise Dropped(name, "wrong layout", f"{where} has no '{key}'")
+    array = np.array(values[key], float)
+    pairs = zip(shape, array.shape, strict=False)
+    if array.ndim != len(shape) or any(wanted != size for wanted, size in pairs if isinstance(wanted, int)):
+        raise Dropped(name, "wrong layout", f"'{key}' of {where} has the shape {array.shape}, not {shape}")
+    return array

@@ -16,8 +16,9 @@ from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.task.sampling.closed_poses import closed_poses
 from common.task.sampling.headings import Headings
-from services.assets.captures.extract import Demonstration, continuous
+from services.assets.captures.extract import Demonstration
 from services.assets.captures.fit import joint_positions
+from services.export.frames import continuous_quaternions
 
 _AT_ONCE = 20
 """Poses that are closed in one compiled call."""
@@ -65,7 +66,7 @@ def transferred(
         path = scale * (human.apply(center) + demonstration.position)
         # The hand centre of the closed hand, in the wrist frame, is what the last pose leaves between the two.
         positions.append(path - turn.apply(turn[-1].inv().apply(path[-1] - last)))
-        quaternions.append(continuous(turn))
+        quaternions.append(continuous_quaternions(turn, scalar_first=True))
     return q, np.array(positions), np.array(quaternions)
 
 

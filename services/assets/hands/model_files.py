@@ -17,7 +17,7 @@ from common.errors import CongraspError
 from common.hands.files import faults, hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Capsule, Hand, Joint, Link, chain_of, vector, wrist_gains
-from services.assets.hands.poses import opening, posed, thumb_of
+from services.assets.hands.poses import opening, propose_poses, thumb_of
 
 TORQUE = 1.0
 """N.m, of a joint for which the file names no limit."""
@@ -79,7 +79,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
         closed_pose={},
         wrist=wrist_gains(sum(link.mass for link in links)),
     )
-    hand = posed(hand)
+    hand = propose_poses(hand)
     scale = choices.object_scale or round(float(np.clip(opening(hand) / _HUMAN_OPENING, 0.3, 3.0)), 1)
     hand = dataclasses.replace(hand, object_scale=scale)
     for fault in faults(hand):
@@ -88,7 +88,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
 
 
 def describe(proposal: Proposal) -> list[str]:
-    """What was understood and what was proposed, in words."""
+    """What was understood and what was proposed, as lines of text."""
     hand = proposal.hand
     frame = grasp_frame(hand)
     tips = [chain_of(hand, hand.links[i].name) for i in hand.tip_links]
@@ -97,8 +97,8 @@ def describe(proposal: Proposal) -> list[str]:
         f"hand         {hand.name}: {len(hand.joints)} joints, {len(hand.links)} links, {mass:.3f} kg",
         f"thumb        {' - '.join(tips[0])}",
         *(f"finger       {' - '.join(tip)}" for tip in tips[1:]),
-        f"heading v    {_words(frame.heading)} in the palm's frame, cross-finger axis w {_words(frame.cross)}",
-        f"hand centre  {_words(frame.center)} m, opening {100 * frame.opening:.1f} cm: objects x {hand.object_scale:g}",
+        f"heading v    {_text(frame.heading)} in the palm's frame, cross-finger axis w {_text(frame.cross)}",
+        f"hand centre  {_text(frame.center)} m, opening {100 * frame.opening:.1f} cm: objects x {hand.object_scale:g}",
         "",
         "joint                     from      to    open  closed      kp      kv   limit",
     ]
@@ -108,11 +108,13 @@ def describe(proposal: Proposal) -> list[str]:
     return [*lines, "rad, N.m/rad, N.m.s/rad, N.m", *(f"note: {note}" for note in proposal.notes)]
 
 
-def _words(vector: np.ndarray) -> str:
+def _text(vector: np.ndarray) -> str:
+    """A vector (3,) with three digits."""
     return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
 
 
 def _model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
+    """The file as MuJoCo compiles it, without meshes that are missing."""
     if path.suffix.lower() not in (".xml", ".urdf", ".mjcf"):
         raise CongraspError(f"{path} is neither URDF nor MJCF.", "Name a file that ends in .urdf or .xml.")
     if not path.is_file():
@@ -135,19 +137,23 @@ def _model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
 
 
 def _found(path: pathlib.Path, spec: mujoco.MjSpec, file: str) -> bool:
+    """Whether a mesh file is where the model says, or beside it."""
     folder = path.parent / (spec.compiler.meshdir or "")
     return (folder / file).exists() or (folder / pathlib.Path(file).name).exists()
 
 
 def _name(model: mujoco.MjModel, body: int) -> str:
+    """A body's name as an identifier."""
     return re.sub(r"\W+", "_", model.body(body).name) or f"body_{body}"
 
 
 def _joint_name(model: mujoco.MjModel, j: int) -> str:
+    """A joint's name as an identifier."""
     return re.sub(r"\W+", "_", model.joint(j).name) or f"joint_{j}"
 
 
 def _hinges(model: mujoco.MjModel, body: int) -> list[int]:
+    """Indices of a body's joints."""
     start, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
     return list(range(start, start + count))
 
@@ -286,7 +292,7 @@ def _motor(model: mujoco.MjModel, j: int) -> tuple[float, float]:
 
 
 def _surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """World points on what collides of a body, or on what is seen of it if nothing collides."""
+    """World points on what collides of a body, or on what is drawn of it if nothing collides."""
     mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
     solid = [g for g in mine if model.geom_contype[g] | model.geom_conaffinity[g]] or mine
     found = []

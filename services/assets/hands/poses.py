@@ -7,7 +7,7 @@ import numpy as np
 
 from common.errors import CongraspError
 from common.hands.spec import Hand, Link, chain_of, wrist_gains
-from services.record.poses import link_poses
+from services.assets.hands.kinematics import mujoco_link_poses
 
 _ALIKE = 0.3  # a range is as long on both sides if its middle is nearer to zero than this share of it
 _TOWARDS = 0.5  # a thumb's joint closes if at least this share of its tip's motion leads to the fingers
@@ -30,7 +30,7 @@ def thumb_of(links: list[Link], tips: list[str], wanted: str) -> str:
     return tips[int(np.argmax(apart))]
 
 
-def posed(hand: Hand) -> Hand:
+def propose_poses(hand: Hand) -> Hand:
     """The hand with an open and a closed pose.
 
     A joint closes towards the longer side of its range. Where the sides are much alike, a finger's joint spreads and
@@ -44,6 +44,7 @@ def posed(hand: Hand) -> Hand:
     way = np.where(both, 0.0, np.sign(hand.upper + hand.lower))
 
     def closing() -> np.ndarray:
+        """(F,) the closed pose by the present ways of closing."""
         ends = np.where(way > 0, hand.upper, hand.lower)
         return np.where(way != 0, flat + _CLOSED * (ends - flat), flat)
 
@@ -59,6 +60,7 @@ def posed(hand: Hand) -> Hand:
     names = [joint.name for joint in hand.joints]
 
     def pose(q: np.ndarray) -> dict[str, float]:
+        """Angles (F,) by the names of their joints, without zeros."""
         q = np.clip(q.round(3), hand.lower, hand.upper)
         return {name: round(float(x), 6) for name, x in zip(names, q, strict=True) if x}
 
@@ -67,7 +69,7 @@ def posed(hand: Hand) -> Hand:
 
 def _tips(hand: Hand, q: np.ndarray) -> np.ndarray:
     """(tips, 3) in the wrist frame, thumb first."""
-    position, quaternion = link_poses(hand, q)
+    position, quaternion = mujoco_link_poses(hand, q)
     found = []
     for i in hand.tip_links:
         link, turn = hand.links[i], np.empty(9)

@@ -1,4 +1,4 @@
-"""Which part of an object may be grasped: new partitions of its surface into O+ and O-.
+"""Which part of an object may be grasped: new partitions into graspable region and avoid region (paper: O+, O-).
 
 From a mesh of one part, from painted vertices, from a half-space, or from points that were touched. All of them label
 the object's surface points; nothing else about the object changes.
@@ -7,7 +7,6 @@ the object's surface points; nothing else about the object changes.
 import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -15,10 +14,10 @@ from scipy.spatial import cKDTree
 
 from common.errors import CongraspError
 from common.objects.spec import GraspObject
-from services.assets.objects.sources import read_mesh
+from services.assets.objects.sources import load_geometry, read_mesh
 
 LEAST_SHARE = 0.10
-"""Least share of the surface that O+ must have (paper, section Constraint Setup)."""
+"""Least share of the surface that the graspable region must have (paper, section Constraint Setup)."""
 _ON_PART = 0.003  # m; a surface point this near to a part's mesh belongs to the part
 _SAME_BOX = 0.1  # share of an object's length by which the bounding box of its painted file may be off
 _COLOUR_TOLERANCE = 60  # largest distance of two colours in RGB that count as one
@@ -33,11 +32,11 @@ def relabelled(
       obj: the object.
       labels: (512,) part of each of its surface points.
       names: of the parts.
-      graspable: which of them form O+.
+      graspable: which of them form the graspable region.
       name: of the new object, if it is to have another.
 
     Raises:
-      CongraspError: O+ has less than a tenth of the surface.
+      CongraspError: the graspable region has less than a tenth of the surface.
     """
     labels = np.asarray(labels, np.int32)
     share = float(np.asarray(graspable, bool)[labels].mean())
@@ -65,10 +64,10 @@ def relabelled(
 
 
 def two_parts(
-    obj: GraspObject, plus: np.ndarray, name: str = "", words: Sequence[str] = ("grasp", "avoid")
+    obj: GraspObject, graspable: np.ndarray, name: str = "", words: Sequence[str] = ("grasp", "avoid")
 ) -> GraspObject:
-    """The object with the surface points `plus` (512,) bool as O+, and the others as O-."""
-    return relabelled(obj, np.where(plus, 0, 1), words, (True, False), name)
+    """The object with the surface points `graspable` (512,) bool, and the others to avoid."""
+    return relabelled(obj, np.where(graspable, 0, 1), words, (True, False), name)
 
 
 def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> np.ndarray:
@@ -118,11 +117,7 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
     """
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Check the path.")
-    try:
-        mesh: Any = trimesh.load(path, process=False)
-    except Exception as error:  # the readers raise whatever they stumble over
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise CongraspError(f"{path} cannot be read: {reason}.", "Export it as PLY with coloured vertices.") from None
+    mesh = load_geometry(path, "Export it as PLY with coloured vertices.")
     visual = getattr(mesh, "visual", None)
     colours = getattr(visual, "vertex_colors", None) if getattr(visual, "kind", None) == "vertex" else None
     if colours is None and isinstance(mesh, trimesh.PointCloud):

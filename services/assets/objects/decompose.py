@@ -30,7 +30,7 @@ class Decomposition(NamedTuple):
     method: str
     """"convex", "coacd", "vhacd" or "hull"."""
     notes: list[str]
-    """What the user should know, in words."""
+    """What the user should know."""
 
 
 def decompose(
@@ -70,6 +70,7 @@ def merge(pieces: list[np.ndarray], max_pieces: int) -> list[np.ndarray]:
     joint: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
 
     def consider(i: int, j: int) -> None:
+        """Notes what joining two parts adds in volume."""
         hull = hull_of(np.concatenate([parts[i], parts[j]]))
         joint[i, j] = (hull.volume - volumes[i] - volumes[j], hull.points[hull.vertices])
 

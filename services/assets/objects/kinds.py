@@ -1,4 +1,4 @@
-"""What kind of file something is, by its content: names lie, and a wrong one should not be the end."""
+"""The kind of a mesh file by its content, whatever its name says; what is no mesh is refused with a remedy."""
 
 import pathlib
 import zipfile
@@ -60,6 +60,7 @@ def kind_of(path: pathlib.Path) -> str:
 
 
 def _supported(start: bytes, size: int) -> str | None:
+    """The suffix of a mesh file with this beginning and size in bytes, if it is one."""
     if start.startswith(b"glTF"):
         return ".glb"
     if start.startswith(b"ply"):
@@ -76,6 +77,7 @@ def _supported(start: bytes, size: int) -> str | None:
 
 
 def _inside(path: pathlib.Path) -> str:
+    """What a zip archive holds, for an error's text."""
     try:
         names = [name for name in zipfile.ZipFile(path).namelist() if name.lower().endswith(SUFFIXES)]
     except (OSError, zipfile.BadZipFile):

@@ -1,4 +1,4 @@
-"""Import of meshes: from files to a `GraspObject`, with every complaint in one line."""
+"""Import of meshes: from files to a `GraspObject`."""
 
 import dataclasses
 import hashlib
@@ -14,92 +14,49 @@ from common.errors import CongraspError
 from common.objects import shapes, store
 from common.objects.procedural import MASS_RANGE
 from common.objects.resting import rest_poses
-from common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
+from common.objects.spec import GraspObject, Piece
 from common.objects.surface import halves, mass_properties, sample_mesh
 from services.assets.objects import decompose, repair
-from services.assets.objects.sizes import Unit, metres_per_unit
-from services.assets.objects.sources import MeshFile, Source, find_sources, read_mesh
+from services.assets.objects.options import ImportOptions, check_options
+from services.assets.objects.sizes import metres_per_unit
+from services.assets.objects.sources import MeshFile, Source, read_mesh
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""
 _CACHE_VERSION = 3
-_MAX_FACES = 20_000
 
 
-@dataclasses.dataclass(frozen=True)
-class ImportOptions:
-    """How meshes become objects; the string under a field is its help on the command line."""
-
-    unit: Unit = "auto"
-    """Unit of the files' numbers; auto takes metres if that makes an object of 1 to 60 cm, and asks otherwise; guess
-    then takes the unit that fits, if only one does."""
-    scale: float = 1.0
-    """Factor on the size, after the unit."""
-    density: float = 500.0
-    """kg/m^3, for the mass where none is given; that mass is kept between 0.05 and 0.5 kg."""
-    mass: float | None = None
-    """Mass in kg."""
-    time_limit: float = 60.0
-    """Seconds for the convex decomposition (CoACD) of one mesh; V-HACD takes over after it."""
-    max_pieces: int = MAX_MESH_PIECES
-    """Most convex pieces of an object; more are merged."""
-    cache_dir: str = ""
-    """Folder that remembers finished imports; empty means the user's cache folder."""
-
-
-def import_paths(paths: Sequence[str | os.PathLike[str]], options: ImportOptions | None = None) -> list[GraspObject]:
-    """Imports everything that the paths hold; see `find_sources` for what they may be.
-
-    Raises:
-      CongraspError: a mesh cannot be used; the line names it, its fault and the remedy.
-    """
-    options = options or ImportOptions()
-    return [import_source(source, options)[0] for path in paths for source in find_sources(path)]
-
-
-def import_source(source: Source, options: ImportOptions) -> tuple[GraspObject, list[str]]:
-    """Imports one object.
+def import_source(source: Source, options: ImportOptions) -> GraspObject:
+    """Imports one object, or takes it from the cache of finished imports; its `notes` say what the user should know.
 
     Its origin moves to the centre of mass; its orientation stays the file's. Parts come from part files; an object
     without them is labelled by its two halves, the slimmer one graspable.
 
-    Returns:
-      The object, and what the user should know about it.
-
     Raises:
-      CongraspError: see `import_paths`.
+      CongraspError: a mesh cannot be used; the line names it, its fault and the remedy.
     """
     check_options(options)
     key = _cache_key(source, options)
     cached = _cache_folder(options) / f"{key}{store.SUFFIX}"
     if cached.is_file():
         try:
-            obj = store.load(cached)
-            return obj, list(obj.notes)
+            return store.load(cached)
         except CongraspError:
             cached.unlink()
-    notes: list[str] = []
-    obj = _build(source, options, int(key, 16), notes)
+    obj = _build(source, options, int(key, 16))
     store.save(obj, cached)
-    return obj, notes
-
-
-def check_options(options: ImportOptions) -> None:
-    """Raises a CongraspError for numbers that are not positive."""
-    for name in ("scale", "density", "time_limit", "max_pieces"):
-        if not getattr(options, name) > 0:
-            raise CongraspError(f"--{name.replace('_', '-')} is {getattr(options, name)}.", "It must be positive.")
-    if options.mass is not None and not options.mass > 0:
-        raise CongraspError(f"--mass is {options.mass}.", "It must be positive, in kilograms.")
+    return obj
 
 
 def _cache_folder(options: ImportOptions) -> pathlib.Path:
+    """Where finished imports are kept."""
     if options.cache_dir:
         return pathlib.Path(options.cache_dir)
     return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "objects"
 
 
 def _cache_key(source: Source, options: ImportOptions) -> str:
+    """24 hex digits of everything that an import depends on."""
     settings = dataclasses.replace(options, cache_dir="")
     content = hashlib.sha256(f"{_CACHE_VERSION} {source.name} {settings}".encode())
     for file in source.files():
@@ -108,7 +65,9 @@ def _cache_key(source: Source, options: ImportOptions) -> str:
     return content.hexdigest()[:24]
 
 
-def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) -> GraspObject:
+def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
+    """The object of a source; the seed draws its surface points."""
+    notes: list[str] = []
     visuals = [read_mesh(file.path, notes) for file in source.visuals] or [
         shapes.triangulate(_corners(file)) for file in source.pieces
     ]
@@ -144,7 +103,7 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
             dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
             for piece, vote in zip(pieces, votes, strict=True)
         )
-    picture = _reduced(whole)
+    picture = repair.with_few_faces(whole)
     obj = GraspObject(
         name=source.name,
         family="imported",
@@ -167,21 +126,19 @@ def _build(source: Source, options: ImportOptions, seed: int, notes: list[str]) 
 
 
 def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Several meshes as one, faces in their order."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
     return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)
 
 
-def _reduced(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with at most `_MAX_FACES` faces."""
-    return mesh if len(mesh.faces) <= _MAX_FACES else mesh.simplify_quadric_decimation(face_count=_MAX_FACES)
-
-
 def _corners(file: MeshFile) -> np.ndarray:
+    """(V, 3) vertices of a file."""
     return np.asarray(read_mesh(file.path).vertices, np.float64)
 
 
 def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
+    """A mesh in metres that faces outwards."""
     mesh = mesh.copy()
     mesh.apply_scale(factor)
     if mesh.volume < 0:
@@ -209,7 +166,7 @@ def _pieces(
             limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
             groups = []
             for mesh, limit in zip(meshes, limits, strict=True):
-                small = _reduced(mesh)
+                small = repair.with_few_faces(mesh)
                 found = decompose.decompose(
                     np.asarray(small.vertices),
                     np.asarray(small.faces),
@@ -261,6 +218,7 @@ def _weigh(
 
 
 def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
+    """A convex piece of vertices (V, 3) around its own middle, relative to the centre of mass."""
     middle = hull.mean(0)
     return Piece("mesh", (0.0, 0.0, 0.0), tuple((middle - center).tolist()), vertices=hull - middle, part=part)
 

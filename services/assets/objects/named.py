@@ -1,54 +1,107 @@
-"""Objects that a user points to: folders of object files, object files, and meshes to import."""
+"""Objects that a user points to: object files, folders of them, meshes to import, names, and seeds of the generator."""
 
 import logging
 import pathlib
 from collections.abc import Callable
+from typing import NamedTuple
 
 from common.errors import CongraspError
 from common.objects import store
+from common.objects.procedural import generate
 from common.objects.spec import GraspObject
-from services.assets.objects.meshes import ImportOptions, import_source
-from services.assets.objects.sources import find_sources
+from services.assets.objects.meshes import import_source
+from services.assets.objects.options import ImportOptions
+from services.assets.objects.sources import SUFFIXES, Source, find_sources
 
 _log = logging.getLogger(__name__)
+_METRES_OR_ASK = ImportOptions()
+
+
+class ObjectAt(NamedTuple):
+    """An object that a path holds, read or imported only when it is wanted."""
+
+    name: str
+    path: pathlib.Path
+    source: Source | None
+    """Its meshes; None for an object file."""
+
+    def load(self, options: ImportOptions = _METRES_OR_ASK) -> GraspObject:
+        """The object; an object file is taken as it is.
+
+        Raises:
+          CongraspError: it cannot be read or imported.
+        """
+        return import_source(self.source, options) if self.source else store.load(self.path)
+
+
+def objects_at(path: pathlib.Path) -> list[ObjectAt]:
+    """What a path holds: an object file, the object files of a folder, or else meshes (see `find_sources`).
+
+    Raises:
+      CongraspError: there is nothing of the kind.
+    """
+    files = [path] if path.suffix == store.SUFFIX else sorted(path.glob(f"*{store.SUFFIX}"))
+    if files:
+        return [ObjectAt(file.stem, file, None) for file in files]
+    return [ObjectAt(source.name, source.path, source) for source in find_sources(path)]
 
 
 def objects_of(
-    path: pathlib.Path, track: Callable[[str, int | None], Callable[[int], None]] | None = None
+    path: pathlib.Path,
+    options: ImportOptions = _METRES_OR_ASK,
+    *,
+    track: Callable[[str, int | None], Callable[[int], None]] | None = None,
 ) -> list[GraspObject]:
-    """Every object of a path, which is what 'congrasp objects import' made or what it takes.
+    """Every object of a path; what an import has to say goes to the log.
 
     Args:
-      path: a folder of object files or one of them; or meshes, see `services.assets.objects.sources.find_sources`.
+      path: see `objects_at`.
+      options: how meshes become objects.
       track: (what is done, how much) -> what is told how much is done; import may take long.
 
     Raises:
       CongraspError: there is nothing of the kind, or it cannot be read or imported.
     """
-    files = [path] if path.suffix == store.SUFFIX else sorted(path.glob(f"*{store.SUFFIX}"))
-    if files:
-        return [store.load(file) for file in files]
-    sources = find_sources(path)
-    advance = track("Importing objects", len(sources)) if track else lambda done: None
+    found = objects_at(path)
+    advance = track("Importing objects", len(found)) if track and found[0].source else lambda done: None
     objects = []
-    for source in sources:
-        obj, notes = import_source(source, ImportOptions())
-        for note in notes:
-            _log.warning("%s: %s", source.name, note)
+    for one in found:
+        obj = one.load(options)
+        for note in obj.notes if one.source else ():
+            _log.warning("%s: %s", one.name, note)
         objects.append(obj)
         advance(len(objects))
     return objects
 
 
-def one_object(path: pathlib.Path, options: ImportOptions) -> GraspObject:
-    """The one object of a path; see `objects_of`.
+def one_object(path: pathlib.Path, options: ImportOptions = _METRES_OR_ASK) -> GraspObject:
+    """The one object of a path; see `objects_at`.
 
     Raises:
       CongraspError: there is none or there are several, or it cannot be imported.
     """
-    if path.suffix == store.SUFFIX:
-        return store.load(path)
-    sources = find_sources(path)
-    if len(sources) > 1:
-        raise CongraspError(f"{path} holds {len(sources)} objects.", "Name one of them.")
-    return import_source(sources[0], options)[0]
+    found = objects_at(path)
+    if len(found) > 1:
+        raise CongraspError(f"{path} holds {len(found)} objects.", "Name one of them.")
+    return found[0].load(options)
+
+
+def find_object(text: str, folder: str = "objects") -> GraspObject:
+    """The object that a user means: an object file, a mesh, FAMILY:SEED, or a name in a folder.
+
+    Raises:
+      CongraspError: there is no such object.
+    """
+    path = pathlib.Path(text)
+    if path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or path.is_dir():
+        return one_object(path)
+    family, colon, seed = text.partition(":")
+    if colon and seed.isdigit():
+        return generate(int(seed), family)
+    catalogue = store.Catalogue(folder)
+    if not catalogue.path(text).is_file():
+        raise CongraspError(
+            f"There is no object '{text}' in {folder}.",
+            "Name an object of the folder, an object file, a mesh, or FAMILY:SEED such as mug:7.",
+        )
+    return catalogue.get(text)

@@ -37,10 +37,14 @@ def reduced(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[
     _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
     vertices, faces = vertices[first], merged.reshape(-1)[faces]
     proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    mesh = trimesh.Trimesh(vertices, faces[proper], process=False)
-    small = mesh.simplify_quadric_decimation(face_count=MAX_FACES)
+    small = with_few_faces(trimesh.Trimesh(vertices, faces[proper], process=False))
     notes.append(f"its {before:,} triangles were reduced to {len(small.faces):,}: a hand does not feel the rest")
     return np.asarray(small.vertices), np.asarray(small.faces)
+
+
+def with_few_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with at most `MAX_FACES` triangles."""
+    return mesh if len(mesh.faces) <= MAX_FACES else mesh.simplify_quadric_decimation(face_count=MAX_FACES)
 
 
 def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
@@ -73,6 +77,7 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 
 def _components(faces: np.ndarray, count: int) -> tuple[int, np.ndarray]:
+    """Connected components of triangles (F, 3) over `count` vertices: their number, and that of each vertex."""
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (count, count))
     number, labels = connected_components(graph, directed=False)
@@ -171,4 +176,5 @@ def _wound_alike(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _was(count: int) -> str:
+    """The verb for so many."""
     return "was" if count == 1 else "were"

@@ -1,4 +1,4 @@
-"""Sizes: what the numbers of a mesh file mean in metres, and how long that is in words."""
+"""Sizes: what the numbers of a mesh file mean in metres, and how long that is compared with common things."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -14,7 +14,7 @@ _PLAUSIBLE = (0.01, 0.6)  # m, longest side of what is taken as metres without a
 _POSSIBLE = (0.005, 1.0)  # m, of what a unit that was named may lead to
 _LIKELY = (0.02, 0.4)  # m, of what makes a unit worth proposing
 _THINNEST = 2e-4  # m
-_THINGS = (
+_COMMON = (
     (0.015, "a pea"),
     (0.03, "a grape"),
     (0.05, "a walnut"),
@@ -79,7 +79,7 @@ def length(metres: float) -> str:
 
 
 def size_in_words(sides: Sequence[float] | np.ndarray) -> str:
-    """Three sides in metres, and a thing about as long."""
+    """Three sides, given in metres, in cm, and something about as long."""
     longest = max(sides)
-    thing = next((name for limit, name in _THINGS if longest < limit), "an arm")
-    return f"{' x '.join(f'{100 * side:.1f}' for side in sides)} cm, about as long as {thing}"
+    like = next((name for limit, name in _COMMON if longest < limit), "an arm")
+    return f"{' x '.join(f'{100 * side:.1f}' for side in sides)} cm, about as long as {like}"

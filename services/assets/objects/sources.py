@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import pathlib
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -67,7 +67,7 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
     """
     path = pathlib.Path(path)
     if path.is_file():
-        return [Source(_name(path.stem), path, (MeshFile(path, "visual"),))]
+        return [Source(safe_name(path.stem), path, (MeshFile(path, "visual"),))]
     if not path.is_dir():
         raise CongraspError(f"There is no file or folder {path}.", "Check the path.")
     meshes = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
@@ -115,13 +115,28 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Tri
     return mesh
 
 
+def load_geometry(path: pathlib.Path, remedy: str, **options: Any) -> Any:
+    """What trimesh finds in a file, be it a mesh or a point cloud, as it is.
+
+    Raises:
+      CongraspError: it cannot be read; the line ends with the remedy.
+    """
+    try:
+        return trimesh.load(path, process=False, **options)
+    except Exception as error:  # the readers raise whatever they stumble over
+        reason = (str(error) or type(error).__name__).splitlines()[0].rstrip(" .!")
+        raise CongraspError(f"{path} cannot be read: {reason}.", remedy) from None
+
+
 def _nested(folder: pathlib.Path) -> list[Source]:
+    """The objects of a folder's own meshes; those of folders below it do not count."""
     meshes = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
     return _in_folder(folder, meshes) if meshes else []
 
 
 def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]:
-    name = _name(folder.resolve().name)
+    """The objects of a folder with these meshes."""
+    name = safe_name(folder.resolve().name)
     two = _two_parts(meshes)
     if two:
         return [Source(name, folder, two, (), two)]
@@ -130,7 +145,7 @@ def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]
     main = next((file for file in others if all(o.stem.startswith(file.stem) for o in others)), None)
     if others and main is None:
         if not pieces:
-            return [Source(_name(file.stem), file, (MeshFile(file, "visual"),)) for file in others]
+            return [Source(safe_name(file.stem), file, (MeshFile(file, "visual"),)) for file in others]
         raise CongraspError(
             f"The folder {folder} has contact pieces, but it is not clear which mesh shows the whole object.",
             f"Name it {name}{others[0].suffix} and its parts {name}_<part>{others[0].suffix}.",
@@ -141,6 +156,7 @@ def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]
 
 
 def _part(file: pathlib.Path, part: str) -> MeshFile:
+    """The file of a part, graspable where its name is that of a handle."""
     return MeshFile(file, "part", part, any(word in part.lower() for word in _GRASPABLE_WORDS))
 
 
@@ -161,7 +177,7 @@ def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
     return tuple(MeshFile(found[key], "part", names[key], key) for key in (True, False) if key in found)
 
 
-def _name(text: str) -> str:
-    """A name that can be a file name."""
+def safe_name(text: str) -> str:
+    """A text as the name of an object, which can be a file name."""
     safe = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in text).lstrip("._-")
     return safe or "object"

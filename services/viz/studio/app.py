@@ -1,4 +1,4 @@
-"""Puts a studio together from what the command was given, and takes it apart again."""
+"""Opens a studio with the policies, objects and runs that the command names, and closes it again."""
 
 import contextlib
 import functools
@@ -7,15 +7,15 @@ import threading
 from collections.abc import Callable, Iterator
 
 from common.errors import CongraspError
-from common.objects import procedural, store
+from common.objects import procedural
 from common.objects.pool import HELD_OUT_SEED
 from common.objects.spec import GraspObject
 from common.policy.pretrained import policy_file, shipped_hands
 from common.transport import urls
 from common.transport.base import Transport
 from common.transport.security import check_exposure
-from services.assets.objects.meshes import ImportOptions, import_source
-from services.assets.objects.sources import find_sources
+from services.assets.objects.named import objects_at, one_object
+from services.assets.objects.options import ImportOptions
 from services.ops.logs import log
 from services.serve.server import follow_file, follow_run
 from services.viz.studio.grasping import PolicyGrasping
@@ -63,7 +63,7 @@ def open_view(
         elif policy is not None:
             hands = {"of the policy": functools.partial(PolicyGrasping, follow_file(policy), policy.name)}
         else:
-            hands = _shipped()
+            hands = _pretrained()
         session = Session(hands, catalogue(objects), take_mesh, window, Recordings(recordings) if recordings else None)
         stack.callback(session.close)
         server = PageServer(session.gets, session.posts, host, port)
@@ -81,13 +81,14 @@ def _of_run(
             pulling = stack.enter_context(urls.connect(connect, "server", certs=certs))
         except CongraspError as error:
             log("warning", f"{error} Until then the studio grasps with the policies that come with congrasp.")
-            return _shipped()
+            return _pretrained()
     return {"of the run": functools.partial(PolicyGrasping, follow_run(pulling, run), f"the run '{run}'")}
 
 
-def _shipped() -> dict[str, Callable[[], PolicyGrasping]]:
+def _pretrained() -> dict[str, Callable[[], PolicyGrasping]]:
+    """The policies that come with the package, by the names of their hands."""
     return {
-        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "shipped policy")
+        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
         for name in shipped_hands()
     }
 
@@ -100,10 +101,7 @@ def catalogue(objects: pathlib.Path | None) -> Catalogue:
     """
     makers: dict[str, Callable[[], GraspObject]] = {}
     if objects is not None:
-        files = [objects] if objects.suffix == store.SUFFIX else sorted(objects.glob(f"*{store.SUFFIX}"))
-        makers |= {file.name.removesuffix(store.SUFFIX): functools.partial(store.load, file) for file in files}
-        for source in [] if files else find_sources(objects):
-            makers[source.name] = functools.partial(lambda source: import_source(source, _GUESS)[0], source)
+        makers |= {found.name: functools.partial(found.load, _GUESS) for found in objects_at(objects)}
     families = sorted(procedural.FAMILIES, key=lambda family: family != _FIRST)
     makers |= {family: functools.partial(procedural.generate, HELD_OUT_SEED, family) for family in families}
     return Catalogue(makers)
@@ -111,7 +109,8 @@ def catalogue(objects: pathlib.Path | None) -> Catalogue:
 
 def take_mesh(path: pathlib.Path) -> tuple[GraspObject, list[str]]:
     """Imports one mesh; what the user should know about it comes with it."""
-    return import_source(find_sources(path)[0], _GUESS)
+    obj = one_object(path, _GUESS)
+    return obj, list(obj.notes)
 
 
 def _read(window: TrainingWindow, recordings: pathlib.Path) -> None:
@@ -119,6 +118,7 @@ def _read(window: TrainingWindow, recordings: pathlib.Path) -> None:
     Recordings(recordings).check()
 
     def work() -> None:
+        """Reads them all."""
         try:
             window.load(recordings)
         except CongraspError as error:

@@ -40,6 +40,7 @@ class Canvas:
             raise CongraspError(f"The brush has a radius of {radius} m.", "Choose 1 mm to 20 cm.")
 
         def brushed(places: np.ndarray, before: np.ndarray) -> np.ndarray:
+            """What is painted of some places after a stroke."""
             squared = ((places[:, None] - strokes[None]) ** 2).sum(-1).min(-1, initial=np.inf)
             return np.where(squared <= radius**2, minus, before)
 
@@ -55,6 +56,7 @@ class Canvas:
         self._set(minus, minus[cKDTree(self._obj.points).query(self.vertices)[1]])
 
     def _set(self, minus: np.ndarray, shown: np.ndarray) -> None:
+        """Takes new paint."""
         self.minus, self.shown, self.version = minus, shown, next(_versions)
 
 

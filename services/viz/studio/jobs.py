@@ -1,4 +1,4 @@
-"""Work that takes longer than a click: one at a time, with words about how far it is."""
+"""Work that takes longer than a click: one job at a time, with its progress."""
 
 import threading
 from collections.abc import Callable
@@ -46,21 +46,24 @@ class Jobs:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _run(self, work: Callable[[Progress], str | None]) -> None:
+        """Runs a job to its end and notes how it ended."""
         error, made = "", None
         try:
             made = work(self._progress)
         except CongraspError as found:
             error = str(found)
-        except Exception as found:  # whatever goes wrong in a job, the page is told and the studio goes on
+        except Exception as found:  # whatever goes wrong in a job, the page shows it and the studio continues
             error = f"This went wrong and is a fault of congrasp: {type(found).__name__}: {found}."
             log("error", error)
         with self._lock:
             self._state |= {"running": False, "share": 1.0, "error": error, "made": made}
 
     def _progress(self, text: str, share: float) -> None:
+        """Notes how far the job is."""
         with self._lock:
             self._state |= {"text": text, "share": min(1.0, max(0.0, share))}
 
 
 def _state(number: int, *, running: bool = True, text: str = "") -> dict[str, Any]:
+    """A job's state at its start."""
     return {"number": number, "running": running, "text": text, "share": 0.0, "error": "", "made": None}

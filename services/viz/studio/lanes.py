@@ -10,8 +10,8 @@ from common.hands import get_hand
 from common.task.constraints import CONSTRAINTS
 from common.task.constraints.base import ErrorSpec
 from common.wire.codec import Message
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.goals import active_blocks, active_constraints
-from services.record.poses import link_poses
 
 TOUCH = 0.05
 """Newtons from which a link counts as touching."""
@@ -81,7 +81,7 @@ def for_page(episode: Message) -> Message:
         arrays |= {f"lane/{name}/{unit}": np.asarray(value, np.float32) for unit, value in lane.errors.items()}
     if "pose" in active_constraints(episode.arrays):
         hand, turn = get_hand(str(episode.meta["hand"])), _turn(episode.arrays["goal/pose_quaternion"])
-        position, quaternion = link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
+        position, quaternion = mujoco_link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
         arrays["ghost_position"] = (turn.apply(position) + episode.arrays["goal/pose_position"]).astype(np.float32)
         arrays["ghost_quaternion"] = (turn * _turn(quaternion)).as_quat(scalar_first=True).astype(np.float32)
     words = {name: lane.words for name, lane in found.items()}

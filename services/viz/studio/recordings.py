@@ -1,4 +1,4 @@
-"""Episodes of a moment, from a run's MCAP files."""
+"""Episodes around a time, from a run's MCAP files."""
 
 import pathlib
 import threading
@@ -9,13 +9,13 @@ from mcap.reader import make_reader
 
 from common.errors import CongraspError
 from common.wire.codec import Message, decode
-from services.record.reader import is_complete, log_files, read_records
+from services.record.reader import is_complete, is_episode, log_files, read_records
 from services.record.scene import EPISODE_SCHEMA
 
 MOST = 60
-"""Episodes that one search finds at most; the nearest to the moment."""
+"""Episodes that one search finds at most; the nearest to the time."""
 FARTHER = (1.0, 5.0, 25.0)
-"""Factors by which it is looked farther where there is no episode."""
+"""Factors on the time searched, tried in turn until there is an episode."""
 
 
 class Recordings:
@@ -40,10 +40,10 @@ class Recordings:
 
         Args:
           time: seconds since 1970.
-          seconds: how far from it they may be; where there are none, it is looked farther away.
+          seconds: how far from it they may be; the search widens where there are none.
 
         Returns:
-          How far it was looked, and for each episode what a list shows of it; its `id` is for `episode`.
+          How far the search went, and for each episode what a list shows of it; its `id` is for `episode`.
 
         Raises:
           CongraspError: there are no recordings.
@@ -72,12 +72,8 @@ class Recordings:
             return self._found[key]
 
 
-def is_episode(topic: str) -> bool:
-    """Whether a topic is that of an actor's whole episodes."""
-    return topic.startswith("/episode/") and topic.endswith("/raw")
-
-
 def _row(key: str, message: Message) -> dict[str, Any]:
+    """What a list shows of an episode."""
     time, _, topic = key.partition("/")
     return {
         "id": key,

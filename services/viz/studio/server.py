@@ -1,4 +1,4 @@
-"""Offers a studio over HTTP to browsers on this machine: files, JSON, and messages of arrays."""
+"""Serves a studio over HTTP to browsers on this machine: files, JSON, and messages of arrays."""
 
 import http.server
 import json
@@ -121,7 +121,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         raise NotImplementedError
 
     def do_GET(self) -> None:
-        path, query = self._asked()
+        """Answers by a route, or with a file."""
+        path, query = self._route()
         if self._refused():
             return
         if path in self.routes[0]:
@@ -130,12 +131,13 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._file("index.html" if path == "/" else path.removeprefix("/static/"))
 
     def do_POST(self) -> None:
-        path, query = self._asked()
+        """Answers by a route."""
+        path, query = self._route()
         length = int(self.headers.get("Content-Length") or -1)
         if not 0 <= length <= MOST_BYTES:
             self.close_connection = True
-            words = "The request says no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
-            self._send(413, "application/json", json.dumps({"error": words}).encode())
+            message = "The request says no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
+            self._send(413, "application/json", json.dumps({"error": message}).encode())
             return
         body = self.rfile.read(length)
         # What a form of another site can send has none of these types.
@@ -150,17 +152,20 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not logged."""
 
-    def _asked(self) -> tuple[str, dict[str, str]]:
+    def _route(self) -> tuple[str, dict[str, str]]:
+        """Path and query parameters of the request."""
         parts = urllib.parse.urlsplit(self.path)
         return parts.path, dict(urllib.parse.parse_qsl(parts.query))
 
     def _refused(self, more: bool = False) -> bool:
+        """Sends a refusal if the request is not allowed; whether it did."""
         if not more and self.allowed():
             return False
         self._send(403, "application/json", b'{"error": "This page answers only to itself."}')
         return True
 
     def _file(self, name: str) -> None:
+        """Sends a file of the page."""
         file = STATIC / name
         if "/" in name or file.suffix not in _TYPES or not file.is_file():
             self._send(404, "text/plain", b"There is nothing of this name.")
@@ -168,15 +173,16 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self._send(200, _TYPES[file.suffix], file.read_bytes())
 
     def _answer(self, work: Callable[[], Answer]) -> None:
+        """Sends what `work` returns, or its error."""
         try:
             found = work()
         except (CongraspError, TransportError) as error:
             self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
             return
-        except Exception as error:  # whatever a page asks for, the server goes on
+        except Exception as error:  # whatever a page asks for, the server continues
             log("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
-            words = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
-            self._send(500, "application/json", json.dumps({"error": words}).encode())
+            message = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
+            self._send(500, "application/json", json.dumps({"error": message}).encode())
             return
         if isinstance(found, Message):
             self._send(200, "application/octet-stream", encode(found))
@@ -188,6 +194,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._send(200, "application/json", json.dumps(found, allow_nan=False).encode())
 
     def _send(self, code: int, kind: str, data: bytes, more: Mapping[str, str] | None = None) -> None:
+        """Sends a whole answer."""
         self.send_response(code)
         headers = {
             "Content-Type": kind,

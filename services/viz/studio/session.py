@@ -17,8 +17,8 @@ from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.wire.codec import Message
-from services.export.motion import FORMATS, export_motions
 from services.export.motion_file import hand_arrays, motion_of_episode, save_motion
+from services.export.motion_formats import FORMATS, export_motions
 from services.record.channels import JsonChannels
 from services.record.scene import episode_entries
 from services.record.writer import LogWriter

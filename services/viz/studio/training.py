@@ -1,6 +1,6 @@
 """What is known of a run while it trains: curves, events, the ledger, and every actor's newest episode.
 
-Fed with log messages and with the learner's status, by whoever receives them; it knows no network and no browser.
+It takes log messages and the learner's status from whoever receives them; it knows no network and no browser.
 """
 
 import bisect
@@ -22,8 +22,7 @@ from common.transport.keys import Keys
 from common.wire.codec import Message, decode
 from services.ops import status as statuses
 from services.record.channels import flatten
-from services.record.reader import Record, log_files, read_records
-from services.viz.studio.recordings import is_episode
+from services.record.reader import Record, is_episode, log_files, read_records
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows first."""
@@ -191,6 +190,7 @@ class TrainingWindow:
             }
 
     def _metrics(self, role: str, name: str, meta: Mapping[str, Any], now: float) -> None:
+        """Adds the numbers of a learner's update or of an actor's rollout."""
         when = float(meta.get("time", now))
         values = {key: float(value) for key, value in meta["values"].items()}
         if role == "actor":
@@ -205,6 +205,7 @@ class TrainingWindow:
                 self._curves.setdefault(key, Curve()).add(step, value, when)
 
     def _episode(self, name: str, message: Message, now: float) -> None:
+        """Keeps an actor's newest episode."""
         if "link_position" not in message.arrays or "success" not in message.meta:
             raise ValueError("not an episode")
         actor = self._actors.setdefault(name, Actor(now))
@@ -212,6 +213,7 @@ class TrainingWindow:
         actor.recent.append(bool(message.meta["success"]))
 
     def _row(self, name: str, role: Mapping[str, Any] | None) -> dict[str, Any]:
+        """What a list shows of an actor."""
         actor = self._actors[name]
         said = role or {}
         row: dict[str, Any] = {"id": name, "alive": role is not None, "episodes": actor.episodes}
@@ -244,12 +246,14 @@ class Follower:
             thread.join(2.0)
 
     def _receive(self) -> None:
+        """Takes log messages until it is told to stop."""
         while not self._stop.is_set():
             received = self._subscription.receive(0.5)
             if received is not None:
                 self._window.take(*received, time.time())
 
     def _ask(self) -> None:
+        """Asks the learner for its status, again and again."""
         while True:
             try:
                 found = statuses.ask(self._transport, self._window.run)

@@ -5,28 +5,27 @@ import json
 import pathlib
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any
 
 import numpy as np
-import pygltflib
 import pytest
+import trimesh
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands import get_hand
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.cli.main import main
-from services.export import bvh, frames, glb, lerobot, motion, ros2, urdf, usd
+from services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
 from services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
 from services.record.channels import Entry
 from services.record.entries import Converter
-from services.record.poses import link_poses
 from services.record.writer import LogWriter
 from tests.episodes import episode
 
 T = 7
 MODULES: dict[str, ModuleType] = {"glb": glb, "usd": usd, "bvh": bvh, "ros2": ros2, "lerobot": lerobot}
-FORMATS = list(motion.FORMATS)
+FORMATS = list(motion_formats.FORMATS)
 
 
 def posed(motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], seed: int) -> GraspMotion:
@@ -55,14 +54,14 @@ def posed(motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np
 @pytest.fixture(scope="module")
 def human() -> GraspMotion:
     hand = get_hand("human")
-    return posed(motion_of_episode(episode(T)), lambda q: link_poses(hand, q), 0)
+    return posed(motion_of_episode(episode(T)), lambda q: mujoco_link_poses(hand, q), 0)
 
 
 @pytest.fixture(scope="module")
 def robot(human: GraspMotion) -> GraspMotion:
     hand = get_hand("sharpa")
     arrays = dataclasses.replace(human, hand=hand.name, **hand_arrays(hand))
-    return posed(arrays, lambda q: link_poses(hand, q), 1)
+    return posed(arrays, lambda q: mujoco_link_poses(hand, q), 1)
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +103,8 @@ def odd_hand(human: GraspMotion) -> GraspMotion:
 
 
 def export(motions: Sequence[GraspMotion], kind: str, folder: pathlib.Path) -> tuple[pathlib.Path, float]:
-    path = folder / f"motion{motion.FORMATS[kind]}"
-    return path, motion.export_motions(motions, kind, path)
+    path = folder / f"motion{motion_formats.FORMATS[kind]}"
+    return path, motion_formats.export_motions(motions, kind, path)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -146,7 +145,7 @@ def test_a_file_that_is_off_is_not_kept(
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_a_single_moment_is_a_motion(human: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
+def test_a_single_frame_is_a_motion(human: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
     cut = {
         name: getattr(human, name)[:1]
         for name in vars(human)
@@ -155,7 +154,7 @@ def test_a_single_moment_is_a_motion(human: GraspMotion, kind: str, tmp_path: pa
     assert export([dataclasses.replace(human, **cut)], kind, tmp_path)[1] < 0.01
 
 
-def test_numbers_that_are_no_poses_are_refused_in_words(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_numbers_that_are_no_poses_are_refused(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     for name, value, words in (
         ("link_position", np.nan, "link_position has values that are not finite"),
         ("object_quaternion", 0.0, "object_quaternion has quaternions that are not of length one"),
@@ -168,30 +167,56 @@ def test_numbers_that_are_no_poses_are_refused_in_words(human: GraspMotion, tmp_
 
 def test_a_glb_is_y_up_for_others_and_names_its_units(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     path, _ = export([human], "glb", tmp_path)
-    file: Any = pygltflib.GLTF2().load(str(path))
-    (root,) = [file.nodes[i] for i in file.scenes[0].nodes]
-    np.testing.assert_allclose(Rotation.from_quat(root.rotation).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
-    assert root.extras["unit"] == "m" and root.extras["quaternion"] == "x, y, z, w"
-    assert root.extras["joints"] == human.joint_names.tolist()
-    assert all(node.matrix is None for node in file.nodes)
+    content = path.read_bytes()
+    assert content[:8] == b"glTF\x02\0\0\0" and int.from_bytes(content[8:12], "little") == len(content)
+    file = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    (root,) = [file["nodes"][i] for i in file["scenes"][0]["nodes"]]
+    np.testing.assert_allclose(Rotation.from_quat(root["rotation"]).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
+    assert root["extras"]["unit"] == "m" and root["extras"]["quaternion"] == "x, y, z, w"
+    assert root["extras"]["joints"] == human.joint_names.tolist()
+    assert all("matrix" not in node for node in file["nodes"])
+    assert [m["pbrMetallicRoughness"]["metallicFactor"] for m in file["materials"]] == [0.0, 0.0]
+
+
+def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    path, _ = export([human], "glb", tmp_path)
+    scene = trimesh.load_scene(path, process=False)
+    for i, name in enumerate(human.link_names):
+        pose = frames.FROM_Y_UP @ scene.graph.get(str(name))[0]
+        np.testing.assert_allclose(pose[:3, 3], human.link_position[0, i], atol=1e-6)
+        turn = Rotation.from_quat(human.link_quaternion[0, i], scalar_first=True)
+        np.testing.assert_allclose(pose[:3, :3], turn.as_matrix(), atol=1e-6)
+    for k in (0, 9):
+        link = str(human.link_names[human.capsule_link[k]])
+        distance = np.linalg.norm(scene.geometry[link].vertices - human.capsule_ends[k].mean(0), axis=1)
+        half = np.linalg.norm(np.diff(human.capsule_ends[k], axis=0)) / 2 + human.capsule_radius[k]
+        assert np.isclose(distance, half, atol=1e-6).any()  # the pole of the capsule is a vertex
 
 
 def test_neighbouring_quaternions_do_not_jump() -> None:
     flipped = Rotation.from_rotvec(np.outer(np.linspace(0, 12, 50), [0, 0, 1]))
-    q = frames.quaternions(flipped, scalar_first=False)
+    q = frames.continuous_quaternions(flipped, scalar_first=False)
     assert (np.sum(q[1:] * q[:-1], -1) > 0).all()
 
 
-def test_usd_shapes_are_where_the_capsules_are(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_pixars_library_finds_links_and_shapes_in_a_usd(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     path, _ = export([human], "usd", tmp_path)
     stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(1 / human.control_dt)
     assert "w, x, y, z" in json.loads(stage.GetRootLayer().customLayerData["congrasp"])["quaternion"]
-    cache = UsdGeom.XformCache(3.0)
+    prims = {prim.GetName(): prim for prim in stage.Traverse()}
+    for t in range(T):
+        cache = UsdGeom.XformCache(float(t))
+        for i, name in enumerate(human.link_names):
+            pose = np.array(cache.GetLocalToWorldTransform(prims[str(name)])).T  # USD's vectors are rows
+            turn = Rotation.from_quat(human.link_quaternion[t, i], scalar_first=True)
+            np.testing.assert_allclose(pose[:3, 3], human.link_position[t, i], atol=1e-6)
+            np.testing.assert_allclose(pose[:3, :3], turn.as_matrix(), atol=1e-6)
     k = 9
-    link = int(human.capsule_link[k])
-    prim = next(p for p in stage.Traverse() if p.GetName() == f"capsule_{k}")
+    link, prim = int(human.capsule_link[k]), prims[f"capsule_{k}"]
     half = UsdGeom.Capsule(prim).GetHeightAttr().Get() / 2
-    matrix = np.array(cache.GetLocalToWorldTransform(prim)).T
+    matrix = np.array(UsdGeom.XformCache(3.0).GetLocalToWorldTransform(prim)).T
     ends = (matrix @ [[0, 0], [0, 0], [-half, half], [1, 1]])[:3].T
     turn = Rotation.from_quat(human.link_quaternion[3, link], scalar_first=True)
     np.testing.assert_allclose(ends, turn.apply(human.capsule_ends[k]) + human.link_position[3, link], atol=1e-6)
@@ -199,7 +224,9 @@ def test_usd_shapes_are_where_the_capsules_are(human: GraspMotion, tmp_path: pat
 
 def test_a_dataset_of_several_motions(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     hand = get_hand("human")
-    other = dataclasses.replace(posed(human, lambda q: link_poses(hand, q), 9), object="mug", constraints=("heading",))
+    other = dataclasses.replace(
+        posed(human, lambda q: mujoco_link_poses(hand, q), 9), object="mug", constraints=("heading",)
+    )
     path, error = export([human, other, human], "lerobot", tmp_path)
     assert error < 0.01
     info = json.loads((path / "meta" / "info.json").read_text())
@@ -251,7 +278,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     save_motion(tmp_path / "mug.npz", motion_of_episode(episode(T)))
     assert run("logs", "--to", "bvh") == 0
     assert run("mug.npz") == 0
-    assert "mug.glb: 7 moments, largest error" in capsys.readouterr().out
+    assert "mug.glb: 7 frames, largest error" in capsys.readouterr().out
     assert run("mug.npz", "logs", "--to", "lerobot") == 0
     made = {"logs.bvh", "logs.bvh.json", "mug-lerobot", "mug.glb"}
     assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *made}

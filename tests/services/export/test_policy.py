@@ -91,25 +91,25 @@ def test_a_file_that_answers_differently_is_not_written(
 
 
 @pytest.fixture(scope="module")
-def shipped_onnx(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+def pretrained_onnx(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     path = tmp_path_factory.mktemp("onnx") / "policy.onnx"
     exports.export_policy(bundles.load(policy_file(None)), "onnx", path)
     return path
 
 
-def test_the_example_grasps_with_onnxruntime_alone(shipped_onnx: pathlib.Path, tmp_path: pathlib.Path) -> None:
+def test_the_example_grasps_with_onnxruntime_alone(pretrained_onnx: pathlib.Path, tmp_path: pathlib.Path) -> None:
     absent = "import sys, runpy; sys.modules.update(dict.fromkeys(['jax', 'flax', 'common', 'services', 'actors'])); "
-    code = f"{absent}sys.argv[1:] = [{str(shipped_onnx)!r}]; runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')"
+    code = f"{absent}sys.argv[1:] = [{str(pretrained_onnx)!r}]; runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "the cylinder is held" in done.stdout
 
 
-def test_the_example_observes_what_the_policy_was_trained_on(shipped_onnx: pathlib.Path) -> None:
+def test_the_example_observes_what_the_policy_was_trained_on(pretrained_onnx: pathlib.Path) -> None:
     spec: Any = importlib.util.spec_from_file_location("onnx_grasp", EXAMPLE)
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    grasp = example.Grasp(onnxruntime.InferenceSession(shipped_onnx))
+    grasp = example.Grasp(onnxruntime.InferenceSession(pretrained_onnx))
     for _ in range(57):  # the hand holds the object, and the table is gone
         grasp.step()
     hand, data, task = get_hand("human"), grasp.data, bundles.load(policy_file(None)).task

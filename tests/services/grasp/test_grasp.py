@@ -14,8 +14,8 @@ from common.policy import bundle as bundles
 from common.policy.pretrained import policy_file
 from common.request import GraspRequest
 from common.rotations import rotate
-from services.assets.objects.meshes import ImportOptions
 from services.assets.objects.named import one_object
+from services.assets.objects.options import ImportOptions
 from services.cli.main import load
 from services.export.motion_file import load_motion, motion_of_episode
 from services.grasp.files import MOTION, OBJECT, PICTURE, RECORDING, RESULT, save_grasp

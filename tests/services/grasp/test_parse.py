@@ -8,7 +8,8 @@ import trimesh
 
 from common.errors import CongraspError
 from common.hands import get_hand
-from services.assets.objects.meshes import ImportOptions, import_paths
+from services.assets.objects.named import objects_of
+from services.assets.objects.options import ImportOptions
 from services.export.motion_file import motion_of_episode, save_motion
 from services.grasp.parse import read_request
 from tests.episodes import HEIGHT, episode
@@ -25,7 +26,7 @@ def block(tmp_path_factory):
     mesh.apply_translation(CENTER)
     mesh.apply_scale(1000)
     mesh.export(folder / "block.stl")
-    return import_paths([folder / "block.stl"], ImportOptions(unit="mm", cache_dir=str(folder / "cache")))[0]
+    return objects_of(folder / "block.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache")))[0]
 
 
 def asked(obj, **constraints):

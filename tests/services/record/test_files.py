@@ -240,7 +240,7 @@ def test_a_file_system_that_is_really_full(small_disk: pathlib.Path) -> None:
     assert len(list(read_records(path))) >= 10
 
 
-def test_what_is_no_recording_is_said_in_words(tmp_path: pathlib.Path) -> None:
+def test_what_is_no_recording_is_refused(tmp_path: pathlib.Path) -> None:
     with pytest.raises(CongraspError, match="no recording"):
         log_files(tmp_path)
     (tmp_path / "a.mcap").write_text("a text")

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands import get_hand
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.export.motion_file import load_motion, motion_of_episode, save_motion
-from services.record.poses import link_poses
 from tests.episodes import CONTROL_DT, episode
 
 
@@ -84,7 +84,7 @@ def test_the_file_alone_suffices_for_the_kinematics():
             turn = turn * own
         turns.append(turn)
         places.append(place)
-    position, quaternion = link_poses(get_hand("human"), q)
+    position, quaternion = mujoco_link_poses(get_hand("human"), q)
     for link in range(len(motion.link_names)):
         joints = np.flatnonzero(motion.joint_link == link)
         origin = motion.joint_anchor[joints[0]] if len(joints) else np.zeros(3)
@@ -109,7 +109,7 @@ def test_what_is_no_motion_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "complaint"),
+    ("name", "change", "message"),
     [
         ("time", lambda x: x[:3], r"table has shape \(12,\), where \(T,\) is \(3,\)"),
         ("object_vertices", lambda x: x[:0], "object_vertices is empty"),
@@ -117,8 +117,8 @@ def test_what_is_no_motion_is_named(tmp_path):
         ("wrist_quaternion", lambda x: x[:, :3], r"wrist_quaternion has shape \(12, 3\), where \(T, 4\) is \(12, 4\)"),
     ],
 )
-def test_arrays_of_the_wrong_shape_are_named(tmp_path, name, change, complaint):
+def test_arrays_of_the_wrong_shape_are_named(tmp_path, name, change, message):
     motion = motion_of_episode(episode())
     save_motion(path := tmp_path / "a.npz", dataclasses.replace(motion, **{name: change(getattr(motion, name))}))
-    with pytest.raises(CongraspError, match=complaint):
+    with pytest.raises(CongraspError, match=message):
         load_motion(path)

@@ -94,7 +94,7 @@ def test_everything_a_run_publishes_is_in_the_file(transport: MemoryTransport, t
 def test_damaged_messages_are_left_out_and_counted(transport: MemoryTransport, tmp_path: pathlib.Path) -> None:
     said: list[str] = []
     broken = Message({**episode().arrays, "link_position": np.zeros(3)}, episode().meta)
-    with Recorder(transport, "r", tmp_path, complain=said.append) as recorder:
+    with Recorder(transport, "r", tmp_path, warn=said.append) as recorder:
         transport.publish(METRICS, Message({}, {}))
         transport.publish(METRICS, Message({}, {"values": {"kl": "high"}}))
         transport.publish(KEYS.log("episode", "actor", "a0"), broken)
@@ -136,7 +136,7 @@ def test_a_full_disk_stops_the_recording_alone(
         flush(self)
 
     monkeypatch.setattr(LogWriter, "flush", flush_or_fail)
-    with Recorder(transport, "r", tmp_path, complain=said.append, sinks=[Sink()]) as recorder:
+    with Recorder(transport, "r", tmp_path, warn=said.append, sinks=[Sink()]) as recorder:
         transport.publish(METRICS, metrics(0))
         wait_for(lambda: bool(recorder.files) and len(list(read_records(recorder.files[0]))) == 1)
         full = True

@@ -15,10 +15,10 @@ from common.errors import CongraspError
 from common.hands import get_hand, kinematics
 from common.hands.spec import link_origin
 from common.wire.codec import Message, decode
+from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry
 from services.record.entries import Converter
 from services.record.goals import active_blocks, active_constraints
-from services.record.poses import link_poses
 from services.record.scene import SPACING
 from tests.episodes import CONTROL_DT, FORCE, episode, older
 
@@ -46,7 +46,7 @@ def quaternion(q: object) -> np.ndarray:
 
 def test_poses_without_jax_agree_with_the_product_of_exponentials() -> None:
     q = np.random.default_rng(0).uniform(HAND.lower, HAND.upper)
-    position, turn = link_poses(HAND, q)
+    position, turn = mujoco_link_poses(HAND, q)
     expected_position, expected_turn = kinematics.link_poses(HAND, jnp.array(q))
     np.testing.assert_allclose(position, expected_position, atol=1e-6)
     np.testing.assert_allclose(np.abs((turn * expected_turn).sum(-1)), 1.0, atol=1e-6)
@@ -194,7 +194,7 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
     assert places == [0.0, pytest.approx(SPACING)]
 
 
-def test_an_unknown_hand_is_said_in_words() -> None:
+def test_an_unknown_hand_is_named_in_the_error() -> None:
     strange = Message(episode().arrays, {**episode().meta, "hand": "tentacle"})
     with pytest.raises(CongraspError, match="tentacle"):
         Converter()(KEY, strange, START)

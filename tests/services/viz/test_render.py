@@ -11,27 +11,25 @@ from scipy.spatial.transform import Rotation
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.wire.codec import encode
-from services.cli import render as command
+from services.cli.main import load
 from services.record.channels import Entry, opaque_channel
+from services.record.palette import OBJECT
+from services.record.reader import pick_episode
 from services.record.writer import LogWriter
+from services.viz.hand_sheets import hand_sheet
 from services.viz.raycast import Camera, Scene, Shape, between
 from services.viz.render import (
-    OBJECT,
-    OBJECT_MINUS,
+    OBJECT_AVOID,
     TOUCHING,
-    arrow,
-    beads,
     best_camera,
     episode_shapes,
     episode_sheet,
     episode_title,
-    fit,
-    hand_sheet,
     key_steps,
-    pick_episode,
     render_episode_frames,
 )
 from services.viz.shade import render_scene, visible
+from services.viz.shapes import arrow, beads, fit
 from services.viz.sheets import contact_sheet, save_png, save_video
 from services.viz.smooth import SmoothNormals
 from tests.episodes import CONTROL_DT, episode, older
@@ -176,7 +174,7 @@ def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
     body = shapes[len(capsules)]
     assert body.paint_colours is not None
     minus = episode().arrays["surface_minus"]
-    np.testing.assert_allclose(body.paint_colours, np.where(minus[:, None], OBJECT_MINUS, OBJECT))
+    np.testing.assert_allclose(body.paint_colours, np.where(minus[:, None], OBJECT_AVOID, OBJECT))
     assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[len(capsules)].paint_points is None
 
 
@@ -207,7 +205,7 @@ def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
 
 
 def test_sheets(tmp_path: pathlib.Path) -> None:
-    sheet = episode_sheet(episode(), moments=3, size=(48, 36))
+    sheet = episode_sheet(episode(), frames=3, size=(48, 36))
     assert sheet.shape[1] == 3 * (48 + 10) + 10
     hand = hand_sheet(get_hand("human"), size=(40, 40))
     assert hand.shape[1] == 3 * (40 + 10) + 10
@@ -255,8 +253,9 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
         with pytest.raises(CongraspError, match="holds"):
             pick_episode(tmp_path / "run", index, success=success)
     out = tmp_path / "out.png"
-    assert command.episode(tmp_path / "run", out, index=0, moments=1) == 0
-    assert Image.open(out).size[0] > 400
+    for option in ("--frames", "--moments"):  # the second is its older name
+        assert load("render")(["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", option, "1"])() == 0
+        assert 400 < Image.open(out).size[0] < 600
     frames = render_episode_frames(pick_episode(tmp_path / "run", 0), range(4), (64, 48))
     save_video(tmp_path / "film.mp4", frames, (64, 48), 0.5 / CONTROL_DT)
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 4

@@ -11,7 +11,7 @@ from common.hands.human import HUMAN
 from common.hands.mano import MANO_FINGERS
 from services.assets.captures.fit import joint_positions
 from services.assets.captures.mano import TO_HUMAN
-from services.record.poses import link_poses
+from services.assets.hands.kinematics import mujoco_link_poses
 
 FRAMES, GRASP = 90, 60
 """Frames of a sequence, and the one in which the fingers have closed."""
@@ -144,7 +144,7 @@ def mano_rotations(fingers: np.ndarray) -> np.ndarray:
     rows = []
     different, which = np.unique(fingers, axis=0, return_inverse=True)
     for q in different:
-        turns = Rotation.from_quat(link_poses(HUMAN, q)[1], scalar_first=True).as_matrix()
+        turns = Rotation.from_quat(mujoco_link_poses(HUMAN, q)[1], scalar_first=True).as_matrix()
         turns = TO_HUMAN.T @ turns @ TO_HUMAN
         for finger in MANO_FINGERS:
             links = ("metacarpal", "proximal", "distal") if finger == "thumb" else ("proximal", "middle", "distal")

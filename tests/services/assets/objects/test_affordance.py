@@ -7,7 +7,8 @@ import trimesh
 from common.errors import CongraspError
 from common.objects import store
 from services.assets.objects.affordance import in_half_space, on_part_mesh, painted, two_parts
-from services.assets.objects.meshes import ImportOptions, import_paths
+from services.assets.objects.named import objects_of
+from services.assets.objects.options import ImportOptions
 from services.cli.main import load
 
 EDGES, SHIFT = np.array([0.05, 0.05, 0.12]), np.array([0.01, 0.02, 0.06])
@@ -30,7 +31,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def box(folder):
-    (obj,) = import_paths([folder / "box.stl"], ImportOptions(unit="mm", cache_dir=str(folder / "cache")))
+    (obj,) = objects_of(folder / "box.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache")))
     return obj
 
 

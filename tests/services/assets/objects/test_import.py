@@ -13,7 +13,8 @@ from common.objects.resting import settle
 from common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES
 from common.objects.store import digest
 from services.assets.objects import decompose, meshes
-from services.assets.objects.meshes import ImportOptions, import_paths, import_source
+from services.assets.objects.named import objects_of
+from services.assets.objects.options import ImportOptions
 from services.assets.objects.sources import find_sources
 
 SIDES = np.array([0.04, 0.06, 0.08])
@@ -33,8 +34,8 @@ def block(sides=SIDES, center=(0.0, 0.0, 0.0)):
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb"])
 def test_a_solid_block_gets_the_mass_properties_worked_out(tmp_path, options, suffix):
     block(center=(0.5, 0.1, -0.2)).export(tmp_path / f"block.{suffix}")
-    (obj,) = import_paths([tmp_path / f"block.{suffix}"], options)
-    assert (obj.name, obj.family, len(obj.pieces), obj.primitive) == ("block", "imported", 1, False)
+    (obj,) = objects_of(tmp_path / f"block.{suffix}", options)
+    assert (obj.name, obj.family, [piece.kind for piece in obj.pieces]) == ("block", "imported", ["mesh"])
     # 192 cm^3 of 500 kg/m^3; I = m/12 (b^2 + c^2).
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-5)
     np.testing.assert_allclose(np.sort(np.ptp(obj.visual_vertices, axis=0)), SIDES, rtol=1e-5)
@@ -53,17 +54,17 @@ def test_a_solid_block_gets_the_mass_properties_worked_out(tmp_path, options, su
 def test_units_scale_density_and_mass(tmp_path, options):
     block(1000 * SIDES).export(tmp_path / "block.stl")
     with pytest.raises(CongraspError, match=r"block\.stl is 80 m long .*too large.*--unit mm' \(8 cm\)") as error:
-        import_paths([tmp_path / "block.stl"], options)
+        objects_of(tmp_path / "block.stl", options)
     assert "\n" not in str(error.value)
     with pytest.raises(CongraspError, match=r"is 0\.08 mm long.*too small.*--scale 0\.00125"):
-        import_paths([tmp_path / "block.stl"], ImportOptions("m", 1e-6, cache_dir=options.cache_dir))
+        objects_of(tmp_path / "block.stl", ImportOptions("m", 1e-6, cache_dir=options.cache_dir))
     made = ImportOptions("mm", 0.5, density=3000.0, cache_dir=options.cache_dir)
-    (obj,) = import_paths([tmp_path / "block.stl"], made)
+    (obj,) = objects_of(tmp_path / "block.stl", made)
     np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), SIDES / 2, rtol=1e-5)
     np.testing.assert_allclose(obj.mass, 3000 * np.prod(SIDES / 2), rtol=1e-5)
-    (heavy,) = import_paths([tmp_path / "block.stl"], ImportOptions("mm", mass=0.7, cache_dir=options.cache_dir))
+    (heavy,) = objects_of(tmp_path / "block.stl", ImportOptions("mm", mass=0.7, cache_dir=options.cache_dir))
     assert heavy.mass == 0.7
-    (light,) = import_paths([tmp_path / "block.stl"], ImportOptions("mm", density=1.0, cache_dir=options.cache_dir))
+    (light,) = objects_of(tmp_path / "block.stl", ImportOptions("mm", density=1.0, cache_dir=options.cache_dir))
     assert light.mass == 0.05
     np.testing.assert_allclose(light.inertia / 0.05, heavy.inertia / 0.7, rtol=1e-6)
 
@@ -71,19 +72,19 @@ def test_units_scale_density_and_mass(tmp_path, options):
 def test_a_second_import_comes_from_the_cache_unless_something_changed(tmp_path, options, monkeypatch):
     path = tmp_path / "block.stl"
     block().export(path)
-    (first,) = import_paths([path], options)
+    (first,) = objects_of(path, options)
     monkeypatch.setattr(meshes, "_build", lambda *_: pytest.fail("built again"))
-    (second,) = import_paths([path], options)
+    (second,) = objects_of(path, options)
     assert digest(second) == digest(first)
     monkeypatch.undo()
-    (denser,) = import_paths([path], ImportOptions(density=900.0, cache_dir=options.cache_dir))
+    (denser,) = objects_of(path, ImportOptions(density=900.0, cache_dir=options.cache_dir))
     assert denser.mass > first.mass
     block(1.5 * SIDES).export(path)
-    (larger,) = import_paths([path], options)
+    (larger,) = objects_of(path, options)
     np.testing.assert_allclose(np.ptp(larger.visual_vertices, axis=0), 1.5 * SIDES, rtol=1e-5)
     for cached in (tmp_path / "cache").iterdir():
         cached.write_bytes(b"damaged")
-    assert digest(import_paths([path], options)[0]) == digest(larger)
+    assert digest(objects_of(path, options)[0]) == digest(larger)
 
 
 @pytest.mark.parametrize("names", [("graspable", "non_graspable"), ("top_watertight_tiny", "bottom_watertight_tiny")])
@@ -92,7 +93,7 @@ def test_part_files_become_the_parts(tmp_path, options, names):
     folder.mkdir()
     block((0.02, 0.02, 0.1), (0, 0, 0.05)).export(folder / f"{names[0]}.obj")
     block((0.06, 0.02, 0.03), (0, 0, 0.115)).export(folder / f"{names[1]}.obj")
-    (obj,) = import_paths([folder], options)
+    (obj,) = objects_of(folder, options)
     assert (obj.name, obj.part_names) == ("tool", ("graspable", "non-graspable"))
     assert obj.graspable.tolist() == [True, False]
     top = 0.115 - 0.015 - (0.02 * 0.02 * 0.1 * 0.05 + 0.06 * 0.02 * 0.03 * 0.115) / (0.02**2 * 0.1 + 0.06 * 0.02 * 0.03)
@@ -106,7 +107,7 @@ def test_a_stand_in_for_no_part_is_left_out(tmp_path, options):
     folder.mkdir()
     block().export(folder / "top.obj")
     block((0.01,) * 3, (0.346408,) * 3).export(folder / "bottom.obj")
-    (obj,) = import_paths([folder], options)
+    (obj,) = objects_of(folder, options)
     assert obj.part_names == ("graspable",)
     assert not obj.non_graspable_points.any()
     np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), SIDES, rtol=1e-5)
@@ -121,7 +122,7 @@ def test_contact_pieces_are_used_as_they_are(tmp_path, options):
     second.export(folder / "contact1.stl")
     first.export(folder / "ell_handle.stl")
     second.export(folder / "ell_blade.stl")
-    (obj,) = import_paths([folder], options)
+    (obj,) = objects_of(folder, options)
     assert obj.part_names == ("blade", "handle")
     assert obj.graspable.tolist() == [False, True]
     volumes = sorted(shapes.volume(piece) for piece in obj.pieces)
@@ -129,10 +130,10 @@ def test_contact_pieces_are_used_as_they_are(tmp_path, options):
     assert [piece.part for piece in sorted(obj.pieces, key=shapes.volume)] == [0, 1]
     (folder / "ell.stl").unlink()
     with pytest.raises(CongraspError, match="not clear which mesh shows the whole"):
-        import_paths([folder], options)
+        objects_of(folder, options)
     (folder / "ell_handle.stl").unlink()
     (folder / "ell_blade.stl").unlink()
-    (bare,) = import_paths([folder], options)
+    (bare,) = objects_of(folder, options)
     np.testing.assert_allclose(bare.mass, obj.mass, rtol=1e-4)
 
 
@@ -152,8 +153,8 @@ def test_an_open_mesh_counts_its_hull_and_says_so(tmp_path, options):
     mesh.update_faces(np.arange(12) > 1)
     mesh.export(tmp_path / "open.stl")
     quick = dataclasses.replace(options, time_limit=0.01)
-    obj, notes = import_source(find_sources(tmp_path / "open.stl")[0], quick)
-    assert any("surface is open" in note and "convex hull" in note for note in notes)
+    (obj,) = objects_of(tmp_path / "open.stl", quick)
+    assert any("surface is open" in note and "convex hull" in note for note in obj.notes)
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-4)
 
 
@@ -191,7 +192,7 @@ def test_bad_meshes_get_one_line_that_names_them(tmp_path, options, name):
     make, expected = BAD[name]
     make(tmp_path / name)
     with pytest.raises(CongraspError, match=expected) as error:
-        import_paths([tmp_path / name], options)
+        objects_of(tmp_path / name, options)
     assert name in str(error.value)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "cache").exists()
@@ -201,7 +202,7 @@ def test_bad_meshes_get_one_line_that_names_them(tmp_path, options, name):
 def test_bad_options_are_named(tmp_path, bad):
     block().export(tmp_path / "block.stl")
     with pytest.raises(CongraspError, match=f"--{next(iter(bad)).replace('_', '-')} is"):
-        import_paths([tmp_path / "block.stl"], ImportOptions(**bad))
+        objects_of(tmp_path / "block.stl", ImportOptions(**bad))
 
 
 def ell():
@@ -270,7 +271,7 @@ def test_simplified_pieces_keep_shape_and_volume():
 
 
 def test_all_scanned_objects_import_and_rest(shared_objects, options):
-    objects = import_paths([shared_objects], options)
+    objects = objects_of(shared_objects, options)
     assert len(objects) == 24
     assert {obj.name for obj in objects} == {path.name for path in shared_objects.iterdir() if path.is_dir()}
     by_name = {obj.name: obj for obj in objects}
@@ -290,4 +291,4 @@ def test_a_copy_of_a_scanned_folder_needs_no_model_files(shared_objects, tmp_pat
     folder.mkdir()
     for file in (shared_objects / "apple").glob("*.stl"):
         shutil.copy(file, folder)
-    assert import_paths([folder], options)[0].name == "apple"
+    assert objects_of(folder, options)[0].name == "apple"

@@ -9,7 +9,8 @@ import trimesh
 
 from common.errors import CongraspError
 from services.assets.objects import repair
-from services.assets.objects.meshes import ImportOptions, import_source
+from services.assets.objects.meshes import import_source
+from services.assets.objects.options import ImportOptions
 from services.assets.objects.repair import closed, largest_body, reduced
 from services.assets.objects.sources import find_sources
 
@@ -31,14 +32,15 @@ def brought(tmp_path):
         else:
             content.export(path)
         (source,) = find_sources(path)
-        return import_source(source, ImportOptions(unit="guess", cache_dir=str(tmp_path / "cache"), **options))
+        obj = import_source(source, ImportOptions(unit="guess", cache_dir=str(tmp_path / "cache"), **options))
+        return obj, obj.notes
 
     return bring
 
 
 def test_a_whole_mesh_is_left_alone(brought):
-    obj, notes = brought(ball())
-    assert not [note for note in notes if "32 vertices" not in note] and obj.notes == tuple(notes)
+    _, notes = brought(ball())
+    assert not [note for note in notes if "32 vertices" not in note]
 
 
 def test_millimetres_for_metres(brought):

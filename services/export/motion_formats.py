@@ -11,7 +11,7 @@ import numpy as np
 from common.errors import CongraspError
 from services.export.frames import TOLERANCE_MM, error_mm
 from services.export.motion_file import GraspMotion, load_motion, motion_of_episode
-from services.viz.render import pick_episode
+from services.record.reader import pick_episode
 
 FORMATS = {
     "glb": ".glb",
@@ -37,7 +37,7 @@ _UNIT = 1e-3
 
 
 def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:
-    """The motion of an NPZ file, or one of the episodes recorded at `path` (see `pictures.render`)."""
+    """The motion of an NPZ file, or an episode recorded at `path` (see `pick_episode`)."""
     if not path.exists():
         raise CongraspError(f"There is no {path}.", "Name a motion (.npz), a recording (.mcap) or a run's folder.")
     if path.suffix == ".npz":
@@ -96,6 +96,7 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
 
 
 def _check(motion: GraspMotion) -> None:
+    """Raises a CongraspError for numbers that are not finite, or quaternions that are not of length one."""
     remedy = "Make it anew with 'congrasp grasp'."
     for name in _NUMBERS:
         values = np.asarray(getattr(motion, name))

@@ -1,4 +1,7 @@
-"""Poses of a hand's links by MuJoCo alone, so that recorders and pictures start no JAX backend."""
+"""Poses of a hand's links by MuJoCo, for one hand pose at a time, so that recorders and pictures start no JAX backend.
+
+`common.hands.kinematics.link_poses` is the same for batches in JAX.
+"""
 
 import functools
 
@@ -11,12 +14,13 @@ from common.hands.spec import Hand
 
 @functools.cache
 def _model(hand: Hand) -> mujoco.MjModel:
+    """The hand alone, with its wrist at the origin."""
     spec = mujoco.MjSpec()
     add_hand(spec, hand)
     return spec.compile()
 
 
-def link_poses(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mujoco_link_poses(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Origins (L, 3) and orientations (L, 4) of the links' frames in the wrist frame.
 
     Args:

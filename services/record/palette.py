@@ -1,0 +1,22 @@
+"""Colours of hand, object and constraints in every picture, recording and export: red, green, blue from 0 to 1."""
+
+Colour = tuple[float, float, float]
+
+SKIN: Colour = (0.70, 0.73, 0.79)
+OBJECT: Colour = (0.95, 0.62, 0.24)
+TABLE: Colour = (0.80, 0.79, 0.77)
+HEADING: Colour = (0.22, 0.40, 0.86)
+"""Also reference poses."""
+WAYPOINT: Colour = (0.53, 0.30, 0.75)
+GRASPABLE: Colour = (0.20, 0.65, 0.32)
+AVOID: Colour = (0.80, 0.16, 0.16)
+PIECES: tuple[Colour, ...] = (
+    (0.90, 0.45, 0.36),
+    (0.35, 0.63, 0.78),
+    (0.95, 0.72, 0.30),
+    (0.45, 0.70, 0.48),
+    (0.66, 0.52, 0.78),
+)
+"""Of convex pieces, in turn."""
+INK = "#262b35"
+"""Text and titles."""

@@ -1,0 +1,60 @@
+"""A picture of one object: its labelled surface, its convex pieces, and headings on the table."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.objects.shapes import tessellate
+from common.objects.spec import GraspObject
+from common.task.sampling.headings import Headings, clear_table, feasible
+from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, PIECES
+from services.viz.raster import Raster
+from services.viz.raycast import Shape
+from services.viz.shapes import arrow, fit, shape_points, table_shape
+from services.viz.sheets import contact_sheet
+
+_ARROWS, _LENGTH = 24, 0.08  # how many headings, and from how far before them they are drawn, m
+_SIZE = (460, 400)
+_VIEW = (0.8, -0.6, 0.6)
+
+
+def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
+    """Three views of the object in its most likely resting pose.
+
+    Left: the surface, the graspable region green and the avoid region red. Middle: the convex pieces. Right: some of
+    the headings that the table leaves, drawn from 8 cm before the heading position up to it.
+
+    Returns:
+      (H, W, 3) uint8.
+    """
+    pose = np.asarray(obj.rest_poses[0], float)
+    place, turn = pose[:3], Rotation.from_quat(pose[3:], scalar_first=True)
+    cleared = clear_table(headings, pose)
+    chosen = np.flatnonzero(feasible(cleared, pose))[:_ARROWS]
+    tips, ways = turn.apply(cleared.position[chosen]) + place, turn.apply(cleared.direction[chosen])
+
+    whole = Shape("mesh", (0, 0, 0), OBJECT, place, pose[3:], vertices=obj.visual_vertices, faces=obj.visual_faces)
+    paint = np.where(obj.non_graspable_points[:, None], AVOID, GRASPABLE)
+    pieces = [
+        dataclasses.replace(whole, colour=PIECES[i % len(PIECES)], vertices=vertices, faces=faces)
+        for i, (vertices, faces) in enumerate(map(tessellate, obj.pieces))
+    ]
+    arrows = [arrow(tip - _LENGTH * way, tip, 0.0015, HEADING) for tip, way in zip(tips, ways, strict=True)]
+    panels = {
+        "surface: graspable region green, avoid region red": [
+            dataclasses.replace(whole, paint_points=obj.points, paint_colours=paint)
+        ],
+        f"{len(obj.pieces)} convex pieces": pieces,
+        f"{len(chosen)} of the headings that the table leaves": [
+            dataclasses.replace(whole, alpha=0.5),
+            *itertools.chain(*arrows),
+        ],
+    }
+    raster, images = Raster(), []
+    for shapes in panels.values():
+        camera = fit(np.concatenate([shape_points(shape) for shape in shapes]), np.array(_VIEW), _SIZE[0] / _SIZE[1])
+        images.append(raster.draw([*shapes, table_shape(place)], camera, _SIZE))
+    title = f"{obj.name}: {1000 * obj.mass:.0f} g, resting pose 1 of {len(obj.rest_poses)}"
+    return contact_sheet(images, list(panels), columns=len(panels), title=title)

@@ -1,0 +1,127 @@
+"""Shapes that pictures are made of: hands, the table, arrows, strings of beads; and cameras that hold them."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from common.hands.spec import Hand, link_origin
+from services.assets.hands.kinematics import mujoco_link_poses
+from services.record.palette import SKIN, TABLE, Colour
+from services.viz.raycast import Camera, Shape, between
+
+_TABLE_RADIUS, _TABLE_HALF_HEIGHT = 0.28, 0.008  # m
+FIELD_OF_VIEW = 26.0
+"""Degrees, of cameras that `fit` makes."""
+_SPACE = 1.06  # free space at the picture's edges
+
+
+def hand_shapes(
+    hand: Hand,
+    position: np.ndarray,
+    quaternion: np.ndarray,
+    colours: Sequence[Colour] | None = None,
+    alpha: float = 1.0,
+) -> list[Shape]:
+    """The hand's capsules.
+
+    Args:
+      hand: the hand.
+      position: (L, 3) origins of the links' frames in the world.
+      quaternion: (L, 4) their orientations.
+      colours: one for each link; skin otherwise.
+      alpha: below one the hand is seen through.
+    """
+    shapes = []
+    for i, link in enumerate(hand.links):
+        turn = Rotation.from_quat(quaternion[i], scalar_first=True)
+        for capsule in link.capsules:
+            start, end = turn.apply(np.subtract([capsule.start, capsule.end], link_origin(link))) + position[i]
+            shapes.append(between(start, end, capsule.radius, colours[i] if colours else SKIN, alpha=alpha))
+    return shapes
+
+
+def posed_hand(
+    hand: Hand,
+    q: np.ndarray,
+    position: np.ndarray,
+    wrist: Rotation,
+    colours: Sequence[Colour] | None = None,
+    alpha: float = 1.0,
+) -> list[Shape]:
+    """The hand with finger angles (F,) and its wrist at a position (3,) m and orientation in the world.
+
+    Colours and alpha are those of `hand_shapes`.
+    """
+    links, quaternion = mujoco_link_poses(hand, q)
+    turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
+    return hand_shapes(hand, wrist.apply(links) + position, turned, colours, alpha)
+
+
+def table_shape(below: np.ndarray) -> Shape:
+    """A round table top at height zero under a point (3,)."""
+    position = np.array([below[0], below[1], -_TABLE_HALF_HEIGHT], float)
+    return Shape("cylinder", (_TABLE_RADIUS, _TABLE_HALF_HEIGHT, 0), TABLE, position, shine=0.0)
+
+
+def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: Colour) -> list[Shape]:
+    """A shaft with a cone whose tip is at `end` (3,)."""
+    along = np.subtract(end, start)
+    direction = along / np.linalg.norm(along)
+    neck = end - 6 * radius * direction
+    turn = Rotation.align_vectors([direction], [[0.0, 0.0, 1.0]])[0].as_quat(scalar_first=True)
+    angles = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    ring = np.stack([2.4 * radius * np.cos(angles), 2.4 * radius * np.sin(angles), np.zeros(32)], -1)
+    vertices = np.concatenate([ring, [[0, 0, 6 * radius], [0, 0, 0]]])
+    here = np.arange(32)
+    after = (here + 1) % 32
+    faces = np.concatenate([np.stack([here, after, np.full(32, 32)], -1), np.stack([after, here, np.full(32, 33)], -1)])
+    cone = Shape("mesh", (0, 0, 0), colour, neck, turn, vertices=vertices, faces=faces)
+    return [between(start, neck, radius, colour), cone]
+
+
+def beads(points: np.ndarray, radius: float, colour: Colour) -> Shape:
+    """Balls at points (N, 3) on a string, as one mesh: every further shape would slow down all rays."""
+    balls = [trimesh.creation.icosphere(1, radius).apply_translation(point) for point in points]
+    pairs = [pair for pair in itertools.pairwise(points) if np.linalg.norm(np.subtract(*pair)) > 1e-6]
+    string = [trimesh.creation.cylinder(0.4 * radius, segment=pair, sections=8) for pair in pairs]
+    mesh: Any = trimesh.util.concatenate([*balls, *string])
+    return Shape("mesh", (0, 0, 0), colour, vertices=mesh.vertices, faces=mesh.faces)
+
+
+def fit(points: np.ndarray, direction: np.ndarray, aspect: float) -> Camera:
+    """The nearest camera that sees all points (N, 3) from `direction` (3,), which leads from them to the camera."""
+    tangent = np.tan(np.radians(FIELD_OF_VIEW) / 2) / _SPACE
+    direction = np.asarray(direction, float) / np.linalg.norm(direction)
+    target = (points.min(0) + points.max(0)) / 2
+    axes = Camera(target + direction, target).axes()
+    distance = 1.0
+    for _ in range(8):  # alternately near enough and in the middle; a few rounds settle to a fraction of a pixel
+        x, y, z = axes @ (points - target).T
+        distance = max((np.abs(x) / (tangent * aspect) - z).max(), (np.abs(y) / tangent - z).max())
+        sides = np.stack([x, y]) / (distance + z)
+        target = target + distance * (sides.max(1) + sides.min(1)) / 2 @ axes[:2]
+    return Camera(target + distance * direction, target, FIELD_OF_VIEW)
+
+
+def shape_points(shape: Shape) -> np.ndarray:
+    """(n, 3) points of the world that a picture of a capsule or a mesh must hold."""
+    turn = Rotation.from_quat(shape.quaternion, scalar_first=True)
+    if shape.vertices is not None:
+        return turn.apply(shape.vertices) + shape.position
+    ends = shape.position + turn.apply([[0, 0, shape.size[1]], [0, 0, -shape.size[1]]])
+    return (ends[:, None] + shape.size[0] * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
+
+
+def upright(hand: Hand) -> Rotation:
+    """Turns the wrist frame so that the fingers point up and the palm, where the fingers curl to, faces +x."""
+    fingers = hand.keypoints[len(hand.links) + 1 :].mean(0)
+    up = fingers / np.linalg.norm(fingers)
+    links = list(hand.tip_links[1:])
+    curl = (mujoco_link_poses(hand, hand.q_closed)[0] - mujoco_link_poses(hand, hand.q_open)[0])[links].mean(0)
+    palm = curl - (curl @ up) * up
+    palm = palm / np.linalg.norm(palm)
+    return Rotation.from_matrix(np.stack([palm, np.cross(up, palm), up]))
