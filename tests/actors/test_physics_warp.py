@@ -123,7 +123,11 @@ def test_rows_are_what_mujoco_compiles():
             hand = slice(0, scene.nv - 6) if name.startswith("dof") else slice(0, body)
             np.testing.assert_allclose(getattr(catalogue.model, name)[hand], getattr(scene, name)[hand], rtol=1e-6)
         used = [g for g in range(scene.ngeom) if scene.geom_bodyid[g] == body]
-        filled = rows["geom_dataid"][n] >= 0 if not obj.primitive else rows["geom_rbound"][n] > 0.002
+        filled = (
+            rows["geom_dataid"][n] >= 0
+            if not all(piece.kind != "mesh" for piece in obj.pieces)
+            else rows["geom_rbound"][n] > 0.002
+        )
         assert filled.sum() == len(used)
         for name in ("geom_size", "geom_rbound", "geom_aabb"):
             mine = np.sort(rows[name][n][filled].reshape(len(used), -1), 0)

@@ -14,7 +14,7 @@ from common.transport.keys import FLOWS, Keys, flow
 from common.transport.ports import free_port, local_url, rank_url, reachable_url
 from common.transport.security import RIGHTS, Credentials
 from common.wire.codec import Message
-from common.wire.messages import RolloutForm
+from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from services.ops.certificates import create_authority, issue
@@ -142,7 +142,7 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
     url = {"memory": f"memory/{tmp_path}", "socket": f"socket/{tmp_path}/s", "tcp": local_url()}[scheme]
     with urls.listen(url, "learner") as transport:
         hub = LearnerHub(
-            transport, run="test", config_json="{}", epoch="e", schema="s",
+            transport, run="test", config_json="{}", run_id="e", schema="s",
             form=RolloutForm(T, B, D, A, half=True), staleness=StalenessManager(1, 1),
         )  # fmt: skip
         hub.publish_weights(bundle(0, "e"), 0)

@@ -68,7 +68,7 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
     actor = MadeUpActor(MemoryTransport(hub), journal=Journal(journal))
     said, complaints, filler = [], [], []
     with MemoryTransport(hub) as transport:
-        recorder = Recorder(transport, config.name, run_dir / LOGS, complain=complaints.append)
+        recorder = Recorder(transport, config.name, run_dir / LOGS, warn=complaints.append)
 
         def on_update(values):
             if values["update"] == 4:

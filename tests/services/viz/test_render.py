@@ -236,7 +236,7 @@ def test_an_older_recording_is_drawn_as_it_is_now() -> None:
     for now, before in zip(episode_shapes(made, 11), episode_shapes(older(made), 11), strict=True):
         for part, other in zip(vars(now).values(), vars(before).values(), strict=True):
             np.testing.assert_equal(other, part)
-    np.testing.assert_array_equal(episode_sheet(older(made), moments=1), episode_sheet(made, moments=1))
+    np.testing.assert_array_equal(episode_sheet(older(made), frames=1), episode_sheet(made, frames=1))
 
 
 def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -> None:
