@@ -22,9 +22,3 @@ def active_constraints(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
     """Names of the active constraints, weakest first; the heading always is."""
     blocks = active_blocks(arrays)
     return tuple(c.name for c in CONSTRAINTS if not c.optional or any(blocks.get(block) for block in c.blocks))
-
-
-def goal_arrays(arrays: Mapping[str, np.ndarray], constraint: str) -> dict[str, np.ndarray]:
-    """A constraint's goal arrays by field, object frame."""
-    prefix = f"goal/{constraint}_"
-    return {name.removeprefix(prefix): np.asarray(value) for name, value in arrays.items() if name.startswith(prefix)}
