@@ -54,7 +54,7 @@ def evaluate(
         references are used instead of the policy's own grasps. Objects without a set are left out.
       split: Of these sets all constraints, the 80 % for training, or those that are held out.
       episodes: Episodes in each row; of the table 'objects', episodes in all.
-      physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
+      physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
       pool: Number of procedural objects; 0 takes 64, and for the table 'objects' one an episode, at most 50,000.
       batch: Worlds that run side by side; 0 chooses by the engine.
       seed: Seed of constraints and episodes.
@@ -75,8 +75,8 @@ def evaluate(
     from services.assets.objects.named import objects_of
     from services.cli.console import tracked
     from services.evaluate.noise import LEVELS
-    from services.evaluate.scores import TABLES, tables_of, write_json
-    from services.evaluate.worlds import objects_in_words
+    from services.evaluate.scores import TABLES, known_rows, tables_of, write_json
+    from services.evaluate.worlds import objects_label
 
     for name, value, least in (("episodes", episodes, 1), ("pool", pool, 0), ("batch", batch, 0), ("seed", seed, 0)):
         if value < least:
@@ -93,8 +93,7 @@ def evaluate(
         bank = None
         if constraints is not None:
             given, bank = _captured(constraints, split, given, objects)
-        names = [name for key in TABLES if key in table or "all" in table for name in TABLES[key]]
-        names = [name for name in names if set(name.split("+")) <= set(loaded.task.constraints)]
+        names = known_rows((key for key in TABLES if key in table or "all" in table), loaded.task)
         evaluator: Any = None
         noisy: list[Any] = []
         left_out: list[CongraspError] = []
@@ -109,7 +108,7 @@ def evaluate(
             rows += noisy
         if "objects" in table or "all" in table:
             rows += _object_rows(loaded, given, pool or min(episodes, _MOST), episodes, settings, track)
-    source = objects_in_words(loaded, objects)
+    source = objects_label(loaded, objects)
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 160)
     title = f"{policy.name}, version {loaded.version}, on {source}, {engine}, friction {friction:g}"
     for shown in tables_of(rows, title):
@@ -146,7 +145,7 @@ def evaluate(
 def _captured(
     folder: pathlib.Path, split: Split, given: "list[GraspObject] | None", objects: pathlib.Path | None
 ) -> "tuple[list[GraspObject], ConstraintBank]":
-    """The objects that have a constraint set in a folder, and the task set of their sets."""
+    """The objects that have a constraint set in a folder, and the constraint bank of their sets."""
     from services.grasp.constraint_sets import bank_of, load_for
 
     if given is None:
