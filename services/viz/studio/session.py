@@ -243,6 +243,7 @@ class Session:
         path.write_bytes(body)
 
         def work(progress: Progress) -> None:
+            """Imports it."""
             progress(f"importing {name}: repair and convex pieces, up to a minute", 0.1)
             try:
                 obj, notes = self._take_mesh(path)
@@ -259,6 +260,7 @@ class Session:
             raise CongraspError(f"There is no policy for the hand '{name}'.", f"There is: {', '.join(self._hands)}.")
 
         def work(progress: Progress) -> None:
+            """Loads it."""
             progress(f"loading the policy of the hand {name}", 0.2)
             grasping = self._hands[name]()
             with self._lock:
@@ -271,6 +273,7 @@ class Session:
         """Makes or imports another object."""
 
         def work(progress: Progress) -> None:
+            """Makes it."""
             progress(f"loading {name}", 0.2)
             self._objects.get(name)
             with self._lock:
@@ -291,6 +294,7 @@ class Session:
         grasping = self._grasping
 
         def work(progress: Progress) -> str:
+            """Grasps; returns the motion's key."""
             episode = grasping.grasp(obj, request, progress)
             with self._lock:
                 self._number += 1
@@ -322,17 +326,8 @@ class Session:
 
 
 _ACTIONS = (
-    "set_rest_pose",
-    "ask",
-    "set_heading",
-    "snap_heading",
-    "roll",
-    "paint",
-    "fill",
-    "choose",
-    "close_hand",
-    "draw",
-    "suggest",
+    *("set_rest_pose", "ask", "choose", "set_heading", "snap_heading", "roll", "paint", "fill"),
+    *("close_hand", "draw", "suggest"),
 )
 """Methods of `Studio` that a page may call, with their arguments by name."""
 
