@@ -245,7 +245,7 @@ class Studio:
         return Resolution(found.goal.row(0), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0])
 
     @property
-    def words(self) -> list[str]:
+    def explanation(self) -> list[str]:
         """The effects of the priority rules, a sentence each, strongest constraint first."""
         return explain(self.asked, bool(self.resolution.redirected))
 
@@ -301,7 +301,7 @@ class Studio:
                 "overruled": bool(resolution.redirected)
                 or any("heading" in get_constraint(n).overrides for n in self.asked),
             },
-            "words": self.words,
+            "explanation": self.explanation,
             "trouble": self.trouble,
             "start": self._start(goal),
             "pose": None if self.pose is None else self._ghost(self.pose),

@@ -112,7 +112,7 @@ export class StudioPanel {
       mask.textContent = `${MASK_NAMES[name] ?? name} ${on ? "on" : "off"}`;
       return mask;
     }));
-    $("words").replaceChildren(...studio.words.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+    $("explanation").replaceChildren(...studio.explanation.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
     $("trouble").textContent = studio.trouble;
     this.#job(state.job);
     $("grasp").disabled = Boolean(studio.trouble) || state.job.running;

@@ -134,7 +134,7 @@ def test_the_rules_act_and_are_explained_when_constraints_are_ticked(opened: Any
     opened.check("[data-ask=pose]")
     opened.wait_for_selector("[data-mask=pose_wrist][data-on=true]")
     assert opened.get_attribute("[data-mask=affordance]", "data-on") == "false"
-    assert "affordance is overridden" in opened.inner_text("#words")
+    assert "affordance is overridden" in opened.inner_text("#explanation")
     opened.uncheck("[data-ask=pose]")
     opened.wait_for_selector("[data-mask=affordance][data-on=true]")
     assert site.studio["asked"] == ["affordance"]
@@ -176,7 +176,7 @@ def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
     path = np.array(site.studio["path"])
     assert len(path) == made_up.MadeUpGrasping().task.trajectory_points
     assert np.linalg.norm(np.diff(path, axis=0), axis=-1).sum() > 0.05
-    assert "wrist trajectory guides the wrist" in opened.inner_text("#words")
+    assert "wrist trajectory guides the wrist" in opened.inner_text("#explanation")
 
 
 def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: Any) -> None:
@@ -193,7 +193,7 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     assert page.is_visible("[data-ask=affordance]") and not page.is_visible("[data-ask=pose]")
     page.check("[data-ask=fingers]")
     page.wait_for_selector("[data-mask=fingers][data-on=true]")
-    assert "Only the named fingers" in page.inner_text("#words") and fingers() == ["thumb", "index"]
+    assert "Only the named fingers" in page.inner_text("#explanation") and fingers() == ["thumb", "index"]
     page.check("#other-constraints label:has-text('middle') input")
     eventually(lambda: fingers() == ["thumb", "index", "middle"])
     assert page.is_checked("[data-ask=fingers]")

@@ -32,7 +32,7 @@ def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
     assert tuple(request.constraints) == ("heading",)
     down = matrix(MUG.rest_poses[0][3:]) @ studio.arrow.direction
     np.testing.assert_allclose(down, [0, 0, -1], atol=1e-6)
-    assert studio.words == ["The heading guides the wrist."]
+    assert studio.explanation == ["The heading guides the wrist."]
     assert masks(studio) == dict.fromkeys(("affordance", "pose_finger", "pose_wrist", "trajectory"), False)
 
 
@@ -70,10 +70,10 @@ def test_the_rules_are_explained_and_set_the_masks(studio: Studio) -> None:
     studio.ask("affordance", True)
     studio.ask("pose", True)
     assert masks(studio) == {"affordance": False, "pose_finger": True, "pose_wrist": True, "trajectory": False}
-    assert any("affordance is overridden" in line for line in studio.words)
+    assert any("affordance is overridden" in line for line in studio.explanation)
     studio.ask("trajectory", True)
     assert masks(studio) == {"affordance": False, "pose_finger": True, "pose_wrist": False, "trajectory": True}
-    assert "guides the wrist" in studio.words[0] and "trajectory" in studio.words[0]
+    assert "guides the wrist" in studio.explanation[0] and "trajectory" in studio.explanation[0]
     studio.ask("pose", False)
     studio.ask("affordance", False)
     assert tuple(studio.request.constraints) == ("heading", "trajectory")
@@ -82,7 +82,7 @@ def test_the_rules_are_explained_and_set_the_masks(studio: Studio) -> None:
 def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studio) -> None:
     studio.paint([studio.arrow.position - INWARD * studio.arrow.direction], 0.03, avoid=True)
     view = studio.view()
-    assert view["active"]["overruled"] and any("turned towards O+" in line for line in view["words"])
+    assert view["active"]["overruled"] and any("turned towards O+" in line for line in view["explanation"])
     assert np.linalg.norm(np.subtract(view["active"]["direction"], studio.arrow.direction)) > 0.02
 
 
@@ -104,7 +104,7 @@ def test_a_drawn_path_keeps_its_begin_and_ends_at_the_wrist_of_the_grasp(studio:
     assert studio.path.position.shape == (TaskConfig().trajectory_points, 3)
     np.testing.assert_allclose(studio.path.position[0], drawn[0], atol=1e-6)
     np.testing.assert_allclose(studio.path.position[-1], studio.pose.position, atol=1e-6)
-    assert studio.trouble == "" and studio.words[0].startswith("The wrist trajectory")
+    assert studio.trouble == "" and studio.explanation[0].startswith("The wrist trajectory")
 
 
 def test_what_training_would_draw_can_be_suggested(studio: Studio) -> None:
