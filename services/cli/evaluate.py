@@ -1,7 +1,7 @@
 """`congrasp evaluate`: a policy by the paper's protocol."""
 
 import pathlib
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
@@ -9,6 +9,8 @@ from common.config import PhysicsName
 from common.errors import CongraspError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from common.objects.spec import GraspObject
     from common.task.bank import ConstraintBank
     from services.cli.console import Track
@@ -44,7 +46,7 @@ def evaluate(
     trajectories are made from its own grasps under headings, as the paper makes them for its hands.
 
     Args:
-      policy: A policy file (policy.safetensors of a run); by default one that comes with the package.
+      policy: A policy file (policy.safetensors of a run); by default a pretrained one.
       table: single: one constraint a row; composed: two; objects: the heading alone on many objects, by size, mass and
         family; noise: poses and trajectories with errors, as captured ones have; all: everything. Several may be
         named.
@@ -54,99 +56,163 @@ def evaluate(
         references are used instead of the policy's own grasps. Objects without a set are left out.
       split: Of these sets all constraints, the 80 % for training, or those that are held out.
       episodes: Episodes in each row; of the table 'objects', episodes in all.
-      physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
+      physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
       pool: Number of procedural objects; 0 takes 64, and for the table 'objects' one an episode, at most 50,000.
       batch: Worlds that run side by side; 0 chooses by the engine.
       seed: Seed of constraints and episodes.
       json: Also write the rows to this file.
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
-      hand: Whose policy of those that come with the package.
+      hand: Whose pretrained policy.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.
     """
-    import sys
-
-    from rich.console import Console
-
     from actors.physics import resolve_physics
-    from common.objects.pool import HELD_OUT_SEED
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
     from services.assets.objects.named import objects_of
     from services.cli.console import tracked
-    from services.evaluate.noise import LEVELS
-    from services.evaluate.scores import TABLES, tables_of, write_json
-    from services.evaluate.worlds import objects_in_words
+    from services.evaluate.scores import write_json
+    from services.evaluate.worlds import objects_label
 
-    for name, value, least in (("episodes", episodes, 1), ("pool", pool, 0), ("batch", batch, 0), ("seed", seed, 0)):
+    _check(friction, episodes=(episodes, 1), pool=(pool, 0), batch=(batch, 0), seed=(seed, 0))
+    policy = policy_file(policy, hand)
+    loaded = bundles.load(policy)
+    engine = resolve_physics(physics)
+    settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
+    with tracked() as track:
+        given, bank = objects_of(objects, track=track) if objects else None, None
+        if constraints is not None:
+            given, bank = _captured(constraints, split, given, objects)
+        found = _evaluate(loaded, given, bank, table, episodes, pool, settings, track, keep=pictures is not None)
+    source = objects_label(loaded, objects)
+    _show(found, f"{policy.name}, version {loaded.version}, on {source}, {engine}, friction {friction:g}")
+    if json is not None:
+        write_json(found.rows, json, _about(policy, loaded, objects, source, constraints, split) | settings)
+    if pictures is not None:
+        _draw(found, loaded, episodes, pictures)
+    return 0
+
+
+class _Found(NamedTuple):
+    """Results of an evaluation."""
+
+    evaluator: Any
+    """Of the rows by constraint; None if there are none."""
+    names: list[str]
+    """Rows by constraint that were evaluated."""
+    left_out: list[CongraspError]
+    """Why others were not."""
+    noisy: list[Any]
+    """Rows under noise."""
+    rows: list[Any]
+    """All rows."""
+
+
+def _check(friction: float, **counts: tuple[int, int]) -> None:
+    """Raises a CongraspError for a count (value, least) or a friction out of range."""
+    for name, (value, least) in counts.items():
         if value < least:
             raise CongraspError(f"--{name} is {value}.", f"It must be at least {least}.")
     if not 0.05 <= friction <= 10.0:
         raise CongraspError(f"--friction is {friction:g}.", "It must lie between 0.05 and 10.")
-    policy = policy_file(policy, hand)
-    loaded = bundles.load(policy)
-    engine = resolve_physics(physics)
-    rows = []
-    with tracked() as track:
-        given = objects_of(objects, track=track) if objects else None
-        settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
-        bank = None
-        if constraints is not None:
-            given, bank = _captured(constraints, split, given, objects)
-        names = [name for key in TABLES if key in table or "all" in table for name in TABLES[key]]
-        names = [name for name in names if set(name.split("+")) <= set(loaded.task.constraints)]
-        evaluator: Any = None
-        noisy: list[Any] = []
-        left_out: list[CongraspError] = []
-        if names:
-            evaluator = _evaluator(loaded, given, bank, pool or _POOL, settings, track)
-            names, left_out = evaluator.allowed(names)
-            advance = track("Episodes", len(names) * episodes)
-            rows += evaluator.rows(names, episodes, advance, keep=pictures is not None)
-        if "noise" in table or "all" in table:
-            evaluator = evaluator or _evaluator(loaded, given, bank, pool or _POOL, settings, track)
-            noisy = evaluator.rows_under_noise(track("Episodes under noise", len(LEVELS) * episodes), episodes)
-            rows += noisy
-        if "objects" in table or "all" in table:
-            rows += _object_rows(loaded, given, pool or min(episodes, _MOST), episodes, settings, track)
-    source = objects_in_words(loaded, objects)
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 160)
-    title = f"{policy.name}, version {loaded.version}, on {source}, {engine}, friction {friction:g}"
-    for shown in tables_of(rows, title):
+
+
+def _evaluate(
+    loaded: Any,
+    given: "list[GraspObject] | None",
+    bank: "ConstraintBank | None",
+    table: tuple[Table, ...],
+    episodes: int,
+    pool: int,
+    settings: dict[str, Any],
+    track: "Track",
+    *,
+    keep: bool,
+) -> _Found:
+    """The rows of the named tables; see `evaluate`."""
+    from services.evaluate.noise import LEVELS
+    from services.evaluate.scores import TABLES, known_rows
+
+    wanted = {*TABLES, "noise", "objects"} if "all" in table else set(table)
+    names = known_rows((key for key in TABLES if key in wanted), loaded.task)
+    rows: list[Any] = []
+    noisy: list[Any] = []
+    left_out: list[CongraspError] = []
+    evaluator: Any = None
+    if names or "noise" in wanted:
+        evaluator = _evaluator(loaded, given, bank, pool or _POOL, settings, track)
+    if names:
+        names, left_out = evaluator.allowed(names)
+        rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=keep)
+    if "noise" in wanted:
+        noisy = evaluator.rows_under_noise(track("Episodes under noise", len(LEVELS) * episodes), episodes)
+    many = []
+    if "objects" in wanted:
+        many = _object_rows(loaded, given, pool or min(episodes, _MOST), episodes, settings, track)
+    return _Found(evaluator, names, left_out, noisy, [*rows, *noisy, *many])
+
+
+def _console() -> "Console":
+    """Standard output, wide where it is no terminal."""
+    import sys
+
+    from rich.console import Console
+
+    return Console(highlight=False, width=None if sys.stdout.isatty() else 160)
+
+
+def _show(found: _Found, title: str) -> None:
+    """Prints the tables, and why rows were left out."""
+    from services.evaluate.scores import tables_of
+
+    console = _console()
+    for shown in tables_of(found.rows, title):
         console.print(shown)
-    for error in left_out:
+    for error in found.left_out:
         console.print(f"Left out: {error}", markup=False, soft_wrap=True)
-    if json is not None:
-        about = {
-            "policy": {"file": policy.name, "version": loaded.version, "transitions": loaded.transitions},
-            "objects": source,
-            "first_object_seed": None if objects else HELD_OUT_SEED,
-            "headings": loaded.task.headings,
-            "constraints": str(constraints) if constraints else None,
-            "split": split if constraints else None,
-            **settings,
-        }
-        write_json(rows, json, about)
-    if pictures is not None and noisy:
-        from services.evaluate.noise_sheet import draw_noise
 
+
+def _about(
+    policy: pathlib.Path,
+    loaded: Any,
+    objects: pathlib.Path | None,
+    source: str,
+    constraints: pathlib.Path | None,
+    split: Split,
+) -> dict[str, Any]:
+    """What the JSON file says beside rows and settings."""
+    from common.objects.pool import HELD_OUT_SEED
+
+    return {
+        "policy": {"file": policy.name, "version": loaded.version, "transitions": loaded.transitions},
+        "objects": source,
+        "first_object_seed": None if objects else HELD_OUT_SEED,
+        "headings": loaded.task.headings,
+        "constraints": str(constraints) if constraints else None,
+        "split": split if constraints else None,
+    }
+
+
+def _draw(found: _Found, loaded: Any, episodes: int, pictures: pathlib.Path) -> None:
+    """Draws curves and examples of noisy references, and episodes of the other rows."""
+    from services.evaluate.failures import failure_sheets
+    from services.evaluate.noise_sheet import draw_noise
+    from services.viz.sheets import save_png
+
+    console = _console()
+    if found.noisy:
         title = f"{loaded.spec.hand_name} hand, version {loaded.version}: {episodes} episodes a level"
-        draw_noise(evaluator, noisy, pictures, title)
+        draw_noise(found.evaluator, found.noisy, pictures, title)
         console.print(f"Curves and examples of noisy references are drawn in {pictures}.", soft_wrap=True)
-    if pictures is not None and names:
-        from services.evaluate.failures import failure_sheets
-        from services.viz.sheets import save_png
-
-        for name, sheet, _ in failure_sheets(evaluator, loaded, names, _PICTURED, _PICTURED):
-            save_png(pictures / f"{name}.png", sheet)
-            console.print(f"Episodes of '{name}' are drawn in {pictures}.", soft_wrap=True)
-    return 0
+    for name, sheet, _ in failure_sheets(found.evaluator, loaded, found.names, _PICTURED, _PICTURED):
+        save_png(pictures / f"{name}.png", sheet)
+        console.print(f"Episodes of '{name}' are drawn in {pictures}.", soft_wrap=True)
 
 
 def _captured(
     folder: pathlib.Path, split: Split, given: "list[GraspObject] | None", objects: pathlib.Path | None
 ) -> "tuple[list[GraspObject], ConstraintBank]":
-    """The objects that have a constraint set in a folder, and the task set of their sets."""
+    """The objects that have a constraint set in a folder, and the constraint bank of their sets."""
     from services.grasp.constraint_sets import bank_of, load_for
 
     if given is None:
@@ -165,6 +231,7 @@ def _evaluator(
     settings: dict[str, Any],
     track: "Track",
 ) -> Any:
+    """An evaluator of given objects, or of held-out procedural ones."""
     import os
 
     from common.config import ObjectsConfig
@@ -191,6 +258,7 @@ def _object_rows(
     settings: dict[str, Any],
     track: "Track",
 ) -> list[Any]:
+    """Rows of the heading on many objects."""
     import os
 
     from common.objects.pool import HELD_OUT_SEED

@@ -26,7 +26,7 @@ def report(
     seed: int = 0,
     hand: str = "human",
 ) -> int:
-    """Write one HTML file about a policy: results beside the paper's, episodes that fail and succeed, and its training.
+    """Write one HTML file about a policy: results beside the paper's, failed and successful episodes, and its training.
 
     It evaluates the policy by the paper's protocol first, and draws some of those very episodes. With 200 episodes a
     row that takes some minutes on a CPU; a first look: --episodes 16.
@@ -54,17 +54,17 @@ def report(
     from services.cli.console import tracked
     from services.evaluate.evaluator import Evaluator
     from services.evaluate.failures import failure_sheets
-    from services.evaluate.report import Made, Picture, causes_in_words, template, write_report
-    from services.evaluate.scores import TABLES
-    from services.evaluate.worlds import objects_in_words, two_seconds
+    from services.evaluate.report import Commands, Picture, count_causes, template, write_report
+    from services.evaluate.scores import TABLES, known_rows
+    from services.evaluate.worlds import objects_label, two_seconds
     from services.viz.sheets import png_of
 
     _check(out, episodes=episodes, pool=pool)
-    template()  # what is missing is said now, not after the evaluation
+    template()  # fails before the evaluation if a package is missing
     run_dir = source if source is not None and source.is_dir() else None
     file = _policy_of_run(run_dir) if run_dir else policy_file(source, hand)
     policy, engine = bundles.load(file), resolve_physics(physics)
-    names = [name for table in TABLES.values() for name in table]
+    names = known_rows(TABLES, policy.task)
     with tracked() as track:
         curves = list(curves_of(run_dir)) if run_dir else []
         given = (
@@ -78,16 +78,16 @@ def report(
         advance = track("Pictures", len(names))
         sheets = []
         for name, sheet, causes in failure_sheets(evaluator, policy, names, _PICTURED, _PICTURED):
-            sheets.append(Picture(name, png_of(sheet), causes_in_words(causes)))
+            sheets.append(Picture(name, png_of(sheet), count_causes(causes)))
             advance(len(sheets))
     subject = f"--policy {file}" if source else f"--hand {hand}"
     subject += f" --objects {objects}" if objects else f" --pool {pool}"
     flags = f"{subject} --episodes {episodes} --physics {engine} --seed {seed}"
     command = f"congrasp evaluate --table single composed {flags}"
-    made = Made(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
-    which = f"{len(given)} objects ({objects_in_words(policy, objects)})"
+    commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
+    which = f"{len(given)} objects ({objects_label(policy, objects)})"
     how = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
-    write_report(out, policy, file.name, rows, how, sheets, curves, made)
+    write_report(out, policy, file.name, rows, how, sheets, curves, commands)
     for error in left_out:
         print(f"Left out: {error}")
     print(f"The report is in {out}: open it in a browser.")

@@ -24,13 +24,13 @@ from common.task.bank import ConstraintBank, Draw
 from common.task.constraints import get_constraint, optional, require_known
 from common.task.types import Surface
 from common.wire.codec import Message
-from services.evaluate.noise import LEVELS, Noise, disturbed
+from services.evaluate.noise import LEVELS, Noise, with_noise
 from services.evaluate.scores import Row, Sample, active_mask, joined, matching, summarise
-from services.evaluate.worlds import NOMINAL_FRICTION, acting, mixture, protocol, two_seconds
+from services.evaluate.worlds import NOMINAL_FRICTION, evaluation_worker, protocol, sampling_config, two_seconds
 
 _BATCH = {"native": 64, "warp": 4096, "jax": 256}
 _PATIENCE = 100
-_TRIES = 40
+_ATTEMPTS = 40
 _REFERENCES = 4
 """References that an object needs, on average."""
 _KEPT = 8
@@ -79,7 +79,7 @@ class Evaluator:
         self._physics, self._threads, self._seed = physics, threads, seed
         self._batch = batch or _BATCH[physics]
         self._bank = bank or build_bank(self._hand, self.task, self.objects, seed)
-        self._referred = bank is not None
+        self._harvested = bank is not None
         self._kept: dict[str, dict[bool, list[Message]]] = {}
 
     def samples(
@@ -101,8 +101,8 @@ class Evaluator:
         Raises:
           CongraspError: no object of the pool allows a row's constraints, or too few resting poses do.
         """
-        with self._worker(mixture(self.task, constraints), episodes, traced=keep) as worker:
-            self._refer(worker, constraints)
+        with self._worker(sampling_config(self.task, constraints), episodes, traced=keep) as worker:
+            self._harvest_references(worker, constraints)
             if keep:
                 self._kept |= {constraint: {False: [], True: []} for constraint in constraints}
             return self._gather(worker, constraints, episodes, progress, keep)
@@ -122,12 +122,12 @@ class Evaluator:
           episodes: on each pool.
           progress: is told how many episodes of the present pool there are.
         """
-        with self._worker(mixture(self.task, [constraint]), episodes) as worker:
+        with self._worker(sampling_config(self.task, [constraint]), episodes) as worker:
             yield self._gather(worker, [constraint], episodes, progress)[constraint]
             for number, objects in enumerate(pools, 1):
                 self.objects = scale_objects(self._hand, self.task, objects)
                 self._bank = build_bank(self._hand, self.task, self.objects, self._seed + number)
-                self._referred = False
+                self._harvested = False
                 worker.replace_objects(self.objects, self._bank)
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
@@ -170,31 +170,31 @@ class Evaluator:
             raise errors[0]
         return allowed, errors
 
-    def references(self, progress: Callable[[int, int], None] = lambda filled, places: None) -> ConstraintBank:
-        """The task set with reference poses and trajectories from the policy's own grasps under headings.
+    def references(self, progress: Callable[[int, int], None] = lambda filled, slots: None) -> ConstraintBank:
+        """The constraint bank with reference poses and trajectories from the policy's own grasps under headings.
 
-        It grasps until every place is filled, or until `_TRIES` episodes a region of an object filled no further one.
+        It grasps until every slot is filled, or until `_ATTEMPTS` episodes a region of an object filled no further one.
 
         Args:
-          progress: is told how many places are filled, and how many there are: those on the whole surface of every
-            object, and on O+ where that can be approached.
+          progress: is told how many slots are filled, and how many there are: those on the whole surface of every
+            object, and on the graspable region where that can be approached.
         """
-        with self._worker(mixture(self.task, ["heading", "affordance"]), self._batch) as worker:
+        with self._worker(sampling_config(self.task, ["heading", "affordance"]), self._batch) as worker:
             regions = np.stack([np.ones(len(self.objects), bool), np.asarray(self._bank.has_affordance).any(-1)], -1)
-            places = int(regions.sum()) * self._bank.pose_q.shape[2]
+            slots = int(regions.sum()) * self._bank.pose_q.shape[2]
             worker.forget_references()
             filled = idle = 0
-            while filled < places and idle < _TRIES * regions.sum():
+            while filled < slots and idle < _ATTEMPTS * regions.sum():
                 worker.restart()
                 worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
                 worker.renew_references()
                 before, filled = filled, int(np.any(worker.bank.pose_valid, axis=2)[regions].sum())
                 idle = 0 if filled > before else idle + self._batch
-                progress(filled, places)
+                progress(filled, slots)
             return ConstraintBank(*(np.asarray(field) for field in worker.bank))
 
     def rows_under_noise(self, progress: Callable[[int], None], episodes: int) -> list[Row]:
-        """A row for each of `services.evaluate.noise.LEVELS`; see there. The same references are disturbed in all.
+        """A row for each of `services.evaluate.noise.LEVELS`; see there. All of them add noise to the same references.
 
         Args:
           progress: is told how many episodes of all rows there are.
@@ -202,10 +202,10 @@ class Evaluator:
         """
         rows: list[Row] = []
         for constraint, group in itertools.groupby(LEVELS, lambda noise: noise.constraint):
-            with self._worker(mixture(self.task, [constraint]), episodes) as worker:
-                self._refer(worker, [constraint])
+            with self._worker(sampling_config(self.task, [constraint]), episodes) as worker:
+                self._harvest_references(worker, [constraint])
                 for noise in group:
-                    worker.replace_objects(self.objects, disturbed(self._hand, self._bank, noise, self._seed))
+                    worker.replace_objects(self.objects, with_noise(self._hand, self._bank, noise, self._seed))
                     worker.restart()
                     advance = functools.partial(lambda done, n: progress(done + n), len(rows) * episodes)
                     sample = self._gather(worker, [constraint], episodes, advance)
@@ -216,17 +216,17 @@ class Evaluator:
         """An episode under a noisy reference in which the object is held to the end, if there is one."""
         kept = self._bank, self._kept
         try:
-            self._bank, self._kept = disturbed(self._hand, self._bank, noise, self._seed), {}
+            self._bank, self._kept = with_noise(self._hand, self._bank, noise, self._seed), {}
             return next(iter(self.examples(noise.constraint, 1, 0, self._batch)), None)
         finally:
             self._bank, self._kept = kept
 
-    def _refer(self, worker: RolloutWorker, constraints: Sequence[str]) -> None:
-        """References from the policy's own grasps under headings, as the paper makes them for its hands; once."""
-        asked = any(get_constraint(part).from_reference for name in constraints for part in name.split("+"))
-        if not self.task.own_references or self._referred or not asked:
+    def _harvest_references(self, worker: RolloutWorker, constraints: Sequence[str]) -> None:
+        """Takes references from the policy's own grasps under headings, as the paper makes them for its hands; once."""
+        needed = any(get_constraint(part).from_reference for name in constraints for part in name.split("+"))
+        if not self.task.own_references or self._harvested or not needed:
             return
-        self._referred = True
+        self._harvested = True
         worker.forget_references()
         wanted = _REFERENCES * len(self.objects)
         for _ in range(0, 2 * wanted, self._batch):
@@ -248,6 +248,11 @@ class Evaluator:
         progress: Callable[[int], None],
         keep: bool = False,
     ) -> dict[str, Sample]:
+        """Collects episodes until every row has enough; see `samples`.
+
+        Raises:
+          CongraspError: a row's constraints are not allowed, or hardly ever drawn.
+        """
         for constraint in constraints:
             self._check_available(constraint)
         found: dict[str, list[Sample]] = {constraint: [] for constraint in constraints}
@@ -310,20 +315,20 @@ class Evaluator:
         kept = self._kept[constraint]
         return [*kept[False][:failures], *kept[True][:successes]]
 
-    def episode(self, constraint: str, tries: int = 1) -> Message:
-        """An episode of one world under a set of constraints: the first that succeeds, or the last of `tries`.
+    def episode(self, constraint: str, attempts: int = 1) -> Message:
+        """An episode of one world under a set of constraints: the first that succeeds, or the last of `attempts`.
 
         Raises:
           CongraspError: the pool does not allow these constraints.
         """
         self._check_available(constraint)
-        with self._worker(mixture(self.task, [constraint]), 1, traced=True) as worker:
-            for _ in range(_PATIENCE * tries):
+        with self._worker(sampling_config(self.task, [constraint]), 1, traced=True) as worker:
+            for _ in range(_PATIENCE * attempts):
                 sample, message = self._batch_of_episodes(worker)
                 if not matching(sample.values, constraint, self.task)[0]:
                     continue
-                tries -= 1
-                if sample.values["success"][0] > 0 or not tries:
+                attempts -= 1
+                if sample.values["success"][0] > 0 or not attempts:
                     return message(0)
         raise CongraspError(f"No episode had the constraints '{constraint}'.", "Choose other objects.")
 
@@ -347,9 +352,9 @@ class Evaluator:
     def _worker(
         self, task: TaskConfig, episodes: int, traced: bool = False
     ) -> contextlib.AbstractContextManager[RolloutWorker]:
-        """Acting worlds, not many more than `episodes` of each row need."""
+        """A worker with not many more worlds than `episodes` of each row need."""
         rows = 2 ** sum(getattr(task, f"p_{constraint.name}") not in (0.0, 1.0) for constraint in optional(task))
-        return acting(
+        return evaluation_worker(
             self.bundle,
             task,
             self.objects,
@@ -390,6 +395,7 @@ class Evaluator:
         values = {name: finished[f"episode/{name}"] for name in metric_names(self.task)}
 
         def message(world: int) -> Message:
+            """The recording of one world's episode."""
             trace = Trace(
                 *(np.concatenate([np.asarray(x[:, world]) for x in field]) for field in zip(*traces, strict=True))
             )

@@ -1,4 +1,4 @@
-"""Failures and successes of a row as a contact sheet, each failure with its cause in words."""
+"""Failures and successes of a row as a contact sheet, each failure with its cause."""
 
 from collections.abc import Iterator, Sequence
 
@@ -10,9 +10,9 @@ from services.evaluate.evaluator import Evaluator
 from services.viz.render import episode_strip
 from services.viz.sheets import contact_sheet
 
-_MOMENTS = 5
+_FRAMES = 5
 _SIZE = (300, 225)
-_PUSHED = 0.05  # m that an object may move before the table goes
+_PUSHED = 0.05  # m that an object may move before the table is removed
 
 
 def cause(episode: Message, drop_height: float) -> str:
@@ -23,16 +23,16 @@ def cause(episode: Message, drop_height: float) -> str:
     if metrics["held"]:
         return "held"
     if metrics["moved_at_removal"] > _PUSHED:
-        return "pushed away before the table went"
+        return "pushed away before the table was removed"
     if not metrics["links_at_removal"]:
-        return "not touched when the table went"
+        return "not touched when the table was removed"
     removal = int(np.argmin(episode.arrays["table"]))
-    seconds = (fall(episode, drop_height) - removal) * episode.meta["control_dt"]
-    return f"slipped {seconds:.2f} s after the table went"
+    seconds = (fall_step(episode, drop_height) - removal) * episode.meta["control_dt"]
+    return f"slipped {seconds:.2f} s after the table was removed"
 
 
-def fall(episode: Message, drop_height: float) -> int:
-    """The step at which the object is `drop_height` (m) below where it was when the table went; the last if none is."""
+def fall_step(episode: Message, drop_height: float) -> int:
+    """The step at which the object is `drop_height` (m) below where it was at the table's removal, or the last one."""
     removal = int(np.argmin(episode.arrays["table"]))
     height = np.asarray(episode.arrays["object_position"])[:, 2]
     below = np.flatnonzero(height[removal:] < height[removal] - drop_height)
@@ -42,7 +42,7 @@ def fall(episode: Message, drop_height: float) -> int:
 def failure_sheets(
     evaluator: Evaluator, policy: PolicyBundle, constraints: Sequence[str], successes: int, failures: int
 ) -> Iterator[tuple[str, np.ndarray, Sequence[str]]]:
-    """Draws episodes of rows to the moment at which the object has fallen, or to the end, failures first.
+    """Draws episodes of rows up to the step at which the object has fallen, or to the end, failures first.
 
     Args:
       evaluator: of the policy; where it kept episodes, none are evaluated anew.
@@ -52,7 +52,7 @@ def failure_sheets(
       failures: how many of each to show, if there are so many.
 
     Yields:
-      For each row that has an episode to show: its name, the sheet (H, W, 3) uint8, and what became of each episode.
+      For each row that has an episode to show: its name, the sheet (H, W, 3) uint8, and the outcome of each episode.
     """
     for constraint in constraints:
         episodes = evaluator.examples(constraint, successes, failures)
@@ -61,11 +61,11 @@ def failure_sheets(
         images: list[np.ndarray] = []
         labels: list[str] = []
         causes = [cause(episode, evaluator.task.drop_height) for episode in episodes]
-        for episode, what in zip(episodes, causes, strict=True):
-            until, first = fall(episode, evaluator.task.drop_height), episode.meta["object"]
-            pictures, words = episode_strip(episode, _MOMENTS, _SIZE, first, f": {what}", until=until, quick=True)
-            images += pictures
-            labels += words
+        for episode, outcome in zip(episodes, causes, strict=True):
+            until, first = fall_step(episode, evaluator.task.drop_height), episode.meta["object"]
+            frames, captions = episode_strip(episode, _FRAMES, _SIZE, first, f": {outcome}", until=until, quick=True)
+            images += frames
+            labels += captions
         who = f"{policy.spec.hand_name} hand, version {policy.version}"
         title = f"{who}, {constraint}: {len(episodes)} episodes, failures first"
-        yield constraint, contact_sheet(images, labels, columns=_MOMENTS, title=title), causes
+        yield constraint, contact_sheet(images, labels, columns=_FRAMES, title=title), causes

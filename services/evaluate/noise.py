@@ -1,7 +1,7 @@
-"""Noisy references: what a policy makes of captured poses and trajectories that are wrong (paper, noisy constraints).
+"""Noisy references: how a policy follows captured poses and trajectories with errors (paper, noisy constraints).
 
-Each kind of noise is added to the reference poses or trajectories of a task set, and the same episodes are evaluated as
-those without noise; errors are measured against what was asked for, noise included.
+Each kind of noise is added to the reference poses or trajectories of a constraint bank, and the same episodes are
+evaluated as those without noise; errors are measured against what was requested, noise included.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ class Noise:
     """One kind of noise at one level."""
 
     constraint: str
-    """The row that it disturbs: pose or trajectory."""
+    """The row whose references get it: pose or trajectory."""
     kind: str
     """joints, depth or jitter; empty for none."""
     level: float
@@ -42,8 +42,8 @@ LEVELS = (
 """Rows of the table."""
 
 
-def disturbed(hand: Hand, bank: ConstraintBank, noise: Noise, seed: int) -> ConstraintBank:
-    """The task set with noisy references.
+def with_noise(hand: Hand, bank: ConstraintBank, noise: Noise, seed: int) -> ConstraintBank:
+    """The constraint bank with noisy references.
 
     * joints: an independent normal error of standard deviation `level` on every finger joint, kept within its limits.
     * depth: the wrist is moved along the hand's heading axis, into the object, by a uniform share of `level`.

@@ -1,4 +1,4 @@
-"""Pictures of noisy references: success and errors against the noise, and what the policy makes of the worst."""
+"""Figures of noisy references: success and errors against the noise, and a grasp under the worst of each kind."""
 
 import io
 import pathlib
@@ -21,7 +21,7 @@ _TITLES = {
     "jitter": "Trajectory: normal error of every waypoint",
 }
 _SUCCESS, _HELD, _ANGLE, _LENGTH = "#2f6fdb", "#1f9d88", "#b5373a", "#e08a2c"
-_MOMENTS = 5
+_FRAMES = 5
 _SIZE = (300, 225)
 
 
@@ -46,13 +46,13 @@ def draw_noise(evaluator: Evaluator, rows: Sequence[Row], folder: pathlib.Path, 
         if episode is None:
             continue
         first = f"{noise.constraint}, {noise.label}: {episode.meta['object']}"
-        pictures, words = episode_strip(episode, _MOMENTS, _SIZE, first, ", held")
-        images += pictures
-        labels += words
+        frames, captions = episode_strip(episode, _FRAMES, _SIZE, first, ", held")
+        images += frames
+        labels += captions
     if not images:
         return
-    text = "Asked for: the blue hand or the violet path, with errors. Done: the grey hand"
-    save_png(folder / "noise_examples.png", contact_sheet(images, labels, columns=_MOMENTS, title=text))
+    text = "Requested: the blue hand or the violet path, with noise. Executed: the grey hand"
+    save_png(folder / "noise_examples.png", contact_sheet(images, labels, columns=_FRAMES, title=text))
 
 
 def draw_curves(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
@@ -74,14 +74,14 @@ def draw_curves(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
     figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     grid = figure.subplots(2, len(_TITLES), sharex="col")
     pairs = list(zip(LEVELS, rows, strict=True))
-    for (above, below), (kind, words) in zip(grid.T, _TITLES.items(), strict=True):
+    for (above, below), (kind, heading) in zip(grid.T, _TITLES.items(), strict=True):
         constraint = next(noise.constraint for noise, _ in pairs if noise.kind == kind)
         shown = [(n, row) for n, row in pairs if n.kind == kind or (not n.kind and n.constraint == constraint)]
         unit, factor = ("rad", 1.0) if kind == "joints" else ("cm", 100.0)
         x = [factor * noise.level for noise, _ in shown]
         _rate(above, x, [row for _, row in shown], "success", _SUCCESS, "success")
         _rate(above, x, [row for _, row in shown], "held_2s", _HELD, "held for 2 s")
-        above.set_title(words, loc="left", fontsize=9)
+        above.set_title(heading, loc="left", fontsize=9)
         above.set_ylim(0, 102)
         above.set_ylabel("%")
         above.legend(frameon=False, fontsize=8, loc="lower left")
@@ -97,12 +97,14 @@ def draw_curves(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
 
 
 def _rate(axes: Any, x: Sequence[float], rows: Sequence[Row], name: str, colour: str, label: str) -> None:
+    """Draws a rate of `Row` in per cent with its interval."""
     low, middle, high = ([100 * (getattr(row, f"{name}{end}") or 0.0) for row in rows] for end in ("_low", "", "_high"))
     axes.plot(x, middle, "o-", color=colour, label=label)
     axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
 
 
 def _errors(axes: Any, x: Sequence[float], rows: Sequence[Row], prefix: str) -> None:
+    """Draws the mean errors of a constraint: angle in rad, length in dm."""
     for name, factor, unit, colour in (("rad", 1.0, "rad", _ANGLE), ("m", 10.0, "dm", _LENGTH)):
         values = [factor * value if (value := row.errors[f"{prefix}_{name}"]) is not None else np.nan for row in rows]
         axes.plot(x, values, "s-", color=colour, label=f"error, {unit}")

@@ -8,19 +8,16 @@ from typing import Any
 import numpy as np
 
 from common.errors import CongraspError
-from services.evaluate.scores import ERRORS
+from common.task.constraints import CONSTRAINTS
 from services.record.palette import INK
 from services.viz.plots import COLOURS, QUIET, new_figure, save, style
 
 _TITLES = {
-    "heading_rad": ("Heading, direction", "rad"),
-    "heading_m": ("Heading, position", "m"),
-    "pose_rad": ("Pose, joints", "rad"),
-    "pose_m": ("Pose, wrist", "m"),
-    "traj_rad": ("Trajectory, direction", "rad"),
-    "traj_m": ("Trajectory, position", "m"),
-    "affordance_ratio": ("Affordance, wrong contacts", "share"),
+    spec.column or spec.name: (f"{constraint.title.capitalize()} error", spec.unit or "share")
+    for constraint in CONSTRAINTS
+    for spec in constraint.errors
 }
+"""Title and unit of each error, by its name in the rows."""
 _COLUMNS = 4
 
 
@@ -68,18 +65,22 @@ def cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def _name(row: Mapping[str, Any]) -> str:
+    """Constraint and group."""
     return f"{row['constraint']}, {row['group']}" if row["group"] else str(row["constraint"])
 
 
 def _percent(rate: float | None) -> str:
+    """Empty where there is no rate."""
     return "" if rate is None else f"{100 * rate:.1f}"
 
 
 def _figure(value: float | None) -> str:
+    """Three digits; empty where there is no value."""
     return "" if value is None else f"{value:.3f}"
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Any:
+    """The figure of `cells`."""
     text = cells(rows)
     widths = [
         max(max(len(word) for word in cell.split("\n")) for cell in column)
@@ -109,6 +110,7 @@ def _wrapped(text: Sequence[Sequence[str]]) -> list[list[str]]:
 
 
 def _success(rows: Sequence[Mapping[str, Any]]) -> Any:
+    """Success of each row with its interval, beside the paper's."""
     figure = new_figure(7.2, 0.9 + 0.36 * len(rows), "Success, with 95 % intervals")
     axes = figure.subplots()
     y = np.arange(len(rows))[::-1]
@@ -126,8 +128,8 @@ def _success(rows: Sequence[Mapping[str, Any]]) -> Any:
 
 
 def _errors(rows: Sequence[Mapping[str, Any]]) -> Any:
-    names = [name for part in ERRORS.values() for name in part.values()]
-    shown = [name for name in names if any(name in row.get("quantiles", {}) for row in rows)]
+    """Cumulative distributions of the errors, a panel each."""
+    shown = [name for name in _TITLES if any(name in row.get("quantiles", {}) for row in rows)]
     columns = min(_COLUMNS, len(shown))
     lines = -(-len(shown) // columns)
     figure = new_figure(3.6 * columns, 0.6 + 2.8 * lines, "Errors of successful episodes: share of episodes below")

@@ -12,12 +12,13 @@ from common.config import TaskConfig
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.policy.bundle import PolicyBundle, content_hash
+from common.task.constraints import optional
 from common.wire.codec import encode
 from services.evaluate.scores import FORCES, Row, force_cells, paper_cells, rate_cells
 
 _LIMITS = (
-    "What it is for: grasps in simulation, of rigid objects that fit the hand, under headings, affordances, reference "
-    "poses and wrist trajectories in any combination. It observes exact poses and contacts.",
+    "What it is for: grasps in simulation, of rigid objects that fit the hand, under its constraints in any "
+    "combination. It observes exact poses and contacts.",
     "What it is not: it was never run on a physical hand, it does not see soft or jointed objects, and success in "
     "simulation says nothing about the safety of a robot.",
 )
@@ -29,13 +30,12 @@ class Picture:
 
     title: str
     png: bytes
-    words: str = ""
-    """What is to be seen."""
+    caption: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
-class Made:
-    """How the parts of a report are made again."""
+class Commands:
+    """Command lines that make the parts of a report again."""
 
     table: str
     pictures: str
@@ -50,7 +50,7 @@ def write_report(
     conditions: str,
     sheets: Sequence[Picture],
     curves: Sequence[Picture],
-    made: Made,
+    commands: Commands,
 ) -> None:
     """Writes the report, whole or not at all.
 
@@ -59,10 +59,10 @@ def write_report(
       policy: what it is about.
       name: of the policy's file.
       rows: the evaluation.
-      conditions: objects, engine and seed of the evaluation, in words.
+      conditions: a sentence on objects, engine and seed of the evaluation.
       sheets: episodes of each row.
       curves: of the training, where it was recorded.
-      made: commands.
+      commands: that make its parts again.
 
     Raises:
       CongraspError: jinja2 is absent, or the file cannot be written.
@@ -73,11 +73,11 @@ def write_report(
         conditions=conditions,
         rates=[{"cells": _compared(row), "verdict": _verdict(row)} for row in rows],
         forces={"columns": FORCES, "rows": [force_cells(row) for row in rows]},
-        command=made.table,
+        command=commands.table,
         sheets=[_embedded(sheet) for sheet in sheets],
-        pictures_command=made.pictures,
+        pictures_command=commands.pictures,
         curves=[_embedded(curve) for curve in curves],
-        curves_command=made.curves,
+        curves_command=commands.curves,
         facts=_facts(policy, name),
         limits=_LIMITS,
     )
@@ -95,12 +95,13 @@ def template() -> Any:
     return environment.from_string(pathlib.Path(__file__).with_suffix(".html").read_text(encoding="utf-8"))
 
 
-def causes_in_words(causes: Sequence[str]) -> str:
-    """Such as "2 held, 1 slipped 0.82 s after the table went"."""
+def count_causes(causes: Sequence[str]) -> str:
+    """Such as "2 held, 1 slipped 0.82 s after the table was removed"."""
     return ", ".join(f"{count} {cause}" for cause, count in collections.Counter(causes).items())
 
 
 def _summary(rows: Sequence[Row]) -> str:
+    """How many rows are better and worse than the paper's."""
     compared = [row for row in rows if row.paper]
     above = sum(row.success >= row.paper.success for row in compared if row.paper)
     clear = collections.Counter(_verdict(row) for row in compared)
@@ -119,22 +120,25 @@ def _compared(row: Row) -> tuple[str, ...]:
 
 
 def _verdict(row: Row) -> str:
+    """better or worse where the whole interval is, else empty."""
     if row.paper is None or row.success_low <= row.paper.success <= row.success_high:
         return ""
     return "better" if row.success_low > row.paper.success else "worse"
 
 
 def _embedded(picture: Picture) -> Mapping[str, Any]:
-    return {"title": picture.title, "words": picture.words, "image": base64.b64encode(picture.png).decode()}
+    """A picture for the template."""
+    return {"title": picture.title, "caption": picture.caption, "image": base64.b64encode(picture.png).decode()}
 
 
 def _trained(task: TaskConfig) -> str:
-    shares = {"an affordance": task.p_affordance, "a reference pose": task.p_pose, "a trajectory": task.p_trajectory}
-    words = [f"{name} in {100 * share:.0f} %" for name, share in shares.items()]
-    return f"headings: {task.headings}; of the episodes {', '.join(words)}"
+    """Probabilities of the constraints in training."""
+    parts = [f"{part.title} in {100 * getattr(task, f'p_{part.name}'):.0f} %" for part in optional(task)]
+    return f"headings: {task.headings}; of the episodes {', '.join(parts)}"
 
 
 def _facts(policy: PolicyBundle, name: str) -> list[tuple[str, str]]:
+    """Names and values of the last table."""
     task, network = policy.task, policy.spec.network
     return [
         ("file", name),

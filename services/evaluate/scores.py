@@ -2,9 +2,8 @@
 
 import dataclasses
 import json
-import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -145,11 +144,15 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     """95 % Wilson score interval of a rate."""
     if count == 0:
         return 0.0, 1.0
-    z, p = 1.959964, successes / count
-    middle = p + z * z / (2 * count)
-    spread = z * math.sqrt(p * (1 - p) / count + z * z / (4 * count * count))
-    low, high = (middle - spread) / (1 + z * z / count), (middle + spread) / (1 + z * z / count)
-    return max(low, 0.0), min(high, 1.0)
+    from scipy.stats import binomtest
+
+    interval = binomtest(successes, count).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def known_rows(tables: Iterable[str], task: TaskConfig) -> list[str]:
+    """Rows of some of `TABLES` whose constraints the task's policy knows."""
+    return [row for table in tables for row in TABLES[table] if set(row.split("+")) <= set(task.constraints)]
 
 
 def active_mask(constraint: str, task: TaskConfig) -> dict[str, bool]:
@@ -224,7 +227,7 @@ def _forces(sample: Sample) -> dict[str, float | None]:
     return row
 
 
-def thirds(values: np.ndarray, names: Sequence[str], unit: str, factor: float) -> tuple[np.ndarray, list[str]]:
+def terciles(values: np.ndarray, names: Sequence[str], unit: str, factor: float) -> tuple[np.ndarray, list[str]]:
     """Objects in three groups of equal number, by a property (N,).
 
     Returns:
@@ -242,12 +245,12 @@ def thirds(values: np.ndarray, names: Sequence[str], unit: str, factor: float) -
 def object_groups(sizes: np.ndarray, masses: np.ndarray, families: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Label and members (N,) bool of the groups of objects that the test on unseen geometry reports.
 
-    The paper stratifies by size without giving bounds: here they are thirds by the largest side (m), then thirds by
-    mass (kg), then families.
+    The paper stratifies by size without giving bounds: here they are terciles of the largest side (m), then terciles
+    of the mass (kg), then families.
     """
     groups = []
     for values, names, unit, factor in ((sizes, _SIZES, "cm", 100.0), (masses, ("light", "mid", "heavy"), "g", 1000.0)):
-        of_object, labels = thirds(values, names, unit, factor)
+        of_object, labels = terciles(values, names, unit, factor)
         groups += [(label, of_object == i) for i, label in enumerate(labels)]
     return groups + [(f"family {family}", families == family) for family in np.unique(families)]
 
@@ -259,7 +262,7 @@ def write_json(rows: Sequence[Row], path: pathlib.Path, about: dict[str, Any]) -
 
 RATES = ("constraint", "episodes", "success", "held 2 s", "error", "paper")
 """Columns of the table that compares with the paper; `rate_cells` fills them."""
-FORCES = ("constraint", "link, N", "sum, N", "torque, % of limit", "links", "diverged")
+FORCES = ("constraint", "link, N", "sum, N", "torque, % of limit", "links in contact at table removal", "diverged")
 """Columns of the table of forces after the removal (mean, 95th percentile); `force_cells` fills them."""
 
 
@@ -311,6 +314,7 @@ def tables_of(rows: Sequence[Row], title: str) -> list[Any]:
 
 
 def _name(row: Row) -> str:
+    """Constraint and group."""
     return f"{row.constraint}, {row.group}" if row.group else row.constraint
 
 
@@ -319,20 +323,22 @@ def _percent(rate: float) -> str:
 
 
 def _rate(rate: float | None, low: float | None, high: float | None) -> str:
+    """Such as "98.7 % (96.6-99.5)"."""
     if rate is None or low is None or high is None:
         return "-"
     return f"{_percent(rate)} ({100 * low:.1f}-{100 * high:.1f})"
 
 
 def _pair(mean: float | None, percentile: float | None, factor: float) -> str:
+    """Such as "7.1, 19.3"."""
     return "-" if mean is None or percentile is None else f"{factor * mean:.1f}, {factor * percentile:.1f}"
 
 
 def _errors(errors: dict[str, float | None] | dict[str, float]) -> str:
     """Such as "0.137 rad 0.020 m", constraint by constraint."""
-    words = []
+    parts = []
     for names in ERRORS.values():
         found = [(errors.get(name), _UNITS[name]) for name in names.values()]
         part = " ".join(f"{value:.3f} {unit}".strip() for value, unit in found if value is not None)
-        words += [part] if part else []
-    return ", ".join(words)
+        parts += [part] if part else []
+    return ", ".join(parts)

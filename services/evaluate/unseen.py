@@ -29,6 +29,7 @@ def procedural_pools(count: int, seed: int, largest: int = POOL) -> Iterator[lis
     with concurrent.futures.ThreadPoolExecutor(1) as background:
 
         def make(start: int) -> list[GraspObject]:
+            """One pool."""
             return parallel_map(procedural.generate, range(seed + start, seed + start + size), families[start:][:size])
 
         coming = background.submit(make, 0)
@@ -78,6 +79,7 @@ def evaluate_objects(
     traits: list[tuple[float, float, str]] = []
 
     def report(done: int) -> None:
+        """Adds the episodes of earlier pools."""
         progress(len(samples) * episodes + done)
 
     for sample in evaluator.samples_of_pools("heading", pools, episodes, report):

@@ -1,4 +1,4 @@
-"""The worlds of an evaluation: the task that is played in them, who acts, and what is measured at every step."""
+"""Worlds of an evaluation: their task, their worker, and what is measured at every step."""
 
 import contextlib
 import dataclasses
@@ -48,27 +48,28 @@ def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) ->
     )
 
 
-def mixture(task: TaskConfig, constraints: Sequence[str]) -> TaskConfig:
-    """The task whose episodes belong to these rows, each row with the same probability or more than others."""
-    asked = [constraint.split("+") for constraint in constraints]
+def sampling_config(task: TaskConfig, constraints: Sequence[str]) -> TaskConfig:
+    """The task that samples episodes of these rows: a constraint that only some of them have with probability 1/2."""
+    rows = [constraint.split("+") for constraint in constraints]
 
     def probability(part: str) -> float:
-        share = sum(part in parts for parts in asked) / len(asked)
+        """Of one constraint."""
+        share = sum(part in parts for parts in rows) / len(rows)
         return share if share in (0.0, 1.0) else 0.5
 
     shares: dict[str, Any] = {f"p_{constraint.name}": probability(constraint.name) for constraint in optional(task)}
     return dataclasses.replace(task, **shares)
 
 
-def objects_in_words(bundle: PolicyBundle, folder: pathlib.Path | None) -> str:
-    """What is grasped, and how much longer it is made for the policy's hand."""
+def objects_label(bundle: PolicyBundle, folder: pathlib.Path | None) -> str:
+    """Name of the objects' source, with the factor on their lengths for the policy's hand."""
     scale = object_scale(get_hand(bundle.spec.hand), bundle.task)
     source = str(folder) if folder else "held-out procedural objects"
     return source if scale == 1.0 else f"{source}, lengths x {scale:g} for the {bundle.spec.hand_name} hand"
 
 
 @contextlib.contextmanager
-def acting(
+def evaluation_worker(
     bundle: PolicyBundle,
     task: TaskConfig,
     objects: Sequence[GraspObject],
@@ -80,7 +81,7 @@ def acting(
     seed: int,
     traced: slice,
 ) -> Iterator[RolloutWorker]:
-    """Worlds that act by the policy's mean.
+    """A worker whose worlds act by the policy's mean.
 
     Each step's probe holds forces of the links (B, L), N, and finger torques (B, F) as shares of their limits.
 
@@ -97,10 +98,12 @@ def acting(
     """
     layout, hand = bundle.spec.layout, get_hand(bundle.spec.hand)
 
-    def policy(acting: Any, observation: Array, key: Array) -> tuple[Array, Array]:
-        return mean_action(layout, acting, observation), observation[..., 0] * 0.0
+    def policy(parameters: Any, observation: Array, key: Array) -> tuple[Array, Array]:
+        """Mean action (B, A), and a log probability (B,) that nobody reads."""
+        return mean_action(layout, parameters, observation), observation[..., 0] * 0.0
 
     def probe(scene: Scene) -> tuple[Array, Array]:
+        """Forces and torques of one step."""
         force = jnp.linalg.norm(scene.features.force, axis=-1)
         return force.astype(jnp.float16), torque_share(scene).astype(jnp.float16)
 

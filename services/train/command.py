@@ -26,7 +26,7 @@ from learner.algorithms import make_algorithm
 from learner.run_directory import CONFIG_FILE, LOGS, POLICY_FILE, continue_run, create_run
 from services.evaluate.evaluator import Evaluator
 from services.evaluate.scores import Row
-from services.evaluate.showcase import CONSTRAINTS, showcase
+from services.evaluate.showcase import showcase
 from services.ops.shutdown import on_signal
 from services.serve.client import PolicyClient
 from services.serve.load import example_episode, one_answer, serving, wait_until_ready
@@ -347,7 +347,7 @@ def _live_query(run_dir: pathlib.Path, hand: str) -> None:
 def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> None:
     """A successful episode if a few attempts find one."""
     evaluator = _evaluator(policy, config, 0, 1)
-    save_png(run_dir / EPISODE, episode_sheet(evaluator.episode("heading", tries=12)))
+    save_png(run_dir / EPISODE, episode_sheet(evaluator.episode("heading", attempts=12)))
 
 
 def _pretrained_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
@@ -355,8 +355,8 @@ def _pretrained_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
     with console.status("The policy that comes with congrasp …") as status:
         grasps = showcase(bundles.load(policy), run_dir / SHIPPED, lambda text: status.update(f"{text} …"))
     console.print(
-        f"The policy that comes with congrasp, trained on the full task: {grasps} of {len(CONSTRAINTS)} grasps, "
-        f"one under each constraint ({', '.join(CONSTRAINTS)}).",
+        f"The policy that comes with congrasp, trained on the full task: {sum(grasps.values())} of {len(grasps)} "
+        f"grasps, one under each constraint ({', '.join(grasps)}).",
         soft_wrap=True,
     )
 

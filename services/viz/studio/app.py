@@ -74,19 +74,19 @@ def open_view(
 def _of_run(
     connect: str, run: str, certs: pathlib.Path | None, watching: Transport, stack: contextlib.ExitStack
 ) -> dict[str, Callable[[], PolicyGrasping]]:
-    """The policy of a run; who may only watch it gets those that come with the package."""
+    """The policy of a run; with an observer's certificate alone the pretrained ones."""
     pulling = watching
     if certs is not None:
         try:
             pulling = stack.enter_context(urls.connect(connect, "server", certs=certs))
         except CongraspError as error:
-            log("warning", f"{error} Until then the studio grasps with the policies that come with congrasp.")
+            log("warning", f"{error} The studio grasps with the pretrained policies.")
             return _pretrained()
     return {"of the run": functools.partial(PolicyGrasping, follow_run(pulling, run), f"the run '{run}'")}
 
 
 def _pretrained() -> dict[str, Callable[[], PolicyGrasping]]:
-    """The policies that come with the package, by the names of their hands."""
+    """The pretrained policies, by the names of their hands."""
     return {
         name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
         for name in shipped_hands()
@@ -108,7 +108,7 @@ def catalogue(objects: pathlib.Path | None) -> Catalogue:
 
 
 def take_mesh(path: pathlib.Path) -> tuple[GraspObject, list[str]]:
-    """Imports one mesh; what the user should know about it comes with it."""
+    """Imports one mesh; with notes for the user."""
     obj = one_object(path, _GUESS)
     return obj, list(obj.notes)
 

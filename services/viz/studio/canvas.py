@@ -1,4 +1,4 @@
-"""An object's surface as the studio paints it: what must not be touched, and a mesh fine enough to show it."""
+"""An object's surface as the studio paints it: the avoid region, and a mesh fine enough to show it."""
 
 import itertools
 from typing import Any
@@ -19,7 +19,7 @@ class Canvas:
     """The paint on one object, none at first.
 
     Attributes:
-      minus: (512,) bool, surface points that are painted as O-.
+      avoid: (512,) bool, surface points of the painted avoid region.
       vertices, faces: (V, 3), (E, 3) of the mesh that is painted on.
       shown: (V,) bool, vertices that are painted.
       version: changes with the paint, and is another for every canvas.
@@ -31,7 +31,7 @@ class Canvas:
         self.vertices, self.faces = _finer(obj.visual_vertices, obj.visual_faces)
         self._set(np.zeros(len(obj.points), bool), np.zeros(len(self.vertices), bool))
 
-    def brush(self, points: Any, radius: float, minus: bool) -> None:
+    def brush(self, points: Any, radius: float, avoid: bool) -> None:
         """Paints what is within `radius` (m) of points (N, 3), or takes the paint away."""
         strokes = np.asarray(points, float)
         if strokes.ndim != 2 or strokes.shape[1:] != (3,) or not np.isfinite(strokes).all() or len(strokes) > 2000:
@@ -42,22 +42,22 @@ class Canvas:
         def brushed(places: np.ndarray, before: np.ndarray) -> np.ndarray:
             """What is painted of some places after a stroke."""
             squared = ((places[:, None] - strokes[None]) ** 2).sum(-1).min(-1, initial=np.inf)
-            return np.where(squared <= radius**2, minus, before)
+            return np.where(squared <= radius**2, avoid, before)
 
-        self._set(brushed(self._obj.points, self.minus), brushed(self.vertices, self.shown))
+        self._set(brushed(self._obj.points, self.avoid), brushed(self.vertices, self.shown))
 
-    def fill(self, minus: bool) -> None:
+    def fill(self, avoid: bool) -> None:
         """Paints everything in one colour."""
-        self._set(np.full_like(self.minus, minus), np.full_like(self.shown, minus))
+        self._set(np.full_like(self.avoid, avoid), np.full_like(self.shown, avoid))
 
     def take_parts(self) -> None:
         """The paint that an object came with: its non-graspable parts."""
-        minus = self._obj.non_graspable_points
-        self._set(minus, minus[cKDTree(self._obj.points).query(self.vertices)[1]])
+        avoid = self._obj.non_graspable_points
+        self._set(avoid, avoid[cKDTree(self._obj.points).query(self.vertices)[1]])
 
-    def _set(self, minus: np.ndarray, shown: np.ndarray) -> None:
+    def _set(self, avoid: np.ndarray, shown: np.ndarray) -> None:
         """Takes new paint."""
-        self.minus, self.shown, self.version = minus, shown, next(_versions)
+        self.avoid, self.shown, self.version = avoid, shown, next(_versions)
 
 
 def _finer(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Grasps of a policy as the studio asks for them: exactly as drawn, and a little beside it where that fails."""
+"""Grasps of a policy as the studio asks for them: exactly as drawn, and close to it where that fails."""
 
 import dataclasses
 import os
@@ -74,7 +74,7 @@ class PolicyGrasping:
                 self._policy = newer
             self._trouble = ""
         except TransportError:
-            self._trouble = "The learner is away; these are its last weights."
+            self._trouble = "The learner is disconnected; these are its last weights."
         except CongraspError as error:
             self._trouble = str(error)
 
@@ -113,7 +113,7 @@ class PolicyGrasping:
 def _episodes(
     hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest
 ) -> tuple[RequestedEpisodes, np.ndarray]:
-    """`ATTEMPTS` episodes, the first as drawn; and (B,) metres by which each comes beside that."""
+    """`ATTEMPTS` episodes, the first as drawn; and how far (B,) in m each is beside that."""
     rng = np.random.default_rng(0)
     goal = jax.tree.map(lambda array: np.repeat(np.asarray(array)[None], ATTEMPTS, 0), goal_of(hand, task, request))
     others = np.arange(ATTEMPTS) > 0
@@ -130,15 +130,16 @@ def _episodes(
         if "position" in constraint.arrays:
             place = goal[constraint.name].position
             goal = goal.replace(constraint.name, position=place + shift.reshape(-1, *[1] * (place.ndim - 2), 3))
-    asked = {
+    requested = {
         constraint.name: np.full(ATTEMPTS, constraint.name in request.constraints) for constraint in optional(task)
     }
     surface = Surface(*(np.repeat(np.asarray(field)[None], ATTEMPTS, 0) for field in _surface(task, obj)))
     rest = np.repeat(obj.rest_poses[request.rest or 0][None].astype(np.float32), ATTEMPTS, 0)
-    return RequestedEpisodes(goal, asked, surface, rest), np.linalg.norm(shift, axis=-1)
+    return RequestedEpisodes(goal, requested, surface, rest), np.linalg.norm(shift, axis=-1)
 
 
 def _surface(task: TaskConfig, obj: GraspObject) -> Surface:
+    """Its surface points (N, 3) and which of them are in the avoid region (N,), object frame."""
     return Surface(obj.points[: task.surface_points], obj.non_graspable_points[: task.surface_points])
 
 
@@ -148,6 +149,7 @@ def _best(outcome: Outcome, constraints: tuple[str, ...]) -> int:
 
 
 def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
+    """Why another grasp than the drawn one is shown, or that none held; empty otherwise."""
     held = outcome.metrics["held"] > 0
     if not held.any():
         return f"Neither what was drawn nor {ATTEMPTS - 1} others near it held. Try another arrow."

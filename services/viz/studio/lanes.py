@@ -25,7 +25,7 @@ class Lane(NamedTuple):
     """(T,) bool."""
     counts: np.ndarray
     """(T,) bool: the constraint is meant for this step (a heading for the grasp, a path for the approach)."""
-    words: str
+    legend: str
     """What is measured, and up to where it is met."""
     errors: Mapping[str, np.ndarray]
     """(T,) by name with its unit."""
@@ -46,14 +46,15 @@ def lanes(episode: Message) -> dict[str, Lane]:
 
 
 def _lane(errors: Sequence[ErrorSpec], arrays: Mapping[str, np.ndarray], table: np.ndarray) -> Lane:
+    """The lane of one constraint from its recorded errors (T,)."""
     values = {spec: arrays[f"error/{spec.name}"] for spec in errors}
     met = np.all([value <= spec.tolerance for spec, value in values.items()], 0)
     counts = table if errors[0].window == "approach" else ~table
-    words = []
+    parts = []
     for spec in errors:
         factor, unit = _UNITS[spec.unit]
-        words.append(f"{spec.meaning}: {factor * spec.tolerance:.0f}{unit} at most")
-    return Lane(met, counts, "; ".join(words), {spec.unit or "share": value for spec, value in values.items()})
+        parts.append(f"{spec.meaning}: {factor * spec.tolerance:.0f}{unit} at most")
+    return Lane(met, counts, "; ".join(parts), {spec.unit or "share": value for spec, value in values.items()})
 
 
 def _turn(quaternion: Any) -> Rotation:
@@ -84,5 +85,4 @@ def for_page(episode: Message) -> Message:
         position, quaternion = mujoco_link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
         arrays["ghost_position"] = (turn.apply(position) + episode.arrays["goal/pose_position"]).astype(np.float32)
         arrays["ghost_quaternion"] = (turn * _turn(quaternion)).as_quat(scalar_first=True).astype(np.float32)
-    words = {name: lane.words for name, lane in found.items()}
-    return Message(arrays, {**episode.meta, "lanes": words})
+    return Message(arrays, {**episode.meta, "lanes": {name: lane.legend for name, lane in found.items()}})

@@ -7,7 +7,7 @@ import socket
 import threading
 import urllib.parse
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from common.errors import CongraspError, TransportError
 from common.wire.codec import Message, encode
@@ -26,11 +26,11 @@ _POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' 
 _TIMEOUT = 30.0  # seconds that a request may take to arrive
 
 
-class Download:
+class Download(NamedTuple):
     """Bytes that a browser saves under a name."""
 
-    def __init__(self, name: str, data: bytes):
-        self.name, self.data = name, data
+    name: str
+    data: bytes
 
 
 Answer = dict[str, Any] | list[Any] | Message | Download
@@ -61,6 +61,7 @@ class PageServer:
             routes = (gets, posts)
 
             def allowed(self) -> bool:
+                """Whether it comes from the page itself."""
                 return server._allowed(self)
 
         try:
@@ -103,6 +104,7 @@ class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, address: tuple[str, int], handler: Any):
+        """Listens at (interface, port)."""
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
         super().__init__(address, handler)
@@ -136,7 +138,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         length = int(self.headers.get("Content-Length") or -1)
         if not 0 <= length <= MOST_BYTES:
             self.close_connection = True
-            message = "The request says no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
+            message = "The request has no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
             self._send(413, "application/json", json.dumps({"error": message}).encode())
             return
         body = self.rfile.read(length)

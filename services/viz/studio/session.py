@@ -96,7 +96,7 @@ class Session:
         Args:
           hands: by name, what loads a policy.
           objects: what can be chosen.
-          take_mesh: imports an uploaded mesh, and says what the user should know about it.
+          take_mesh: imports an uploaded mesh, with notes for the user.
           window: what is known of a run, or None.
           recordings: its episodes on disk, or None.
         """
@@ -118,11 +118,11 @@ class Session:
             "/api/job": lambda query: self._jobs.state(),
             "/api/hand": lambda query: hand_message(query.get("name", self._hand)),
             "/api/object": lambda query: self.mesh(),
-            "/api/paint": lambda query: Message({"minus": self._studio.canvas.shown}, {}),
+            "/api/paint": lambda query: Message({"avoid": self._studio.canvas.shown}, {}),
             "/api/motion": lambda query: for_page(self.motion(query.get("id", ""))),
             "/api/export": lambda query: self.export(query.get("id", ""), query.get("kind", "")),
             "/api/training": lambda query: self.training(query.get("names", "")),
-            "/api/moment": lambda query: self.moment(query.get("time", ""), query.get("seconds", "")),
+            "/api/episodes": lambda query: self.episodes_around(query.get("time", ""), query.get("seconds", "")),
         }
         self.posts: dict[str, Post] = {"/api/do": self._do, "/api/upload": self._upload}
 
@@ -200,22 +200,22 @@ class Session:
             raise CongraspError("The studio follows no run.", "Start it with --connect, or with --recordings.")
         return self._window.view([name for name in names.split(",") if name])
 
-    def moment(self, time: str, seconds: str) -> dict[str, Any]:
+    def episodes_around(self, time: str, seconds: str) -> dict[str, Any]:
         """Episodes that were recorded around a time."""
         if self._recordings is None:
             raise CongraspError("No recordings were named.", "Start the studio with --recordings FOLDER.")
         try:
             when, around = float(time), float(seconds)
         except ValueError:
-            raise CongraspError("A moment needs two numbers: time and seconds.") from None
+            raise CongraspError("A search for episodes needs two numbers: time and seconds.") from None
         reach, episodes = self._recordings.around(when, min(max(around, 0.1), 3600.0))
         return {"seconds": reach, "episodes": episodes}
 
     def _do(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
         """One action of the user; answers with the new state."""
         try:
-            wish = json_object(body)
-            action = wish.pop("action")
+            request = json_object(body)
+            action = request.pop("action")
         except (ValueError, KeyError):
             raise CongraspError("The request is not a JSON object with an 'action'.") from None
         actions: dict[str, Callable[..., Any]] = {
@@ -229,9 +229,9 @@ class Session:
             raise CongraspError(f"The studio cannot do '{str(action)[:40]}'.", f"It can: {', '.join(actions)}.")
         with self._lock:
             try:
-                actions[action](**wish)
+                actions[action](**request)
             except TypeError as error:
-                raise CongraspError(f"'{action}' was asked for with other values than it takes ({error}).") from None
+                raise CongraspError(f"'{action}' takes other values ({error}).") from None
         return self.state()
 
     def _upload(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
@@ -243,6 +243,7 @@ class Session:
         path.write_bytes(body)
 
         def work(progress: Progress) -> None:
+            """Imports it."""
             progress(f"importing {name}: repair and convex pieces, up to a minute", 0.1)
             try:
                 obj, notes = self._take_mesh(path)
@@ -254,10 +255,12 @@ class Session:
         return self._jobs.start(f"importing {name}", work)
 
     def _choose_hand(self, name: str) -> None:
+        """Loads the policy of another hand."""
         if name not in self._hands:
             raise CongraspError(f"There is no policy for the hand '{name}'.", f"There is: {', '.join(self._hands)}.")
 
         def work(progress: Progress) -> None:
+            """Loads it."""
             progress(f"loading the policy of the hand {name}", 0.2)
             grasping = self._hands[name]()
             with self._lock:
@@ -267,7 +270,10 @@ class Session:
         self._jobs.start(f"loading the policy of the hand {name}", work)
 
     def _choose_object(self, name: str) -> None:
+        """Makes or imports another object."""
+
         def work(progress: Progress) -> None:
+            """Makes it."""
             progress(f"loading {name}", 0.2)
             self._objects.get(name)
             with self._lock:
@@ -278,14 +284,17 @@ class Session:
         self._jobs.start(f"loading {name}", work)
 
     def _show(self, name: str, notes: Sequence[str] = ()) -> None:
+        """Puts an object that is there into the studio."""
         self._studio.take(self._objects.get(name))
         self._object, self._notes = name, list(notes)
 
     def _grasp(self) -> None:
+        """Begins the grasp that is requested; its motion is kept."""
         request, obj = self._studio.request, self._studio.labelled
         grasping = self._grasping
 
         def work(progress: Progress) -> str:
+            """Grasps; returns the motion's key."""
             episode = grasping.grasp(obj, request, progress)
             with self._lock:
                 self._number += 1
@@ -297,9 +306,11 @@ class Session:
         self._jobs.start("grasping", work)
 
     def _forget(self, id: str) -> None:
+        """Deletes a motion."""
         self._motions.pop(id, None)
 
     def _described(self, key: str) -> dict[str, Any]:
+        """What a list shows of a motion."""
         episode = self._motions[key]
         meta, metrics = episode.meta, episode.meta.get("metrics", {})
         return {
@@ -314,7 +325,10 @@ class Session:
         }
 
 
-_ACTIONS = ("lay", "ask", "point", "aim", "roll", "paint", "fill", "choose", "close_hand", "draw", "suggest")
+_ACTIONS = (
+    *("set_rest_pose", "ask", "choose", "set_heading", "snap_heading", "roll", "paint", "fill"),
+    *("close_hand", "draw", "suggest"),
+)
 """Methods of `Studio` that a page may call, with their arguments by name."""
 
 

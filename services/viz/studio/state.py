@@ -1,4 +1,4 @@
-"""What the user of the studio asks for, without any browser: object, constraints, and what the priority rules do."""
+"""The request of the studio's user, without any browser: object, constraints, and what the priority rules do."""
 
 import dataclasses
 import functools
@@ -60,7 +60,7 @@ class Studio:
       rest: index of its resting pose.
       asked: names of the optional constraints that are switched on.
       arrow: the heading.
-      canvas: the object's surface, with what is painted on it as O-.
+      canvas: the object's surface, with the painted avoid region.
     """
 
     def __init__(self, hand: Hand, task: TaskConfig, obj: GraspObject):
@@ -69,7 +69,7 @@ class Studio:
         self.take(obj)
 
     def take(self, obj: GraspObject) -> None:
-        """Another object: what was asked of the one before is gone."""
+        """Another object, with nothing requested but its heading from above."""
         self.obj, self.rest = obj, 0
         self.asked: set[str] = set()
         self.canvas = Canvas(obj)
@@ -82,7 +82,7 @@ class Studio:
         self._next = {"heading": 0, "pose": 0, "trajectory": 0}
         self.arrow = self._from_above()
 
-    def lay(self, rest: int) -> None:
+    def set_rest_pose(self, rest: int) -> None:
         """Another resting pose."""
         if not 0 <= rest < len(self.obj.rest_poses):
             raise CongraspError(f"The object '{self.obj.name}' has no resting pose {rest + 1}.")
@@ -92,7 +92,9 @@ class Studio:
     def ask(self, constraint: str, on: bool) -> None:
         """Switches an optional constraint; what it needs and is not there yet is suggested."""
         require_known([constraint], self.task)
-        if on and constraint == "affordance" and not self.canvas.minus.any():
+        if not get_constraint(constraint).optional:
+            raise CongraspError(f"The {constraint} is always active.", "Set it with the arrow.")
+        if on and constraint == "affordance" and not self.canvas.avoid.any():
             self.canvas.take_parts()
         if on and constraint == "pose" and self.pose is None:
             self.close_hand()
@@ -111,8 +113,8 @@ class Studio:
         self.others[constraint] = {**self.others[constraint], field: np.array([bool(value) for value in values])}
         self.asked.add(constraint)
 
-    def point(self, position: Any, direction: Any, cross: Any = None) -> None:
-        """Puts the approach arrow somewhere.
+    def set_heading(self, position: Any, direction: Any, cross: Any = None) -> None:
+        """Sets the heading.
 
         Args:
           position: (3,) target in the object frame, m.
@@ -127,10 +129,10 @@ class Studio:
         wanted = self.arrow.cross if cross is None else _vector("arrow's roll", cross)
         self.arrow = Arrow(position, direction, _orthogonal(wanted, direction))
 
-    def aim(self, surface: Any, direction: Any) -> None:
-        """Puts the arrow through a point (3,) of the surface: its target is as deep inside as in training."""
+    def snap_heading(self, surface: Any, direction: Any) -> None:
+        """Sets the heading through a point (3,) of the surface: its target is as deep inside as in training."""
         surface, direction = _vector("point", surface), _vector("arrow's direction", direction)
-        self.point(surface + INWARD * direction / max(1e-6, float(np.linalg.norm(direction))), direction)
+        self.set_heading(surface + INWARD * direction / max(1e-6, float(np.linalg.norm(direction))), direction)
 
     def roll(self, angle: float) -> None:
         """Turns the hand around the arrow, by an angle in rad."""
@@ -138,17 +140,17 @@ class Studio:
         other = np.cross(self.arrow.direction, self.arrow.cross)
         self.arrow = self.arrow._replace(cross=np.cos(angle) * self.arrow.cross + np.sin(angle) * other)
 
-    def paint(self, points: Any, radius: float, minus: bool) -> None:
-        """Brushes over points (N, 3) of the surface: the hand must not touch there, or may again.
+    def paint(self, points: Any, radius: float, avoid: bool) -> None:
+        """Brushes over points (N, 3) of the surface: they join the avoid region, or leave it.
 
         Paint asks for the affordance; without any it is asked for no longer.
         """
-        self.canvas.brush(points, radius, minus)
+        self.canvas.brush(points, radius, avoid)
         self._repainted()
 
-    def fill(self, minus: bool) -> None:
+    def fill(self, avoid: bool) -> None:
         """Paints everything in one colour."""
-        self.canvas.fill(minus)
+        self.canvas.fill(avoid)
         self._repainted()
 
     def close_hand(self) -> None:
@@ -188,8 +190,8 @@ class Studio:
         if constraint not in self._next:
             raise CongraspError(f"Nothing can be suggested for '{constraint}'.", "Choose heading, pose or trajectory.")
         sets = self._constraint_sets().arrays
-        variant = int("affordance" in self.asked and bool(self.canvas.minus.any()))
-        allowed = sets["heading/allowed" if constraint == "heading" else "pose/allowed"][variant, self.rest]
+        region = int("affordance" in self.asked and bool(self.canvas.avoid.any()))
+        allowed = sets["heading/allowed" if constraint == "heading" else "pose/allowed"][region, self.rest]
         found = np.flatnonzero(allowed)
         if not len(found):
             raise CongraspError(
@@ -198,11 +200,11 @@ class Studio:
             )
         pick = found[(self._next[constraint] * 7919) % len(found)]
         self._next[constraint] += 1
-        at = (variant, pick)
+        at = (region, pick)
         if constraint == "heading":
             direction = sets["heading/direction"][at]
-            position = sets["heading/position"][at] - sets["heading/back"][variant, self.rest, pick] * direction
-            self.point(position, direction, sets["heading/cross"][at])
+            position = sets["heading/position"][at] - sets["heading/back"][region, self.rest, pick] * direction
+            self.set_heading(position, direction, sets["heading/cross"][at])
             return
         self.pose = Poses(*(sets[f"pose/{name}"][at] for name in Poses._fields))
         if constraint == "trajectory":
@@ -211,7 +213,7 @@ class Studio:
     @property
     def labelled(self) -> GraspObject:
         """The object with the painted regions as its parts."""
-        return with_avoid(self.obj, self.canvas.minus)
+        return with_avoid(self.obj, self.canvas.avoid)
 
     @property
     def request(self) -> GraspRequest:
@@ -225,44 +227,45 @@ class Studio:
         return self._request()
 
     def _request(self) -> GraspRequest:
+        """The request, whether or not it is possible."""
         given: dict[str, dict[str, np.ndarray]] = {"affordance": {}, **self.others}
         given |= {name: part._asdict() for name, part in (("pose", self.pose), ("trajectory", self.path)) if part}
         constraints = {"heading": self.arrow._asdict()}
         constraints |= {c.name: given[c.name] for c in optional(self.task) if c.name in self.asked}
-        avoid = self.canvas.minus if "affordance" in self.asked else None
+        avoid = self.canvas.avoid if "affordance" in self.asked else None
         return GraspRequest(constraints, avoid, rest=self.rest)
 
     @property
     def resolution(self) -> Resolution:
-        """What the priority rules make of it, without batch axes."""
+        """The request after the priority rules, without batch axes."""
         asked = {c.name: np.array([c.name in self.asked]) for c in optional(self.task)}
         goal = jax.tree.map(lambda array: np.asarray(array)[None], goal_of(self.hand, self.task, self._request()))
-        surface = Surface(np.asarray(self.obj.points, np.float32)[None], self.canvas.minus[None])
+        surface = Surface(np.asarray(self.obj.points, np.float32)[None], self.canvas.avoid[None])
         found = _resolve(self.hand, surface, goal, asked)
         return Resolution(found.goal.row(0), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0])
 
     @property
-    def words(self) -> list[str]:
-        """What the priority rules do, strongest constraint first."""
+    def explanation(self) -> list[str]:
+        """The effects of the priority rules, a sentence each, strongest constraint first."""
         return explain(self.asked, bool(self.resolution.redirected))
 
     @property
     def trouble(self) -> str:
         """Why this cannot be asked for, and what to do; empty if it can."""
-        if "affordance" in self.asked and (self.canvas.minus.all() or not self.canvas.minus.any()):
-            what = "Everything is" if self.canvas.minus.any() else "Nothing is"
-            return f"{what} painted as not to be touched. Paint a part of the object with the brush."
+        if "affordance" in self.asked and (self.canvas.avoid.all() or not self.canvas.avoid.any()):
+            what = "Everything is" if self.canvas.avoid.any() else "Nothing is"
+            return f"{what} painted as avoid region. Paint a part of the object with the brush."
         for name in self.asked - {"affordance"}:
             own = jax.tree.map(
                 lambda array: np.asarray(array)[None], goal_of(self.hand, self.task, self._request())[name]
             )
-            if not get_constraint(name).valid(Surface(np.asarray(self.obj.points)[None], self.canvas.minus[None]), own)[
+            if not get_constraint(name).valid(Surface(np.asarray(self.obj.points)[None], self.canvas.avoid[None]), own)[
                 0
             ]:
                 return " ".join(get_constraint(name).invalid)
         found = self.resolution
         if not found.aligned:
-            return "The wrist path ends nearer to what must not be touched. Draw another path, or paint elsewhere."
+            return "The wrist path ends nearer to the avoid region. Draw another path, or paint elsewhere."
         heading = found.goal["heading"]
         start = self._world(heading.position - BACK_OFF * heading.direction)
         if "trajectory" not in self.asked and start[2] < 0:
@@ -298,17 +301,18 @@ class Studio:
                 "overruled": bool(resolution.redirected)
                 or any("heading" in get_constraint(n).overrides for n in self.asked),
             },
-            "words": self.words,
+            "explanation": self.explanation,
             "trouble": self.trouble,
             "start": self._start(goal),
             "pose": None if self.pose is None else self._ghost(self.pose),
             "path": None if self.path is None else np.asarray(self.path.position).tolist(),
             "painted": self.canvas.version,
-            "minus": round(float(self.canvas.minus.mean()), 3),
+            "avoid_share": round(float(self.canvas.avoid.mean()), 3),
         }
 
     def _repainted(self) -> None:
-        (self.asked.add if self.canvas.minus.any() else self.asked.discard)("affordance")
+        """Asks for the affordance where there is paint."""
+        (self.asked.add if self.canvas.avoid.any() else self.asked.discard)("affordance")
 
     def _toggles(self, name: str, fields: dict[str, np.ndarray]) -> dict[str, Any]:
         """A constraint without tools of its own, as the page shows it."""
@@ -321,7 +325,7 @@ class Studio:
         """Link frames (L, 3), (L, 4) in the world from which a grasp would begin."""
         one = jax.tree.map(lambda array: np.asarray(array)[None], goal)
         rest = np.asarray(self.obj.rest_poses[self.rest], np.float32)[None]
-        position, quaternion = _begin(self.hand, self.task, one, rest)
+        position, quaternion = _start(self.hand, self.task, one, rest)
         return {"position": np.asarray(position).tolist(), "quaternion": np.asarray(quaternion).tolist()}
 
     def _ghost(self, pose: Poses) -> dict[str, Any]:
@@ -330,12 +334,14 @@ class Studio:
         return {"position": np.asarray(position).tolist(), "quaternion": np.asarray(quaternion).tolist()}
 
     def _constraint_sets(self) -> Message:
-        key = self.canvas.minus.tobytes()
+        """The constraint set of the object with its present paint, made when it is needed."""
+        key = self.canvas.avoid.tobytes()
         if self._sets is None or self._sets[0] != key:
             self._sets = key, make_sets(self.hand, self.task, [self.labelled], seed=0)[0]
         return self._sets[1]
 
     def _world(self, point: np.ndarray) -> np.ndarray:
+        """(3,) a point of the object frame in the world."""
         rest = self.obj.rest_poses[self.rest]
         return rest[:3] + matrix(rest[3:]) @ point
 
@@ -354,23 +360,27 @@ class Studio:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _resolve(hand: Hand, surface: Surface, goal: Goal, asked: dict[str, jax.Array]) -> Resolution:
+    """`resolve`, compiled."""
     return resolve(hand, surface, goal, asked)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _begin(hand: Hand, task: TaskConfig, goal: Goal, rest: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _start(hand: Hand, task: TaskConfig, goal: Goal, rest: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Link frames (L, 3), (L, 4) in the world at the start of an episode."""
     q, position, quaternion = initial_hand(hand, task, goal, rest)
     return _links(hand, q[0], position[0], quaternion[0])
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _links(hand: Hand, q: jax.Array, position: jax.Array, quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Link frames (L, 3), (L, 4) of finger angles (F,) and a wrist pose (3,), (4,), in the pose's frame."""
     local = kinematics.link_poses(hand, q)
     turn = jnp.broadcast_to(quaternion, local[1].shape)
     return rotations.compose_pose(jnp.broadcast_to(position, local[0].shape), turn, *local)
 
 
 def _vector(what: str, value: Any) -> np.ndarray:
+    """(3,) three finite numbers, or a CongraspError."""
     try:
         vector = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -381,6 +391,7 @@ def _vector(what: str, value: Any) -> np.ndarray:
 
 
 def _orthogonal(wanted: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(3,) unit, the part of a vector that is orthogonal to a direction, or any such where there is none."""
     cross = wanted - wanted @ direction * direction
     if np.linalg.norm(cross) < 1e-3:
         cross = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
@@ -388,4 +399,5 @@ def _orthogonal(wanted: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def _pose(row: np.ndarray) -> dict[str, list[float]]:
+    """A pose (7,) as JSON."""
     return {"position": row[:3].tolist(), "quaternion": row[3:].tolist()}

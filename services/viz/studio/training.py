@@ -1,4 +1,4 @@
-"""What is known of a run while it trains: curves, events, the ledger, and every actor's newest episode.
+"""What is known of a run while it trains: curves, events, the learner's counters, and every actor's newest episode.
 
 It takes log messages and the learner's status from whoever receives them; it knows no network and no browser.
 """
@@ -65,8 +65,6 @@ class Actor:
     """One actor, as its messages show it."""
 
     seen: float
-    figures: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Its newest metrics."""
     episode: Message | None = None
     """Its newest episode."""
     episodes: int = 0
@@ -85,7 +83,7 @@ class TrainingWindow:
         self._actors: dict[str, Actor] = {}
         self._events: collections.deque[dict[str, Any]] = collections.deque(maxlen=_EVENTS)
         self._status: Mapping[str, Any] | None = None
-        self._away = True
+        self._disconnected = True
         self.damaged = 0
         """Messages that were not what their key says."""
 
@@ -105,9 +103,9 @@ class TrainingWindow:
             self.damaged += 1
 
     def take_status(self, found: Mapping[str, Any] | None, now: float) -> None:
-        """What the learner says of itself; None while it is away."""
+        """The learner's status; None while there is no response."""
         with self._lock:
-            self._away = found is None
+            self._disconnected = found is None
             if found is None:
                 return
             self._status = found
@@ -171,11 +169,11 @@ class TrainingWindow:
             wanted = [name for name in names if name in self._curves] or [n for n in FIRST if n in self._curves]
             return {
                 "run": self.run,
-                "away": self._away,
+                "disconnected": self._disconnected,
                 "version": None if found is None else found["version"],
                 "rates": {} if found is None else found["rates"],
                 "queue": None if found is None else found["queue"],
-                "ledger": {} if found is None else found["ledger"],
+                "counters": {} if found is None else found["ledger"],
                 "warnings": [] if found is None else found["warnings"],
                 "finished": bool(found and found["finished"]),
                 "curves": {name: self._curves[name].thinned(points) for name in wanted},
@@ -195,10 +193,10 @@ class TrainingWindow:
         values = {key: float(value) for key, value in meta["values"].items()}
         if role == "actor":
             actor = self._actors.setdefault(name, Actor(now))
-            actor.seen, actor.figures = now, values
+            actor.seen = now
             return
         if role != "learner" or name != "0":
-            return  # every rank of a learner says the same
+            return  # every rank of a learner publishes the same
         step = float(meta.get("update", meta.get("version", 0)))
         for key, value in values.items():
             if np.isfinite(value):
@@ -215,9 +213,9 @@ class TrainingWindow:
     def _row(self, name: str, role: Mapping[str, Any] | None) -> dict[str, Any]:
         """What a list shows of an actor."""
         actor = self._actors[name]
-        said = role or {}
+        status = role or {}
         row: dict[str, Any] = {"id": name, "alive": role is not None, "episodes": actor.episodes}
-        row |= {key: said.get(key) for key in ("version", "lag", "rollouts", "steps_per_second")}
+        row |= {key: status.get(key) for key in ("version", "lag", "rollouts", "steps_per_second")}
         if actor.recent:
             row["success"] = sum(actor.recent) / len(actor.recent)
         if actor.episode is not None:
@@ -246,7 +244,7 @@ class Follower:
             thread.join(2.0)
 
     def _receive(self) -> None:
-        """Takes log messages until it is told to stop."""
+        """Takes log messages until it is closed."""
         while not self._stop.is_set():
             received = self._subscription.receive(0.5)
             if received is not None:

@@ -19,7 +19,7 @@ from services.cli.main import load
 from services.evaluate.evaluator import Evaluator
 from services.evaluate.scores import Sample, matching
 from services.evaluate.unseen import evaluate_objects, procedural_pools
-from services.evaluate.worlds import mixture
+from services.evaluate.worlds import sampling_config
 from services.train.command import untrained
 
 CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
@@ -106,9 +106,9 @@ def test_procedural_pools_hold_different_objects_in_equal_numbers():
     assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000)]
 
 
-def test_rows_are_mixed_only_in_what_differs_between_them():
+def test_only_constraints_that_differ_between_rows_are_sampled():
     def chances(*constraints):
-        task = mixture(CONFIG.task, constraints)
+        task = sampling_config(CONFIG.task, constraints)
         return task.p_affordance, task.p_pose, task.p_trajectory
 
     assert chances("heading") == (0, 0, 0)

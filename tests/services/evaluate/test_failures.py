@@ -1,4 +1,4 @@
-"""Failures are drawn, and their causes said, from what was simulated."""
+"""Failures are drawn with their causes, from what was simulated."""
 
 import dataclasses
 
@@ -27,12 +27,12 @@ def episode(heights, **metrics) -> Message:
     [
         ({"held": 1.0}, "held"),
         ({"bad": 1.0, "links_at_removal": 0.0}, "the physics diverged"),
-        ({"moved_at_removal": 0.06}, "pushed away before the table went"),
-        ({"links_at_removal": 0.0}, "not touched when the table went"),
-        ({}, "slipped 0.03 s after the table went"),
+        ({"moved_at_removal": 0.06}, "pushed away before the table was removed"),
+        ({"links_at_removal": 0.0}, "not touched when the table was removed"),
+        ({}, "slipped 0.03 s after the table was removed"),
     ],
 )
-def test_causes_in_words(metrics, said):
+def test_every_cause_has_its_label(metrics, said):
     assert cause(episode([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics), 0.05) == said
 
 

@@ -13,7 +13,7 @@ from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from common.objects import procedural
 from services.evaluate.evaluator import Evaluator
-from services.evaluate.noise import LEVELS, Noise, disturbed
+from services.evaluate.noise import LEVELS, Noise, with_noise
 from services.evaluate.noise_sheet import draw_curves
 from services.grasp import constraint_sets
 from services.train.command import untrained
@@ -28,7 +28,7 @@ def bank():
 
 
 def test_joint_noise_has_its_size_and_stays_within_the_limits(bank):
-    noisy = disturbed(HAND, bank, Noise("pose", "joints", 0.1), 0)
+    noisy = with_noise(HAND, bank, Noise("pose", "joints", 0.1), 0)
     q = np.asarray(bank.pose_q)
     away = (noisy.pose_q - q)[(q > HAND.lower + 0.4) & (q < HAND.upper - 0.4)]
     assert 0.095 < away.std() < 0.105 and abs(away.mean()) < 0.005
@@ -37,7 +37,7 @@ def test_joint_noise_has_its_size_and_stays_within_the_limits(bank):
 
 
 def test_poses_sink_along_the_heading(bank):
-    noisy = disturbed(HAND, bank, Noise("pose", "depth", 0.01), 0)
+    noisy = with_noise(HAND, bank, Noise("pose", "depth", 0.01), 0)
     moved = np.asarray(noisy.pose_position) - np.asarray(bank.pose_position)
     w, *v = np.moveaxis(np.asarray(bank.pose_quaternion, float), -1, 0)
     axis = np.broadcast_to(grasp_frame(HAND).heading, moved.shape)
@@ -49,13 +49,13 @@ def test_poses_sink_along_the_heading(bank):
 
 
 def test_jitter_moves_every_waypoint(bank):
-    noisy = disturbed(HAND, bank, Noise("trajectory", "jitter", 0.01), 0)
+    noisy = with_noise(HAND, bank, Noise("trajectory", "jitter", 0.01), 0)
     away = np.asarray(noisy.trajectory_position) - np.asarray(bank.trajectory_position)
     assert 0.0098 < away.std() < 0.0102 and np.all(np.abs(away).max((0, 1, 2, 4)) > 0)
     np.testing.assert_array_equal(noisy.trajectory_quaternion, bank.trajectory_quaternion)
 
 
-def test_the_same_references_are_disturbed_in_every_row(bank, monkeypatch, tmp_path):
+def test_noise_is_added_to_the_same_references_in_every_row(bank, monkeypatch, tmp_path):
     config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
     evaluator = Evaluator(untrained(config), OBJECTS, bank=bank)
     worker, told = mock.Mock(), []
@@ -72,13 +72,13 @@ def test_the_same_references_are_disturbed_in_every_row(bank, monkeypatch, tmp_p
     assert told == [5 * (i + 1) for i in range(len(LEVELS))]
     given = [call.args[1] for call in worker.replace_objects.call_args_list]
     for noise, seen in zip(LEVELS, given, strict=True):
-        expected = disturbed(HAND, bank, noise, 0)
+        expected = with_noise(HAND, bank, noise, 0)
         for name in ("pose_q", "pose_position", "trajectory_position"):
             np.testing.assert_array_equal(getattr(seen, name), getattr(expected, name))
 
 
 @pytest.mark.parametrize("most", [20, 5])
-def test_references_are_renewed_until_their_places_are_filled_or_none_is_added(bank, monkeypatch, most):
+def test_references_are_renewed_until_their_slots_are_filled_or_none_is_added(bank, monkeypatch, most):
     config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
     flat = bank._replace(has_affordance=np.array([[True], [False]]).repeat(bank.rest.shape[1], 1))
     evaluator = Evaluator(untrained(config), OBJECTS, bank=flat)
@@ -95,7 +95,7 @@ def test_references_are_renewed_until_their_places_are_filled_or_none_is_added(b
     worker.forget_references.side_effect, worker.renew_references.side_effect = forget, renew
     monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
     made = evaluator.references(lambda *counts: told.append(counts))
-    # Two whole surfaces and one O+; 40 episodes for each of the three, 64 a batch, are two batches.
+    # Two whole surfaces and one graspable region; 40 episodes for each of the three, 64 a batch, are two batches.
     idle = [(15, 60)] * 2 if most < 20 else []
     assert told == [(3 * (i + 1), 60) for i in range(most)] + idle
     sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 0, made)
@@ -109,13 +109,12 @@ def test_curves_show_every_kind_of_noise(tmp_path):
     row.held_2s, row.held_2s_low, row.held_2s_high = 0.8, 0.7, 0.9
     draw_curves([row] * len(LEVELS), tmp_path / "noise.png", "made up")
     picture = np.asarray(Image.open(tmp_path / "noise.png").convert("RGB")).astype(int)
-    thirds = np.array_split(picture, 3, axis=1)
-    for part in thirds:  # the lines of success in each panel
+    for part in np.array_split(picture, 3, axis=1):  # the lines of success in each panel
         red, _, blue = part.reshape(-1, 3).T
         assert (blue - red > 100).sum() > 50
 
 
-def test_a_task_set_comes_back_from_its_files(bank):
+def test_a_constraint_bank_comes_back_from_its_files(bank):
     sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 3)
     back = constraint_sets.bank_of(sets)
     for name in ("points", "minus", "heading_position", "pose_q", "trajectory_position", "pose_quaternion"):

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from services.cli.report import curves_of
-from services.evaluate.report import Made, Picture, causes_in_words, write_report
+from services.evaluate.report import Commands, Picture, count_causes, write_report
 from services.evaluate.scores import PAPER, Row
 from services.record.channels import JsonChannels
 from services.record.writer import LogWriter
@@ -66,9 +66,9 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
     png = (tmp_path / "p.png").read_bytes()
     rows = [row("heading", 0.99, 0.975, 0.995), row("pose", 0.9, 0.85, 0.95), row("trajectory", 0.96, 0.93, 0.98)]
     out = tmp_path / "report.html"
-    made = Made("congrasp evaluate --policy <mine>", "", "congrasp plot x")
+    commands = Commands("congrasp evaluate --policy <mine>", "", "congrasp plot x")
     sheets = [Picture("heading", png, "2 held, 1 slipped <b>")]
-    write_report(out, policy, "p & q.safetensors", rows, "100 episodes", sheets, [Picture("Learning", png)], made)
+    write_report(out, policy, "p & q.safetensors", rows, "100 episodes", sheets, [Picture("Learning", png)], commands)
     found = Reader(text := out.read_text())
     cells = {content: kind for kind, content in found.cells}
     # The paper has 96.9, 96.4 and 95.5 %: above it, below it, and within the interval.
@@ -96,4 +96,4 @@ def test_a_runs_curves_are_pictures(tmp_path):
 
 
 def test_causes_are_counted():
-    assert causes_in_words(["held", "slipped", "held"]) == "2 held, 1 slipped"
+    assert count_causes(["held", "slipped", "held"]) == "2 held, 1 slipped"

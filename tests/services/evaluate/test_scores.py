@@ -120,7 +120,7 @@ def test_joined_samples_keep_forces_beside_their_episodes():
     assert len(odd.link_force) == PROBED_EPISODES // 2 and odd.link_force[0].min() == 1.0
 
 
-def test_objects_are_grouped_by_thirds_and_family():
+def test_objects_are_grouped_by_terciles_and_family():
     sizes, masses = np.array([0.03, 0.09, 0.06, 0.12, 0.15, 0.18]), np.array([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
     groups = dict(object_groups(sizes, masses, np.array(["mug", "ball", "mug", "mug", "ball", "ball"])))
     by_word = {label.split(" (")[0]: set(np.flatnonzero(members).tolist()) for label, members in groups.items()}

@@ -9,18 +9,19 @@ import pytest
 from actors.env import metric_names
 from common.config import TaskConfig
 from common.errors import CongraspError
+from common.task.constraints import CONSTRAINTS
 from services.cli.plot import plot
 from services.evaluate.plots import cells, plot_evaluation
 from services.evaluate.scores import Sample, active_mask, summarise, write_json
 
-TASK = TaskConfig()
+TASK = TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))
 METRICS = metric_names(TASK)
 
 
 def evaluation(path: pathlib.Path) -> list[dict]:
-    """Two rows of 40 episodes, of which 30 succeeded with errors that rise evenly from 0.1 to 0.4."""
+    """Three rows of 40 episodes, of which 30 succeeded with errors that rise evenly from 0.1 to 0.4."""
     rows = []
-    for constraint in ("heading", "trajectory+affordance"):
+    for constraint in ("heading", "trajectory+affordance", "fingers"):
         values = {name: np.zeros(40) for name in METRICS}
         values["success"][:30] = 1
         for name in METRICS:
@@ -35,19 +36,22 @@ def evaluation(path: pathlib.Path) -> list[dict]:
 
 
 def test_quantiles_are_of_the_successful_episodes(tmp_path: pathlib.Path) -> None:
-    heading, composed = evaluation(tmp_path / "e.json")
+    heading, composed, fingers = evaluation(tmp_path / "e.json")
     np.testing.assert_allclose(heading["quantiles"]["heading_rad"], np.linspace(0.1, 0.4, 101), atol=1e-6)
     assert set(heading["quantiles"]) == {"heading_rad", "heading_m"}
     assert set(composed["quantiles"]) == {"traj_rad", "traj_m", "affordance_ratio"}
+    assert set(fingers["quantiles"]) == {"fingers_ratio"}
 
 
 def test_the_table_has_every_row_beside_the_papers(tmp_path: pathlib.Path) -> None:
-    head, heading, composed = cells(evaluation(tmp_path / "e.json"))
+    head, heading, composed, fingers = cells(evaluation(tmp_path / "e.json"))
     assert heading[:5] == ["heading", "40", "75.0 (59.8-85.8)", "96.9", "0.0"]
-    at = head.index("Heading, direction, rad")
+    at = head.index("Heading error, rad")
     assert heading[at : at + 2] == ["0.250", "0.137"] and composed[at : at + 2] == ["", ""]
-    at = head.index("Affordance, wrong contacts, share")
+    at = head.index("Affordance error, share")
     assert composed[at : at + 2] == ["0.250", "0.045"]
+    at = head.index("Fingers error, share")
+    assert fingers[at : at + 2] == ["0.250", ""]
 
 
 def test_an_evaluation_becomes_png_and_pdf(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -59,7 +63,7 @@ def test_an_evaluation_becomes_png_and_pdf(tmp_path: pathlib.Path, capsys: pytes
     assert all(file.read_bytes().startswith(starts[file.suffix]) for file in files)
 
 
-def test_other_files_are_refused_in_words(tmp_path: pathlib.Path) -> None:
+def test_other_files_are_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.json").write_text("[1]")
     with pytest.raises(CongraspError, match=r"a\.json is not the result of an evaluation .*evaluate --json"):
         plot_evaluation(tmp_path / "a.json", tmp_path, ("png",))

@@ -4,7 +4,7 @@ import numpy as np
 from PIL import Image
 
 from services.evaluate import showcase as module
-from services.evaluate.showcase import CONSTRAINTS, showcase
+from services.evaluate.showcase import showcase
 from tests.episodes import episode
 
 
@@ -15,7 +15,7 @@ def test_the_picture_has_a_row_for_each_constraint_and_counts_the_successes(monk
         def __init__(self, policy, objects, **options):
             assert objects == ["an object"]
 
-        def episode(self, constraint, tries):
+        def episode(self, constraint, attempts):
             asked.append(constraint)
             return episode(success=constraint != "pose")
 
@@ -23,9 +23,9 @@ def test_the_picture_has_a_row_for_each_constraint_and_counts_the_successes(monk
     monkeypatch.setattr(module, "load_pool", lambda config: ["an object"])
     monkeypatch.setattr(module, "_SIZE", (40, 30))
     told = []
-    assert showcase(_policy(), tmp_path / "grasps.png", told.append) == 3
-    assert tuple(asked) == CONSTRAINTS == ("heading", "pose", "trajectory", "affordance")
-    assert len(told) == 4
+    found = showcase(_policy(), tmp_path / "grasps.png", told.append)
+    assert found == {"heading": True, "affordance": True, "pose": False, "fingers": True}
+    assert asked == list(found) and len(told) == 4
     image = np.asarray(Image.open(tmp_path / "grasps.png"))
     assert image.shape[0] > 4 * 30 and image.shape[1] > 4 * 40
 
@@ -33,4 +33,5 @@ def test_the_picture_has_a_row_for_each_constraint_and_counts_the_successes(monk
 def _policy():
     import types
 
-    return types.SimpleNamespace(version=3, spec=types.SimpleNamespace(hand_name="human"))
+    task = types.SimpleNamespace(constraints=("heading", "affordance", "pose", "fingers"))
+    return types.SimpleNamespace(version=3, task=task, spec=types.SimpleNamespace(hand_name="human"))

@@ -60,7 +60,7 @@ export class Camera {
     this.distance = Math.min(4, Math.max(0.12, this.distance * Math.exp(0.12 * notches)));
   }
 
-  // The ray {origin, direction} through a point of the picture, given as shares of its width and height from the top.
+  // The ray {origin, direction} through a point of the frame, given as shares of its width and height from the top.
   ray(x, y) {
     const [right, up, back] = this.axes;
     const tangent = Math.tan(FIELD / 2);
@@ -68,7 +68,7 @@ export class Camera {
     return { origin: this.position, direction: unit(sub(sideways, back)) };
   }
 
-  // Where a point of the world is in the picture, as shares from the top left; null behind the camera.
+  // Where a point of the world is in the frame, as shares from the top left; null behind the camera.
   project(point) {
     const [right, up, back] = this.axes;
     const off = sub(point, this.position);

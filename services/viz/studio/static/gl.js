@@ -48,7 +48,7 @@ export class Renderer {
     this.canvas = canvas;
     this.software = drawnInSoftware();
     this.coarse = 1; // share of the pixels, along each side, while something moves
-    this.mean = 0; // ms of a picture
+    this.mean = 0; // ms of a frame
     const gl = canvas.getContext("webgl2", { antialias: !this.software, alpha: false });
     if (!gl) throw new Error("This browser offers no WebGL 2. Use a newer one, or allow hardware acceleration.");
     this.gl = gl;
@@ -98,7 +98,7 @@ export class Renderer {
     for (const buffer of mesh.buffers) this.gl.deleteBuffer(buffer);
   }
 
-  // Told how long a picture took while something moves: without a graphics card fewer pixels are drawn until it is fast.
+  // Told how long a frame took while something moves: without a graphics card fewer pixels are drawn until it is fast.
   pace(milliseconds, slowest) {
     if (!this.software) return;
     this.mean += 0.2 * (milliseconds - this.mean);
@@ -108,7 +108,7 @@ export class Renderer {
     }
   }
 
-  // Fits the picture to the space that the page gives it.
+  // Fits the frame to the space that the page gives it.
   resize(moving) {
     const ratio = this.software ? (moving ? this.coarse : 1) : Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));

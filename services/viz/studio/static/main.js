@@ -1,4 +1,4 @@
-// Joins picture, tools, player and panels.
+// Joins scene, tools, player and panels.
 
 import { Camera } from "./camera.js";
 import { Renderer } from "./gl.js";
@@ -12,7 +12,7 @@ import { ask, fetchMessage } from "./wire.js";
 
 const $ = (id) => document.getElementById(id);
 const BACKGROUND = [0.953, 0.961, 0.969];
-const SLOWEST = 34; // ms between two pictures while something moves
+const SLOWEST = 34; // ms between two frames while something moves
 const READABLE = 200; // ms between two changes of the numbers while a motion plays
 
 class App {
@@ -86,7 +86,7 @@ class App {
   async #object(studio) {
     const [mesh, paint] = await Promise.all([fetchMessage("/api/object"), fetchMessage("/api/paint")]);
     this.scene.setObject(mesh.arrays.vertices.data, mesh.arrays.faces.data);
-    this.body.paint(paint.arrays.minus.data);
+    this.body.paint(paint.arrays.avoid.data);
     this.shownObject = studio.object.name;
     this.shownPaint = studio.painted;
   }
@@ -103,7 +103,7 @@ class App {
       this.#frameAll(studio);
     } else if (studio.painted !== this.shownPaint) {
       this.shownPaint = studio.painted;
-      this.body.paint((await fetchMessage("/api/paint")).arrays.minus.data);
+      this.body.paint((await fetchMessage("/api/paint")).arrays.avoid.data);
     }
     this.edited = studio;
     this.redraw();
@@ -115,7 +115,7 @@ class App {
       await this.#hand(motion.hand);
       this.playedBody?.release();
       this.playedBody = new Body(this.renderer, motion.vertices, motion.faces);
-      this.playedBody.paint(motion.minus);
+      this.playedBody.paint(motion.avoid);
       this.motion = motion;
     } catch (error) {
       this.panel.error(error.message);
@@ -162,7 +162,7 @@ class App {
 
   seek(time) {
     this.time = Math.min(this.motion.duration, Math.max(0, time));
-    this.#moment();
+    this.#showFrame();
     this.redraw();
   }
 
@@ -180,13 +180,13 @@ class App {
     $("play").textContent = this.playing ? "Pause" : "Play";
   }
 
-  #moment() {
+  #showFrame() {
     const step = this.motion.step(this.time);
     this.timeline.at(this.time);
     const now = performance.now();
     if (this.playing && now - (this.written ?? 0) < READABLE) return;
     this.written = now;
-    $("moment").textContent = `${this.time.toFixed(2)} s`;
+    $("time").textContent = `${this.time.toFixed(2)} s`;
     this.timeline.write(step);
     $("scrub").value = step;
     const terms = Object.entries(this.motion.rewards).filter(([, values]) => values.some((value) => value !== 0));
@@ -215,7 +215,7 @@ class App {
         this.playing = false;
         this.#label();
       }
-      this.#moment();
+      this.#showFrame();
       this.redraw();
     }
     const moving = this.playing && now - (this.before ?? 0) < 200;
@@ -240,7 +240,7 @@ class App {
   #count() {
     const now = performance.now();
     this.drawn = this.drawn.filter((time) => now - time < 1000);
-    $("frames").textContent = this.playing ? `${this.drawn.length} pictures/s` : "";
+    $("frames").textContent = this.playing ? `${this.drawn.length} fps` : "";
   }
 }
 

@@ -1,4 +1,4 @@
-// A recorded motion: the moment at a time, between two steps too.
+// A recorded motion: its frame at a time, between two steps too.
 
 import { blend, mix, norm } from "./math.js";
 
@@ -34,16 +34,16 @@ export class Motion {
       path: this.active.includes("trajectory") ? rows(arrays["goal/trajectory_position"]) : null,
     };
     this.ghost = arrays.ghost_position ? { position: rows(arrays.ghost_position), quaternion: rows(arrays.ghost_quaternion) } : null;
-    this.minus = this.active.includes("affordance") ? this.#labels(arrays) : null;
+    this.avoid = this.active.includes("affordance") ? this.#labels(arrays) : null;
     this.rewards = {};
     for (const [name, { data }] of Object.entries(arrays)) if (name.startsWith("reward/")) this.rewards[name.slice(7)] = data;
-    this.lanes = Object.entries(meta.lanes).map(([name, words]) => {
+    this.lanes = Object.entries(meta.lanes).map(([name, legend]) => {
       const errors = {};
       for (const key of Object.keys(arrays)) {
         const [, lane, unit] = key.match(/^lane\/([^/]+)\/(.+)$/) ?? [];
         if (lane === name && unit !== "met" && unit !== "counts") errors[unit] = arrays[key].data;
       }
-      return { name, words, errors, met: arrays[`lane/${name}/met`].data, counts: arrays[`lane/${name}/counts`].data };
+      return { name, legend, errors, met: arrays[`lane/${name}/met`].data, counts: arrays[`lane/${name}/counts`].data };
     });
     this.totalForce = this.forces.map((links) => links.reduce((sum, force) => sum + norm(force), 0));
     this.totalReward = this.forces.map((_, t) => Object.values(this.rewards).reduce((sum, term) => sum + term[t], 0));
@@ -56,16 +56,16 @@ export class Motion {
   // Each vertex has the label of the surface point nearest to it.
   #labels(arrays) {
     const { data: points } = arrays.surface_points;
-    const { data: minus } = arrays.surface_minus;
+    const { data: avoid } = arrays.surface_minus;
     const labels = new Uint8Array(this.vertices.length / 3);
     for (let v = 0; v < labels.length; v++) {
       let nearest = Infinity;
-      for (let p = 0; p < minus.length; p++) {
+      for (let p = 0; p < avoid.length; p++) {
         const x = points[3 * p] - this.vertices[3 * v];
         const y = points[3 * p + 1] - this.vertices[3 * v + 1];
         const z = points[3 * p + 2] - this.vertices[3 * v + 2];
         const far = x * x + y * y + z * z;
-        if (far < nearest) [nearest, labels[v]] = [far, minus[p]];
+        if (far < nearest) [nearest, labels[v]] = [far, avoid[p]];
       }
     }
     return labels;

@@ -5,7 +5,7 @@ import * as shapes from "./shapes.js";
 
 const SKIN = [0.72, 0.75, 0.81];
 const OBJECT = [0.95, 0.64, 0.28];
-const MINUS = [0.8, 0.22, 0.22];
+const AVOID = [0.8, 0.22, 0.22];
 const TOUCHING = [0.13, 0.74, 0.63];
 const HEADING = [0.22, 0.4, 0.86];
 const COUNTS = [0.1, 0.62, 0.85];
@@ -45,14 +45,14 @@ export class Body {
   }
 
   // Colours by a label for each vertex; all alike without labels.
-  paint(minus) {
-    this.vertex.forEach((vertex, i) => this.colours.set(minus && minus[vertex] ? MINUS : OBJECT, 3 * i));
+  paint(avoid) {
+    this.vertex.forEach((vertex, i) => this.colours.set(avoid && avoid[vertex] ? AVOID : OBJECT, 3 * i));
     this.renderer.recolour(this.mesh, this.colours);
   }
 
   // Colours what a brush at a point of the object frame touches, until the server's answer is there.
-  brush(point, radius, minus) {
-    const colour = minus ? MINUS : OBJECT;
+  brush(point, radius, avoid) {
+    const colour = avoid ? AVOID : OBJECT;
     for (let i = 0; i < this.points.length; i += 3) {
       const [x, y, z] = [this.points[i] - point[0], this.points[i + 1] - point[1], this.points[i + 2] - point[2]];
       if (x * x + y * y + z * z <= radius * radius) this.colours.set(colour, i);
@@ -170,20 +170,20 @@ export class Scene {
     return things;
   }
 
-  // Things of a moment of a motion; see `Motion.at`.
-  playing(motion, body, moment) {
-    const place = moment.object;
+  // Things of a frame of a motion; see `Motion.at`.
+  playing(motion, body, frame) {
+    const place = frame.object;
     const things = [];
-    if (moment.table) things.push(this.#table(motion.center));
+    if (frame.table) things.push(this.#table(motion.center));
     things.push({ mesh: body.mesh, model: pose(place.position, place.quaternion) });
-    const share = moment.forces.map((force) => Math.min(norm(force) / FULL, 1));
-    things.push(...this.#links(motion.hand, moment.links, (i) => {
+    const share = frame.forces.map((force) => Math.min(norm(force) / FULL, 1));
+    things.push(...this.#links(motion.hand, frame.links, (i) => {
       const touch = share[i] * FULL > LEAST ? 0.45 + 0.55 * share[i] : 0;
       return { tint: SKIN.map((c, k) => c + (TOUCHING[k] - c) * touch) };
     }));
-    moment.forces.forEach((force, i) => {
+    frame.forces.forEach((force, i) => {
       const strength = norm(force);
-      if (strength > LEAST) things.push({ mesh: this.force, model: along(moment.links.position[i], scale(force, 1 / strength), Math.min(FORCE_LENGTH * strength, LONGEST)).map((x, k) => (k < 8 ? 0.09 * x : x)), tint: FORCE });
+      if (strength > LEAST) things.push({ mesh: this.force, model: along(frame.links.position[i], scale(force, 1 / strength), Math.min(FORCE_LENGTH * strength, LONGEST)).map((x, k) => (k < 8 ? 0.09 * x : x)), tint: FORCE });
     });
     const { goal } = motion;
     const direction = rotate(place.quaternion, goal.direction);

@@ -1,6 +1,6 @@
-// The studio's panel: what is asked for, what the rules make of it, and the motions that came of it.
+// The studio's panel: the request, the resolved constraints, and the motions.
 
-import { ask, download, tell, upload } from "./wire.js";
+import { ask, download, post, upload } from "./wire.js";
 
 const $ = (id) => document.getElementById(id);
 const MASK_NAMES = { pose_finger: "pose: fingers", pose_wrist: "pose: wrist" };
@@ -19,7 +19,7 @@ export class StudioPanel {
     this.queue = Promise.resolve(true);
     $("hand").addEventListener("change", () => this.act("hand", { name: $("hand").value }));
     $("object").addEventListener("change", () => this.act("object", { name: $("object").value }));
-    $("rest").addEventListener("change", () => this.act("lay", { rest: Number($("rest").value) }));
+    $("rest").addEventListener("change", () => this.act("set_rest_pose", { rest: Number($("rest").value) }));
     $("file").addEventListener("change", () => {
       if ($("file").files.length) this.take($("file").files[0]);
       $("file").value = "";
@@ -30,7 +30,7 @@ export class StudioPanel {
         const constraint = button.dataset.suggest;
         if ((await this.act("suggest", { constraint })) && constraint !== "heading") this.act("ask", { constraint, on: true });
       });
-    $("all-plus").addEventListener("click", () => this.act("fill", { minus: false }));
+    $("clear-paint").addEventListener("click", () => this.act("fill", { avoid: false }));
     $("close-hand").addEventListener("click", async () => {
       if (await this.act("close_hand", {})) this.act("ask", { constraint: "pose", on: true });
     });
@@ -48,7 +48,7 @@ export class StudioPanel {
     this.queue = this.queue.then(async () => {
       this.busy(true);
       try {
-        const state = await tell("/api/do", { action, ...values });
+        const state = await post("/api/do", { action, ...values });
         this.error("");
         await this.show(state);
         return true;
@@ -87,13 +87,13 @@ export class StudioPanel {
     }
   }
 
-  // Resolves when the picture can be drawn with it.
+  // Resolves when the scene can be drawn with it.
   show(state) {
     const { studio } = state;
     this.state = state;
     fill($("hand"), state.hands.map((name) => [name, name]), state.hand);
     fill($("object"), state.objects.map((name) => [name, name]), state.chosen);
-    const rests = Array.from({ length: studio.object.rests }, (_, i) => [String(i), i ? `resting pose ${i + 1}` : "as it lies best"]);
+    const rests = Array.from({ length: studio.object.rests }, (_, i) => [String(i), i ? `resting pose ${i + 1}` : "most stable"]);
     fill($("rest"), rests, String(studio.rest.index));
     const { size_cm: size, mass_g: mass, faces } = studio.object;
     $("facts").textContent = [`${size.join(" × ")} cm, ${mass} g, ${faces} faces`, ...state.notes].join(". ");
@@ -103,7 +103,7 @@ export class StudioPanel {
       box.checked = studio.asked.includes(box.dataset.ask);
       box.closest(".constraint").hidden = !studio.known.includes(box.dataset.ask);
     }
-    $("share").textContent = studio.minus ? `${Math.round(100 * studio.minus)} % painted` : "nothing painted";
+    $("share").textContent = studio.avoid_share ? `${Math.round(100 * studio.avoid_share)} % painted` : "nothing painted";
     $("masks").replaceChildren(...Object.entries({ heading: true, ...studio.active.masks }).map(([name, on]) => {
       const mask = document.createElement("span");
       mask.className = "mask";
@@ -112,7 +112,7 @@ export class StudioPanel {
       mask.textContent = `${MASK_NAMES[name] ?? name} ${on ? "on" : "off"}`;
       return mask;
     }));
-    $("words").replaceChildren(...studio.words.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+    $("explanation").replaceChildren(...studio.explanation.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
     $("trouble").textContent = studio.trouble;
     this.#job(state.job);
     $("grasp").disabled = Boolean(studio.trouble) || state.job.running;
@@ -176,7 +176,7 @@ export class StudioPanel {
       const item = document.createElement("li");
       const name = document.createElement("button");
       name.className = "name";
-      name.textContent = `${motion.id}. ${motion.object}: ${motion.held ? "held" : motion.success ? "held a moment" : "not held"}`;
+      name.textContent = `${motion.id}. ${motion.object}: ${motion.held ? "held" : motion.success ? "held briefly" : "not held"}`;
       name.title = motion.note;
       name.classList.add(motion.held ? "good" : "bad");
       name.addEventListener("click", () => this.app.play(motion.id));

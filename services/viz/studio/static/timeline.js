@@ -39,10 +39,10 @@ export class Timeline {
 
   show(motion) {
     this.motion = motion;
-    const rows = motion.lanes.map(({ name, words }) => {
+    const rows = motion.lanes.map(({ name, legend }) => {
       const item = document.createElement("li");
       item.dataset.lane = name;
-      item.title = words;
+      item.title = legend;
       item.innerHTML = '<span class="name"></span> <span class="value"></span>';
       item.firstChild.textContent = name;
       return item;
@@ -59,7 +59,7 @@ export class Timeline {
     this.#prepare();
   }
 
-  // Draws everything but the moment.
+  // Draws everything but the present frame.
   #prepare() {
     const { motion, canvas } = this;
     if (!motion) return;
@@ -94,7 +94,7 @@ export class Timeline {
       g.stroke();
       g.fillStyle = "#667080";
       g.font = "11px system-ui, sans-serif";
-      g.fillText("table goes", gone * cell + 4, height - 4);
+      g.fillText("table removed", gone * cell + 4, height - 4);
     }
     this.at(this.time ?? 0);
   }
@@ -109,7 +109,7 @@ export class Timeline {
     g.stroke();
   }
 
-  // Moves the line that shows the moment.
+  // Moves the line that shows the present frame.
   at(time) {
     this.time = time;
     if (!this.motion) return;

@@ -1,4 +1,4 @@
-// What the mouse does in the picture: look around, place the arrow, paint, draw a path.
+// What the mouse does in the scene: look around, place the arrow, paint, draw a path.
 
 import { onPlane } from "./camera.js";
 import { add, rotate, conjugate, scale, sub, toLocal, toWorld, unit } from "./math.js";
@@ -11,8 +11,8 @@ const STEP = 0.004; // m between two points of a drawn path
 const HINTS = {
   look: "Drag to turn, right button to move, wheel to zoom. The arrow's ends can be dragged.",
   arrow: "Click where the hand should come to. Drag the arrow's tip over the object, or its tail to turn it.",
-  minus: "Brush over what the hand must not touch.",
-  plus: "Brush over what the hand may grasp.",
+  avoid: "Brush over what the hand must not touch.",
+  graspable: "Brush over what the hand may grasp.",
   path: "Draw the wrist's way with one stroke, from far away to the object.",
 };
 
@@ -48,7 +48,7 @@ export class Tools {
   choose(tool) {
     this.tool = tool;
     for (const button of document.querySelectorAll("[data-tool]")) button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
-    document.getElementById("brush").hidden = tool !== "minus" && tool !== "plus";
+    document.getElementById("brush").hidden = tool !== "avoid" && tool !== "graspable";
     document.getElementById("hint").textContent = HINTS[tool];
     this.app.canvas.style.cursor = tool === "look" ? "grab" : "crosshair";
   }
@@ -102,7 +102,7 @@ export class Tools {
     app.canvas.focus({ preventScroll: true });
     app.canvas.setPointerCapture(event.pointerId);
     this.last = [event.clientX, event.clientY];
-    const painting = this.tool === "minus" || this.tool === "plus";
+    const painting = this.tool === "avoid" || this.tool === "graspable";
     const hit = painting || this.tool === "arrow" ? this.#hit(event) : null;
     if (event.button === 2 || event.button === 1 || event.shiftKey) this.doing = "pan";
     else if (!painting && this.#handle(event)) this.doing = this.#handle(event);
@@ -116,7 +116,7 @@ export class Tools {
       const inward = rotate(state.rest.quaternion, scale(hit.normal, -1));
       // From below the table no hand comes: such a direction is levelled.
       const direction = unit([inward[0], inward[1], Math.min(inward[2], 0)]);
-      app.act("aim", { surface: hit.point, direction: rotate(conjugate(state.rest.quaternion), direction) });
+      app.act("snap_heading", { surface: hit.point, direction: rotate(conjugate(state.rest.quaternion), direction) });
     } else if (this.tool === "path" && app.state) {
       this.doing = "path";
       this.stroke = [];
@@ -148,11 +148,11 @@ export class Tools {
 
   #up(event) {
     const { app } = this;
-    if (this.doing === "paint") app.act("paint", { points: this.stroke, radius: this.radius, minus: this.tool === "minus" });
+    if (this.doing === "paint") app.act("paint", { points: this.stroke, radius: this.radius, avoid: this.tool === "avoid" });
     if (this.doing === "path" && this.stroke.length > 1) app.act("draw", { points: this.stroke }).then((done) => done && app.act("ask", { constraint: "trajectory", on: true }));
     if ((this.doing === "tip" || this.doing === "tail") && this.arrow) {
       const surface = sub(this.arrow.position, scale(this.arrow.direction, INWARD));
-      app.act("aim", { surface, direction: this.arrow.direction }).finally(() => {
+      app.act("snap_heading", { surface, direction: this.arrow.direction }).finally(() => {
         this.arrow = null;
         app.redraw();
       });
@@ -163,7 +163,7 @@ export class Tools {
 
   #brush(hit) {
     this.stroke.push(hit.point);
-    this.app.body.brush(hit.point, this.radius, this.tool === "minus");
+    this.app.body.brush(hit.point, this.radius, this.tool === "avoid");
     this.app.redraw();
   }
 

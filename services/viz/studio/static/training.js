@@ -1,4 +1,4 @@
-// The window on a training: how it goes, its curves, its actors, and the episodes of a moment.
+// The window on a training: how it goes, its curves, its actors, and the episodes around a time.
 
 import { ask } from "./wire.js";
 
@@ -48,7 +48,7 @@ export class TrainingPanel {
     this.looking = true;
     try {
       this.view = await ask("/api/training", { names: this.chosen.join(",") });
-      this.#say();
+      this.#showWarnings();
       this.#show();
     } catch (error) {
       $("run-trouble").textContent = error.message;
@@ -57,13 +57,13 @@ export class TrainingPanel {
     }
   }
 
-  #say() {
+  #showWarnings() {
     const { view } = this;
     const watched = view.actors.find((actor) => actor.id === this.watched);
-    const said = [...view.warnings];
-    if (view.away && view.version !== null) said.push("The learner is away.");
-    if (watched && !watched.episodes) said.push(`${watched.id} has sent no episode yet; the next one is played when it comes.`);
-    $("run-trouble").textContent = said.join(" ");
+    const warnings = [...view.warnings];
+    if (view.disconnected && view.version !== null) warnings.push("The learner is disconnected.");
+    if (watched && !watched.episodes) warnings.push(`${watched.id} has sent no episode yet; the next one is played when it comes.`);
+    $("run-trouble").textContent = warnings.join(" ");
   }
 
   #show() {
@@ -99,7 +99,7 @@ export class TrainingPanel {
       return bar;
     }));
     this.#actors(view.actors);
-    $("ledger").replaceChildren(...Object.entries(view.ledger).map(([name, value]) => row([name, String(value)])));
+    $("counters").replaceChildren(...Object.entries(view.counters).map(([name, value]) => row([name, String(value)])));
     $("events").parentElement.hidden = !view.events.length;
     $("events").replaceChildren(...view.events.map(({ time, level, text }) => {
       const item = document.createElement("li");
@@ -156,7 +156,7 @@ export class TrainingPanel {
     });
     canvas.addEventListener("click", (event) => {
       this.#point(figure, event);
-      if (figure.near !== null) this.#moment(name, figure.near);
+      if (figure.near !== null) this.#episodesAround(name, figure.near);
     });
     return figure;
   }
@@ -216,7 +216,7 @@ export class TrainingPanel {
     g.fill();
   }
 
-  async #moment(name, index) {
+  async #episodesAround(name, index) {
     const curve = this.view.curves[name];
     const gaps = curve.times.slice(1).map((time, i) => time - curve.times[i]).sort((a, b) => a - b);
     const seconds = Math.min(600, Math.max(2, 1.5 * (gaps[gaps.length >> 1] ?? 2)));
@@ -224,7 +224,7 @@ export class TrainingPanel {
     found.hidden = false;
     found.textContent = "Searching the recordings …";
     try {
-      const { seconds: reach, episodes } = await ask("/api/moment", { time: curve.times[index], seconds });
+      const { seconds: reach, episodes } = await ask("/api/episodes", { time: curve.times[index], seconds });
       const title = document.createElement("p");
       title.textContent = `${episodes.length} episodes within ${short(reach)} s of update ${short(curve.steps[index])}, ${episodes.filter((e) => e.success).length} succeeded`;
       found.replaceChildren(title, ...episodes.map((episode) => {

@@ -20,36 +20,37 @@ function decode(buffer) {
   return { arrays, meta: JSON.parse(header.__metadata__.meta) };
 }
 
-// The answer, or what the studio says against it: a refusal is an answer too, and no fault of the network.
-async function answered(response) {
+// The server's response. A refusal is an error with its message; so is a server that does not respond.
+async function request(path, query = {}, options = {}) {
+  const response = await fetch(`${path}?${new URLSearchParams(query)}`, options).catch(() => {
+    throw new Error("Disconnected: start the studio again and reload.");
+  });
   if (!response.ok) throw new Error(`The studio answered ${response.status}: ${(await response.text()).slice(0, 200)}`);
   if (response.headers.has("X-Refused")) throw new Error((await response.json()).error);
   return response;
 }
 
-const address = (path, query) => `${path}?${new URLSearchParams(query)}`;
-
-export async function ask(path, query = {}) {
-  return (await answered(await fetch(address(path, query)))).json();
+export async function ask(path, query) {
+  return (await request(path, query)).json();
 }
 
-export async function fetchMessage(path, query = {}) {
-  return decode(await (await answered(await fetch(address(path, query)))).arrayBuffer());
+export async function fetchMessage(path, query) {
+  return decode(await (await request(path, query)).arrayBuffer());
 }
 
-export async function tell(path, body) {
+export async function post(path, body) {
   const options = { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
-  return (await answered(await fetch(path, options))).json();
+  return (await request(path, {}, options)).json();
 }
 
 export async function upload(path, file) {
   const options = { method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: file };
-  return (await answered(await fetch(address(path, { name: file.name }), options))).json();
+  return (await request(path, { name: file.name }, options)).json();
 }
 
 // Lets the browser save what the server answers with, under the name that it gives.
 export async function download(path, query) {
-  const response = await answered(await fetch(address(path, query)));
+  const response = await request(path, query);
   const link = document.createElement("a");
   link.href = URL.createObjectURL(await response.blob());
   link.download = decodeURIComponent((response.headers.get("Content-Disposition") ?? "").split("''")[1] ?? "motion");

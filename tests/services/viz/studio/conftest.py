@@ -32,25 +32,27 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any, request: pytest.FixtureRequest, tmp_path: pathlib.Path) -> Iterator[Any]:
-    """A page that must not complain: errors on its console fail the test."""
+    """A page whose console must stay empty: errors and warnings there fail the test."""
     context = browser.new_context(viewport=SIZE, accept_downloads=True)
     context.set_default_timeout(60_000)
     context.tracing.start(screenshots=True, snapshots=True)
     opened = context.new_page()
-    complaints: list[str] = []
-    opened.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
-    opened.on("pageerror", lambda error: complaints.append(str(error)))
-    opened.complaints = complaints
+    messages: list[str] = []
+    opened.on(
+        "console", lambda message: messages.append(message.text) if message.type in ("error", "warning") else None
+    )
+    opened.on("pageerror", lambda error: messages.append(str(error)))
+    opened.messages = messages
     yield opened
-    # Chromium itself warns when a picture is read back from a processor that draws.
-    complaints[:] = [text for text in complaints if "GL Driver Message" not in text]
-    if complaints or getattr(request.node, "failed", True) or os.environ.get("KEEP_TRACES"):
+    # Chromium itself warns when a frame is read back from a processor that draws.
+    messages[:] = [text for text in messages if "GL Driver Message" not in text]
+    if messages or getattr(request.node, "failed", True) or os.environ.get("KEEP_TRACES"):
         name = re.sub(r"\W+", "-", request.node.name)
         RESULTS.mkdir(exist_ok=True)
         opened.screenshot(path=RESULTS / f"{name}.png")
         context.tracing.stop(path=RESULTS / f"{name}.zip")
     context.close()
-    assert complaints == getattr(opened, "expected", [])
+    assert messages == getattr(opened, "expected", [])
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,7 +1,7 @@
 """Measures the page in a headless browser: python -m tests.services.viz.studio.measure [URL]
 
 Without the address of a studio it opens one on a made-up grasp of an object of 10,000 faces. Prints how long the first
-picture takes, and how many pictures are drawn in a second while the grasp is played.
+frame takes, and the frames drawn in each second while the grasp is played.
 """
 
 import contextlib
@@ -68,11 +68,11 @@ def main() -> None:
         found = next(filter(None, map(shutil.which, BROWSERS)), None)
         browser = playwright.chromium.launch(executable_path=found, args=ARGUMENTS)
         page = browser.new_page(viewport=SIZE)
-        complaints: list[str] = []
-        page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+        errors: list[str] = []
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         page.goto(url)
         page.wait_for_selector("body[data-first-picture]")
-        print(f"{page.inner_text('#facts')}; first picture after {page.get_attribute('body', 'data-first-picture')} ms")
+        print(f"{page.inner_text('#facts')}; first frame after {page.get_attribute('body', 'data-first-picture')} ms")
         page.click("#grasp")
         page.wait_for_selector("#player:not([hidden])", timeout=120_000)
         page.select_option("#speed", "0.1")
@@ -83,8 +83,8 @@ def main() -> None:
                 page.click("#play")
                 page.wait_for_timeout(1000)
             rates.append(int((page.inner_text("#frames") or "0").split()[0]))
-        print(f"pictures in each second while playing: {rates[1:]}; median {int(np.median(rates[1:]))}")
-        print(f"errors on the console: {len(complaints)}")
+        print(f"fps while playing: {rates[1:]}; median {int(np.median(rates[1:]))}")
+        print(f"errors on the console: {len(errors)}")
         browser.close()
 
 

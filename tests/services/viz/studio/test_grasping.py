@@ -43,7 +43,7 @@ def outcome(held: list[int], error: list[float]) -> Outcome:
     return Outcome(None, none, ~none, metrics, Trace())  # type: ignore[arg-type]
 
 
-def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused_in_words() -> None:
+def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused() -> None:
     source = Source()
     policy = PolicyGrasping(source, "the run 'r'")
     newer = dataclasses.replace(SHIPPED, version=SHIPPED.version + 5)
@@ -60,7 +60,7 @@ def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused_in_words(
 
     source.next = away
     policy.refresh()
-    assert "away" in policy.newest()["trouble"]
+    assert "disconnected" in policy.newest()["trouble"]
     source.next = lambda: None
     policy.refresh()
     assert policy.newest()["trouble"] == ""

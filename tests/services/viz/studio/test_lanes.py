@@ -44,7 +44,7 @@ def test_tolerances_are_those_of_a_grasp_that_may_become_a_reference() -> None:
     assert [error.tolerance for error in get_constraint("pose").errors] == [0.25, 0.03]
 
 
-def test_a_wrist_beside_its_path_is_told_how_far() -> None:
+def test_a_wrist_beside_its_path_has_its_distance() -> None:
     made = episode(STEPS, removal=REMOVAL)
     lane = lanes(with_error(made, trajectory_m=TRAJECTORY[1] + 0.01))["trajectory"]
     np.testing.assert_allclose(lane.errors["m"], TRAJECTORY[1] + 0.01, atol=1e-6)
@@ -53,7 +53,7 @@ def test_a_wrist_beside_its_path_is_told_how_far() -> None:
     assert not lanes(with_error(made, trajectory_rad=TRAJECTORY[0] + 0.01))["trajectory"].met.any()
 
 
-def test_a_hand_beside_the_arrow_is_told_how_far() -> None:
+def test_a_hand_beside_the_arrow_has_its_distance() -> None:
     made = episode(STEPS, removal=REMOVAL)
     before, after = lanes(made)["heading"], lanes(with_error(made, heading_m=0.05))["heading"]
     assert before.errors["m"][-1] <= HEADING[1] and after.errors["m"][-1] > HEADING[1] and not after.met[-1]
@@ -71,13 +71,13 @@ def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:
 def test_of_a_pose_whose_wrist_the_path_decides_on_only_the_fingers_count() -> None:
     made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 1, 0, 1)), pose_m=0.2)
     pose = lanes(made)["pose"]
-    assert pose.met[-1] and set(pose.errors) == {"rad"} and "distance" not in pose.words
+    assert pose.met[-1] and set(pose.errors) == {"rad"} and "distance" not in pose.legend
 
 
 def test_every_constraint_with_recorded_errors_has_a_lane() -> None:
     made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)), fingers_ratio=0.25)
     lane = lanes(Message({**made.arrays, "active/fingers": np.bool_(True)}, made.meta))["fingers"]
-    assert not lane.met.any() and lane.words == "share of touching links of other fingers: 0 % at most"
+    assert not lane.met.any() and lane.legend == "share of touching links of other fingers: 0 % at most"
 
 
 def test_the_page_gets_one_message_with_everything_it_plays() -> None:

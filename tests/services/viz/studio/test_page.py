@@ -62,8 +62,8 @@ def opened(page: Any, site: Site) -> Any:
         eventually(lambda: site.studio["object"]["name"] == "mug_1")
     for constraint in ("affordance", "pose", "trajectory"):
         site.do("ask", constraint=constraint, on=False)
-    site.do("fill", minus=False)
-    site.do("lay", rest=0)
+    site.do("fill", avoid=False)
+    site.do("set_rest_pose", rest=0)
     page.goto(site.server.url)
     page.wait_for_selector("body[data-first-picture]")
     return page
@@ -127,14 +127,14 @@ def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
     assert orange(seen).mean() > 0.01
 
 
-def test_the_rules_act_in_words_when_constraints_are_ticked(opened: Any, site: Site) -> None:
+def test_the_rules_act_and_are_explained_when_constraints_are_ticked(opened: Any, site: Site) -> None:
     opened.check("[data-ask=affordance]")
     opened.wait_for_selector("[data-mask=affordance][data-on=true]")
     assert red(picture(opened)).mean() > 0.002
     opened.check("[data-ask=pose]")
     opened.wait_for_selector("[data-mask=pose_wrist][data-on=true]")
     assert opened.get_attribute("[data-mask=affordance]", "data-on") == "false"
-    assert "affordance is overridden" in opened.inner_text("#words")
+    assert "affordance is overridden" in opened.inner_text("#explanation")
     opened.uncheck("[data-ask=pose]")
     opened.wait_for_selector("[data-mask=affordance][data-on=true]")
     assert site.studio["asked"] == ["affordance"]
@@ -143,14 +143,14 @@ def test_the_rules_act_in_words_when_constraints_are_ticked(opened: Any, site: S
 def test_the_brush_paints_what_it_goes_over(opened: Any, site: Site) -> None:
     x, y = on_object(opened)
     before = red(picture(opened)).sum()
-    opened.click("[data-tool=minus]")
+    opened.click("[data-tool=avoid]")
     drag(opened, [(x, y), (x + 12, y + 4)])
     opened.wait_for_selector("[data-mask=affordance][data-on=true]")
-    painted = site.studio["minus"]
+    painted = site.studio["avoid_share"]
     assert painted > 0 and red(picture(opened)).sum() > before + 100
-    opened.click("[data-tool=plus]")
+    opened.click("[data-tool=graspable]")
     drag(opened, [(x, y), (x + 12, y + 4)])
-    eventually(lambda: site.studio["minus"] < painted)
+    eventually(lambda: site.studio["avoid_share"] < painted)
 
 
 def test_the_arrow_is_placed_by_a_click_and_turned_by_its_tail(opened: Any, site: Site) -> None:
@@ -158,7 +158,7 @@ def test_the_arrow_is_placed_by_a_click_and_turned_by_its_tail(opened: Any, site
     opened.click("[data-tool=arrow]")
     opened.mouse.click(*on_object(opened))
     eventually(lambda: site.studio["arrow"] != before)
-    site.do("lay", rest=0)  # from above again, where both ends are in the picture
+    site.do("set_rest_pose", rest=0)  # from above again, where both ends are in the picture
     opened.reload()
     opened.wait_for_selector("body[data-first-picture]")
     tail = handle(opened, "tail")
@@ -176,7 +176,7 @@ def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
     path = np.array(site.studio["path"])
     assert len(path) == made_up.MadeUpGrasping().task.trajectory_points
     assert np.linalg.norm(np.diff(path, axis=0), axis=-1).sum() > 0.05
-    assert "wrist trajectory guides the wrist" in opened.inner_text("#words")
+    assert "wrist trajectory guides the wrist" in opened.inner_text("#explanation")
 
 
 def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: Any) -> None:
@@ -193,7 +193,7 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     assert page.is_visible("[data-ask=affordance]") and not page.is_visible("[data-ask=pose]")
     page.check("[data-ask=fingers]")
     page.wait_for_selector("[data-mask=fingers][data-on=true]")
-    assert "Only the named fingers" in page.inner_text("#words") and fingers() == ["thumb", "index"]
+    assert "Only the named fingers" in page.inner_text("#explanation") and fingers() == ["thumb", "index"]
     page.check("#other-constraints label:has-text('middle') input")
     eventually(lambda: fingers() == ["thumb", "index", "middle"])
     assert page.is_checked("[data-ask=fingers]")
@@ -205,6 +205,10 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     page.uncheck("[data-ask=fingers]")
     page.wait_for_selector("[data-mask=fingers][data-on=false]")
     assert page.is_enabled("#grasp")
+    page.route("**/api/**", lambda route: route.abort())
+    page.click("#grasp")
+    page.wait_for_selector("#error:has-text('Disconnected: start the studio again')")
+    page.expected = ["Failed to load resource: net::ERR_FAILED"] * 2
     server.close()
     session.close()
 
@@ -237,7 +241,7 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
     box = opened.locator("#timeline").bounding_box()
     opened.mouse.click(box["x"] + 0.97 * box["width"], box["y"] + 10)
     opened.wait_for_selector("[data-lane=heading][data-met=true]")
-    assert opened.inner_text("#moment") != "0.00 s" and "7.5 N" in opened.inner_text("#lanes")
+    assert opened.inner_text("#time") != "0.00 s" and "7.5 N" in opened.inner_text("#lanes")
     assert "contact force" in opened.inner_text("#values")
     last = picture(opened)
     for one, other in ((still, first), (first, last)):

@@ -1,4 +1,4 @@
-"""The page's server answers its own page alone, and whatever is asked, in words."""
+"""The page's server answers its own page alone, and any request with a result or a message."""
 
 import http.client
 import json
@@ -72,7 +72,7 @@ def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: 
 def test_other_sites_are_turned_away(page: Page) -> None:
     assert page.ask("GET", "/api/state", Host="evil.example:80")[0] == 403
     assert page.ask("GET", "/api/state", Origin="http://evil.example")[0] == 403
-    body = json.dumps({"action": "fill", "minus": True}).encode()
+    body = json.dumps({"action": "fill", "avoid": True}).encode()
     assert page.ask("POST", "/api/do", body, Content_Type="text/plain")[0] == 403
     assert page.ask("POST", "/api/do", body, Origin="http://evil.example")[0] == 403
     assert (
@@ -92,7 +92,7 @@ def test_other_sites_are_turned_away(page: Page) -> None:
         (b'{"action": "ask", "constraint": "x", "on": true}', "no constraint 'x'"),
     ],
 )
-def test_wrong_requests_are_answered_in_words(page: Page, body: bytes, says: str) -> None:
+def test_wrong_requests_are_answered_with_a_message(page: Page, body: bytes, says: str) -> None:
     code, found = page.ask("POST", "/api/do", body)
     assert code == 200 and says in json.loads(found)["error"]
 
@@ -102,7 +102,7 @@ def test_too_much_is_refused_before_it_is_read(page: Page) -> None:
 
 
 def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasping, tmp_path: pathlib.Path) -> None:
-    page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, minus=True)
+    page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, avoid=True)
     page.do("grasp")
     assert page.wait()["error"] == ""
     assert tuple(grasping.asked[-1][1].constraints) == ("heading", "affordance")
@@ -119,7 +119,7 @@ def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasp
     assert b"Choose from: npz, mcap, glb" in page.ask("GET", "/api/export?id=1&kind=docx")[1]
 
 
-def test_a_fault_inside_is_told_and_the_studio_goes_on(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+def test_a_fault_inside_is_shown_and_the_studio_continues(page: Page, grasping: made_up.MadeUpGrasping) -> None:
     grasping.fails = "the hand fell off"
     page.do("grasp")
     job = page.wait()
@@ -129,7 +129,7 @@ def test_a_fault_inside_is_told_and_the_studio_goes_on(page: Page, grasping: mad
     assert page.wait()["error"] == ""
 
 
-def test_a_mesh_becomes_an_object_and_an_empty_file_a_sentence(page: Page) -> None:
+def test_a_mesh_becomes_an_object_and_an_empty_file_is_refused(page: Page) -> None:
     code, found = page.ask("POST", "/api/upload?name=nothing.stl", b"", Content_Type="application/octet-stream")
     assert code == 200 and "nothing.stl is empty" in json.loads(found)["error"]
     code, _ = page.ask("POST", "/api/upload?name=..%2Fx.stl", b"solid", Content_Type="application/octet-stream")
@@ -143,7 +143,7 @@ def test_a_run_is_shown_beside_the_studio(page: Page) -> None:
     assert list(view["curves"]) == ["episode/return"] and len(view["actors"]) == 5
     played = decode(page.ask("GET", "/api/motion?id=actor:a003")[1])
     assert played.meta["object"] == "thing-3"
-    assert "recordings" in json.loads(page.ask("GET", "/api/moment?time=1&seconds=1")[1])["error"]
+    assert "recordings" in json.loads(page.ask("GET", "/api/episodes?time=1&seconds=1")[1])["error"]
 
 
 def test_a_busy_port_and_an_open_interface_are_refused_in_one_line(

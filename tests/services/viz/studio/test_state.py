@@ -32,7 +32,7 @@ def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
     assert tuple(request.constraints) == ("heading",)
     down = matrix(MUG.rest_poses[0][3:]) @ studio.arrow.direction
     np.testing.assert_allclose(down, [0, 0, -1], atol=1e-6)
-    assert studio.words == ["The heading guides the wrist."]
+    assert studio.explanation == ["The heading guides the wrist."]
     assert masks(studio) == dict.fromkeys(("affordance", "pose_finger", "pose_wrist", "trajectory"), False)
 
 
@@ -48,46 +48,46 @@ def test_the_hand_begins_before_the_arrow_and_aligned_with_it(studio: Studio) ->
 
 def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: Studio) -> None:
     center = MUG.points[0]
-    studio.paint([center], 0.02, minus=True)
+    studio.paint([center], 0.02, avoid=True)
     far = np.linalg.norm(MUG.points - center, axis=-1)
-    np.testing.assert_array_equal(studio.canvas.minus, far <= 0.02)
+    np.testing.assert_array_equal(studio.canvas.avoid, far <= 0.02)
     shown = np.linalg.norm(studio.canvas.vertices - center, axis=-1)
     np.testing.assert_array_equal(studio.canvas.shown, shown <= 0.02)
     assert studio.asked == {"affordance"} and masks(studio)["affordance"]
-    np.testing.assert_array_equal(studio.labelled.non_graspable_points, studio.canvas.minus)
-    np.testing.assert_array_equal(studio.request.avoid, studio.canvas.minus)
-    studio.paint([center], 0.03, minus=False)
-    assert not studio.canvas.minus.any() and studio.asked == set()
+    np.testing.assert_array_equal(studio.labelled.non_graspable_points, studio.canvas.avoid)
+    np.testing.assert_array_equal(studio.request.avoid, studio.canvas.avoid)
+    studio.paint([center], 0.03, avoid=False)
+    assert not studio.canvas.avoid.any() and studio.asked == set()
 
 
 def test_without_paint_the_affordance_takes_the_parts_that_the_object_came_with(studio: Studio) -> None:
     studio.ask("affordance", True)
-    np.testing.assert_array_equal(studio.canvas.minus, MUG.non_graspable_points)
+    np.testing.assert_array_equal(studio.canvas.avoid, MUG.non_graspable_points)
     assert 0 < studio.canvas.shown.mean() < 1
 
 
-def test_the_rules_are_told_in_words_and_masks(studio: Studio) -> None:
+def test_the_rules_are_explained_and_set_the_masks(studio: Studio) -> None:
     studio.ask("affordance", True)
     studio.ask("pose", True)
     assert masks(studio) == {"affordance": False, "pose_finger": True, "pose_wrist": True, "trajectory": False}
-    assert any("affordance is overridden" in line for line in studio.words)
+    assert any("affordance is overridden" in line for line in studio.explanation)
     studio.ask("trajectory", True)
     assert masks(studio) == {"affordance": False, "pose_finger": True, "pose_wrist": False, "trajectory": True}
-    assert "guides the wrist" in studio.words[0] and "trajectory" in studio.words[0]
+    assert "guides the wrist" in studio.explanation[0] and "trajectory" in studio.explanation[0]
     studio.ask("pose", False)
     studio.ask("affordance", False)
     assert tuple(studio.request.constraints) == ("heading", "trajectory")
 
 
 def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studio) -> None:
-    studio.paint([studio.arrow.position - INWARD * studio.arrow.direction], 0.03, minus=True)
+    studio.paint([studio.arrow.position - INWARD * studio.arrow.direction], 0.03, avoid=True)
     view = studio.view()
-    assert view["active"]["overruled"] and any("turned towards O+" in line for line in view["words"])
+    assert view["active"]["overruled"] and any("turned towards O+" in line for line in view["explanation"])
     assert np.linalg.norm(np.subtract(view["active"]["direction"], studio.arrow.direction)) > 0.02
 
 
 def test_the_arrow_is_aimed_as_deep_as_in_training_and_rolls_around_itself(studio: Studio) -> None:
-    studio.aim([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
+    studio.snap_heading([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
     np.testing.assert_allclose(studio.arrow.position, [0.01, -INWARD, 0.02])
     before = studio.arrow.cross
     studio.roll(np.pi / 2)
@@ -104,7 +104,7 @@ def test_a_drawn_path_keeps_its_begin_and_ends_at_the_wrist_of_the_grasp(studio:
     assert studio.path.position.shape == (TaskConfig().trajectory_points, 3)
     np.testing.assert_allclose(studio.path.position[0], drawn[0], atol=1e-6)
     np.testing.assert_allclose(studio.path.position[-1], studio.pose.position, atol=1e-6)
-    assert studio.trouble == "" and studio.words[0].startswith("The wrist trajectory")
+    assert studio.trouble == "" and studio.explanation[0].startswith("The wrist trajectory")
 
 
 def test_what_training_would_draw_can_be_suggested(studio: Studio) -> None:
@@ -127,30 +127,31 @@ def test_suggestions_are_for_the_object_as_it_is_shown(studio: Studio) -> None:
 @pytest.mark.parametrize(
     ("do", "says"),
     [
-        (lambda s: s.point([0, 0, np.nan], [0, 0, 1]), "three numbers"),
-        (lambda s: s.point([0, 0, 0], [0, 0, 0]), "no direction"),
-        (lambda s: s.point("up", [0, 0, 1]), "three numbers"),
+        (lambda s: s.set_heading([0, 0, np.nan], [0, 0, 1]), "three numbers"),
+        (lambda s: s.set_heading([0, 0, 0], [0, 0, 0]), "no direction"),
+        (lambda s: s.set_heading("up", [0, 0, 1]), "three numbers"),
         (lambda s: s.paint([[0, 0]], 0.01, True), "brush stroke"),
         (lambda s: s.paint([[0, 0, 0]], 9.0, True), "radius"),
         (lambda s: s.draw([[0, 0, 0.1], [0, 0, 0.101]]), "0.1 cm long"),
         (lambda s: s.ask("touch", True), "no constraint 'touch'"),
-        (lambda s: s.lay(99), "no resting pose"),
+        (lambda s: s.ask("heading", True), "heading is always active. Set it with the arrow"),
+        (lambda s: s.set_rest_pose(99), "no resting pose"),
         (lambda s: s.suggest("affordance"), "Nothing can be suggested"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(studio: Studio, do, says) -> None:
+def test_what_cannot_be_is_refused_in_one_line(studio: Studio, do, says) -> None:
     with pytest.raises(CongraspError, match=says):
         do(studio)
 
 
-def test_an_impossible_request_says_why_before_it_is_asked(studio: Studio) -> None:
+def test_an_impossible_request_is_explained_before_it_is_sent(studio: Studio) -> None:
     up = matrix(MUG.rest_poses[0][3:]).T @ np.array([0.0, 0.0, 1.0])
-    studio.aim(studio.arrow.position, up)
+    studio.snap_heading(studio.arrow.position, up)
     assert "under the table" in studio.trouble
     with pytest.raises(CongraspError, match="under the table"):
         _ = studio.request
     studio.suggest("heading")
-    studio.fill(minus=True)
+    studio.fill(avoid=True)
     assert studio.trouble.startswith("Everything is painted")
 
 

@@ -1,4 +1,4 @@
-"""What is known of a run: curves, a hundred actors, and episodes found by their moment."""
+"""What is known of a run: curves, a hundred actors, and episodes found by their time."""
 
 import pathlib
 import threading
@@ -28,12 +28,12 @@ def test_a_window_shows_a_hundred_actors_with_their_newest_episodes() -> None:
     assert (row["id"], row["lag"], row["steps_per_second"], row["success"]) == ("a004", 1, 1004.0, 0.0)
     assert row["object"] == "thing-4" and row["alive"]
     assert window.episode("a004").meta["object"] == "thing-4"
-    assert view["constraints"]["pose"] == 0.5 and view["ledger"]["granted"] == 3
+    assert view["constraints"]["pose"] == 0.5 and view["counters"]["granted"] == 3
     with pytest.raises(CongraspError, match="a999"):
         window.episode("a999")
 
 
-def test_success_is_shown_for_every_constraint_that_the_learner_tells_of() -> None:
+def test_success_is_shown_for_every_constraint_of_the_learners_metrics() -> None:
     window, key = made_up.window(actors=0), KEYS.log("metrics", "learner", "0")
     assert list(window.view()["constraints"]) == ["heading", "pose"]
     window.take(key, Message({}, {"time": BEGIN, "update": 60, "values": {"success/fingers": 0.25}}), time.time())
@@ -48,7 +48,7 @@ def test_an_actors_newer_episode_takes_the_place_of_the_one_before() -> None:
     assert [row["episodes"] for row in window.view()["actors"]] == [1, 2]
 
 
-def test_actors_that_are_gone_are_forgotten_after_a_while_and_an_absent_learner_is_told() -> None:
+def test_actors_that_are_gone_are_forgotten_after_a_while_and_an_absent_learner_is_shown() -> None:
     window = made_up.window(actors=3)
     now = time.time()
     window.take_status(made_up.status(2), now + 5)
@@ -56,7 +56,7 @@ def test_actors_that_are_gone_are_forgotten_after_a_while_and_an_absent_learner_
     window.take_status(made_up.status(2), now + 60)
     assert [row["id"] for row in window.view()["actors"]] == ["a000", "a001"]
     window.take_status(None, now + 61)
-    assert window.view()["away"] and window.view()["version"] == 12
+    assert window.view()["disconnected"] and window.view()["version"] == 12
 
 
 def test_thinned_curves_keep_every_dip() -> None:
@@ -105,16 +105,16 @@ def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_g
             assert time.monotonic() < deadline
             learner.publish(KEYS.log("metrics", "learner", "0"), made_up.metrics(1))
             stop.wait(0.05)
-        assert not window.view()["away"]
+        assert not window.view()["disconnected"]
         learner.close()
-        while not window.view()["away"]:
+        while not window.view()["disconnected"]:
             assert time.monotonic() < deadline
             stop.wait(0.05)
     finally:
         follower.close()
 
 
-def test_episodes_of_a_moment_come_from_finished_and_from_growing_files(tmp_path: pathlib.Path) -> None:
+def test_episodes_around_a_time_come_from_finished_and_from_growing_files(tmp_path: pathlib.Path) -> None:
     when = BEGIN + 10 * DIP
     made_up.record(tmp_path, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
     recordings = Recordings(tmp_path)
