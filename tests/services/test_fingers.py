@@ -102,6 +102,9 @@ def test_fingers_are_read_by_their_names() -> None:
     request = read_request(MUG, HAND, 15, fingers=("thumb", "index"))
     assert set(request.constraints) == {"heading", "fingers"}
     np.testing.assert_array_equal(request.given("fingers", "allowed"), PINCH)
+    for written in ("thumb index", "thumb, index", "thumb,index", ["thumb", "index"]):
+        request = read_request(MUG, HAND, 15, fingers=written)
+        np.testing.assert_array_equal(request.given("fingers", "allowed"), PINCH)
     assert read_request(MUG, HAND, 15).given("fingers", "allowed") is None
     with pytest.raises(CongraspError, match=r"no finger 'toe'\. Known: thumb, index, middle, ring, "):
         read_request(MUG, HAND, 15, fingers=("thumb", "toe"))
@@ -110,12 +113,12 @@ def test_fingers_are_read_by_their_names() -> None:
 
 
 def test_a_grasp_is_asked_for_with_two_fingers(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
-    grasper = Grasper(policy, tries=2, rounds=1, seconds=0.25, threads=1)
+    grasper = Grasper(policy, attempts=2, rounds=1, seconds=0.25, threads=1)
     found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index")))
     grasper.close()
     assert found.motion.constraints == ("heading", "fingers") and "fingers_ratio" in found.facts()
     np.testing.assert_array_equal(found.motion.goal["fingers_allowed"], PINCH)
-    assert "Only the named fingers may touch the object." in found.words
+    assert "Only the named fingers may touch the object." in found.active
     arrays = found.episode.arrays
     steps = len(arrays["table"])
     other = np.isin(HAND.link_fingers, (2, 3, 4))
