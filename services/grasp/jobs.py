@@ -1,4 +1,4 @@
-"""Grasps of many objects, one after another: what is done stays done, and one bad object does not stop the others."""
+"""Grasps of many objects, one after another: finished ones are kept, and one bad object does not stop the others."""
 
 import dataclasses
 import hashlib
@@ -38,7 +38,7 @@ class Settings(NamedTuple):
     video: bool
     pictures: bool
     again: bool
-    """Whether to grasp anew what is done."""
+    """Whether to redo finished objects."""
 
 
 class Result(NamedTuple):
@@ -49,7 +49,7 @@ class Result(NamedTuple):
     """As in the result file; empty where there is an error."""
     error: str = ""
     skipped: bool = False
-    """It was done before."""
+    """It was finished before."""
 
     def line(self) -> str:
         """One line."""
@@ -96,7 +96,7 @@ def _distinct(found: Sequence[ObjectAt]) -> Iterator[str]:
 
 
 def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: Progress) -> Result:
-    """Grasps one object and writes its folder, unless that is done already."""
+    """Grasps one object and writes its folder, unless it is finished already."""
     folder = settings.out / at.name
     try:
         given = {
@@ -149,7 +149,7 @@ def _identity(text: str) -> str:
 
 
 def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> None:
-    """Writes the results of a hand as JSON, and the last moments of all grasps as one picture."""
+    """Writes the results of a hand as JSON, and the last frames of all grasps as one picture."""
     held = sum(bool(result.facts.get("success")) for result in results)
     rows = [{"name": r.name, "error": r.error} if r.error else {"name": r.name, **r.facts} for r in results]
     summary = {"hand": hand, "objects": len(rows), "succeeded": held, "results": rows}

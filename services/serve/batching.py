@@ -14,6 +14,8 @@ R = TypeVar("R")
 
 
 class _Waiting(NamedTuple):
+    """An item in the queue; times in seconds of the monotonic clock."""
+
     item: object
     future: Future
     arrival: float
@@ -93,12 +95,14 @@ class Batcher(Generic[T, R]):
         self._thread.join(timeout)
 
     def _work(self) -> None:
+        """Answers batches until the batcher is closed, in the worker."""
         while batch := self._collect():
             self._answer(batch)
         for waiting in self._queue:
             waiting.future.set_exception(CongraspError("The server is shutting down."))
 
     def _answer(self, batch: list[_Waiting]) -> None:
+        """Runs a batch without what is late, and gives every item its outcome."""
         now = time.monotonic()
         for waiting in batch:
             if waiting.deadline < now:

@@ -47,5 +47,6 @@ class PolicyClient(EpisodePolicy):
         self._transport.close()
 
     def _query(self, query: Message) -> Message:
+        """The server's reply."""
         meta = {"hand": self._hand, "timeout": self._timeout, **query.meta}
         return self._transport.query(self._keys.act, Message(query.arrays, meta), timeout=self._timeout)

@@ -30,6 +30,7 @@ class LocalPolicy(EpisodePolicy):
         self._function.warm_up(bundle.acting, BATCH_SIZES[:1])
 
     def _query(self, query: Message) -> Message:
+        """The reply of a server with this bundle."""
         began = time.perf_counter()
         try:
             parsed = self._function.layout.parse(query)

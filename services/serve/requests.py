@@ -107,10 +107,11 @@ class Layout:
         return vectors[..., self._places(name)]
 
     def _places(self, name: str) -> slice:
+        """Where a field's numbers stand in a vector."""
         return slice(self.offsets[name], self.offsets[name] + math.prod(self.shapes[name]))
 
     def parse(self, message: Message) -> Query:
-        """Lays a query out, unless it is packed already; a CongraspError says what is wrong with its form."""
+        """Lays a query out, unless it is packed already; a CongraspError names what is wrong with its form."""
         meta = message.meta
         hand = meta.get("hand", self.hand.name)
         if hand != self.hand.name:
@@ -186,7 +187,7 @@ class Layout:
         return Goal({c.name: c.goal(**{name: fields[f"{c.name}_{name}"] for name in c.arrays}) for c in self.known}, {})
 
     def find_error(self, query: Query, checks: np.ndarray) -> CongraspError | None:
-        """What is wrong with the values of a query's first bad state, by what `complete` found (n, C): see there."""
+        """The error of a query's first bad state, by what `complete` found (n, C): see there; None if all are good."""
         wrong = ~(np.abs(checks - 1.0) <= _UNIT_TOLERANCE)
         if not wrong.any():
             return None
@@ -223,13 +224,13 @@ class Layout:
             raise CongraspError(
                 f"The field 'surface_points' has shape {points.shape}; it must be (N, 3), N at most {SURFACE_LIMIT}."
             )
-        minus = np.asarray(arrays.get("surface_minus", np.zeros(len(points), bool)))
-        if minus.shape != (len(points),):
-            raise CongraspError(f"The field 'surface_minus' has shape {minus.shape}; it must be ({len(points)},).")
+        avoid = np.asarray(arrays.get("surface_minus", np.zeros(len(points), bool)))
+        if avoid.shape != (len(points),):
+            raise CongraspError(f"The field 'surface_minus' has shape {avoid.shape}; it must be ({len(points)},).")
         if len(points) == self.task.surface_points:
-            return points, minus
+            return points, avoid
         index = np.arange(self.task.surface_points) * len(points) // self.task.surface_points
-        return points[index], minus[index]
+        return points[index], avoid[index]
 
 
 def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[jax.Array, jax.Array]:
