@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from actors.uploads import Outcome, Uploads, backoff, check_timeout
-from common.errors import CongraspError, TransportError
+from common.errors import CongraspError, RefusedError, TransportError
 from common.journal import Journal
-from common.transport.base import RefusedError, Transport
+from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, SharedMessage, checksum
 

@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any, Literal, NamedTuple
 
-from common.errors import CongraspError, TransportError
+from common.errors import CongraspError, RefusedError, TransportError
 from common.journal import Journal
-from common.transport.base import RefusedError, Transport
+from common.transport.base import Transport
 from common.wire.codec import Message
 
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]

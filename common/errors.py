@@ -6,9 +6,11 @@ class CongraspError(Exception):
 
     Attributes:
       exit_code: what the command line returns to the shell for this error.
+      code: names the kind on the wire, beside the sentence; empty where a program cannot do anything about the kind.
     """
 
     exit_code = 2
+    code = ""
 
     def __init__(self, what: str, remedy: str = ""):
         super().__init__(f"{what} {remedy}".strip().replace("\n", " "))
@@ -24,3 +26,49 @@ class TransportError(CongraspError):
     """A peer did not answer within its deadline, or refused."""
 
     exit_code = 4
+
+
+class RefusedError(TransportError):
+    """Whoever was asked, a peer or a policy in this process, cannot do what the request says."""
+
+
+class OverloadedError(RefusedError):
+    """Too many wait already; known at once, so that the caller can do something else within its deadline."""
+
+    code = "overloaded"
+
+
+class LateError(RefusedError):
+    """The request's deadline passed while it waited."""
+
+    code = "late"
+
+
+class UnknownConstraintError(RefusedError):
+    """There is no such constraint, or the policy does not know it."""
+
+    exit_code = CongraspError.exit_code
+    code = "unknown_constraint"
+
+
+class ContradictionError(RefusedError):
+    """Two constraints exclude each other, and neither overrides the other."""
+
+    exit_code = CongraspError.exit_code
+    code = "contradiction"
+
+
+class LayoutError(RefusedError):
+    """A packed query follows another layout than the policy's."""
+
+    code = "layout"
+
+
+_BY_CODE = {
+    error.code: error for error in (OverloadedError, LateError, UnknownConstraintError, ContradictionError, LayoutError)
+}
+
+
+def error_of(code: str, message: str) -> RefusedError:
+    """What a caller raises for an error of the one it asked: the class that the code names, else `RefusedError`."""
+    return _BY_CODE.get(code, RefusedError)(message)

@@ -1,4 +1,4 @@
-"""What somebody asks of a policy on one object: the same for a file, a server, `congrasp grasp` and the studio."""
+"""Constraints on one object: the same for a policy in this process, a server, `congrasp grasp` and the studio."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,8 +13,8 @@ Pose = tuple[np.ndarray, np.ndarray]
 class GraspRequest:
     """Constraints on one object, and where the episode begins.
 
-    Whoever leaves it out leaves it free: `congrasp grasp` then tries several. A control loop must give `surface`, `q`,
-    `wrist` and `object_pose`.
+    What is left out is free: `congrasp grasp` then attempts several. A control loop must give `surface`, `q`, `wrist`
+    and `object_pose`.
     """
 
     constraints: Mapping[str, Mapping[str, np.ndarray]] = dataclasses.field(default_factory=lambda: {"heading": {}})

@@ -14,18 +14,17 @@ from typing import Literal
 import numpy as np
 import tyro
 
+import congrasp
 from common.hands import get_hand
 from common.hands.mano import read_mano
 from common.objects.spec import GraspObject
 from common.wire.codec import Message
 from services.assets.captures.build import Options, import_sets
 from services.assets.captures.objects import Meshes
-from services.export.motion_file import save_motion
-from services.grasp.grasper import grasp
 from services.viz.render import episode_strip
 from services.viz.sheets import contact_sheet, save_png
 
-_MOMENTS = 4
+_FRAMES = 4
 
 
 @dataclasses.dataclass
@@ -65,37 +64,33 @@ def main(arguments: Arguments) -> None:
             episode = imitate(arguments, name, obj, constraints)
             result = "held" if episode.meta["success"] else "not held"
             images, labels = pictures.setdefault(obj.name, ([], []))
-            new = episode_strip(episode, _MOMENTS, (360, 270), f"{name}: 0.00 s", f", {result}")
+            new = episode_strip(episode, _FRAMES, (360, 270), f"{name}: 0.00 s", f", {result}")
             images += new[0]
             labels += new[1]
     for name, (images, labels) in pictures.items():
         title = f"{name}: heading and affordance of a human demonstration"
-        save_png(arguments.out / f"{name}.png", contact_sheet(images, labels, columns=_MOMENTS, title=title))
+        save_png(arguments.out / f"{name}.png", contact_sheet(images, labels, columns=_FRAMES, title=title))
 
 
 def imitate(arguments: Arguments, hand: str, obj: GraspObject, constraints: Message) -> Message:
     """Grasps an object as its constraint set's first demonstration did; returns the episode."""
     fitting = obj.scaled(constraints.meta["object_scale"])
-    done = grasp(
+    done = congrasp.grasp(
         fitting,
-        heading=_words(constraints.arrays["heading/direction"][0, 0]),
-        at=_words(constraints.arrays["heading/position"][0, 0] - fitting.origin),
+        heading=constraints.arrays["heading/direction"][0, 0],
+        at=constraints.arrays["heading/position"][0, 0] - fitting.origin,
         affordance=",".join(np.array(obj.part_names)[obj.graspable]) if not obj.graspable.all() else "",
         hand=hand,
         policy=arguments.policy,
     )
-    save_motion(arguments.out / f"{obj.name}-{hand}.npz", done.motion)
+    congrasp.save_motion(arguments.out / f"{obj.name}-{hand}.npz", done.motion)
     error = done.motion.metrics
     print(
-        f"{obj.name}, {hand} hand: {'held' if done.success else 'not held'} ({done.held} of {done.tries} tries); "
+        f"{obj.name}, {hand} hand: {'held' if done.success else 'not held'} ({done.held} of {done.attempts} attempts); "
         f"heading off by {error['heading_rad']:.2f} rad and {100 * error['heading_m']:.1f} cm, "
         f"{error['affordance_ratio']:.0%} of the contacts outside of what the demonstration touched."
     )
     return done.episode
-
-
-def _words(vector: np.ndarray) -> str:
-    return " ".join(map(str, vector))
 
 
 if __name__ == "__main__":

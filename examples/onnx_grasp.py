@@ -215,7 +215,7 @@ class Grasp:
 
 
 def main():
-    """Runs one grasp and says how it ended."""
+    """Runs one grasp and prints its outcome."""
     path = sys.argv[1] if len(sys.argv) > 1 else "policy.onnx"
     grasp = Grasp(onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"]))
     steps = grasp.task["approach_steps"] + 200  # two seconds after the table is removed

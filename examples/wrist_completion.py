@@ -13,12 +13,11 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
+import congrasp
 from common.hands import get_hand
 from services.assets.captures.extract import Surface, approach
 from services.assets.captures.transfer import followed
 from services.assets.objects.named import find_object
-from services.export.motion_file import save_motion
-from services.grasp.grasper import grasp
 from services.grasp.wrist_paths import read_wrist_path
 from services.viz.render import episode_sheet
 from services.viz.sheets import save_png
@@ -43,7 +42,7 @@ class Arguments:
     back: str = "+z"
     """Axis of that joint towards the back of the hand."""
     hand: str = "human"
-    """Hand whose shipped policy is taken; any but the human one follows the wrist by its own grasp axes."""
+    """Hand whose pretrained policy is taken; any but the human one follows the wrist by its own grasp axes."""
     policy: pathlib.Path | None = None
     """A policy file instead."""
     out: pathlib.Path = pathlib.Path("completed")
@@ -64,13 +63,13 @@ def main(arguments: Arguments) -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     table = arguments.out / "wrist.csv"  # in the coordinates of the object's file, as congrasp grasp takes it
     np.savetxt(table, np.concatenate([waypoints, turns], 1), delimiter=",", header="x, y, z, qw, qx, qy, qz")
-    done = grasp(obj, trajectory=str(table), hand=arguments.hand, policy=arguments.policy)
-    save_motion(arguments.out / "grasp.npz", done.motion)
+    done = congrasp.grasp(obj, trajectory=str(table), hand=arguments.hand, policy=arguments.policy)
+    congrasp.save_motion(arguments.out / "grasp.npz", done.motion)
     save_png(arguments.out / "grasp.png", episode_sheet(done.episode))
     error = done.motion.metrics
     print(
         f"frames {start} to {frame} of {len(far)}: {obj.name} is {'held' if done.success else 'not held'} "
-        f"({done.held} of {done.tries} tries); the wrist is off by {100 * error['trajectory_m']:.1f} cm and "
+        f"({done.held} of {done.attempts} attempts); the wrist is off by {100 * error['trajectory_m']:.1f} cm and "
         f"{error['trajectory_rad']:.2f} rad. Everything is in {arguments.out}."
     )
 

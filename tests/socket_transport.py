@@ -13,13 +13,14 @@ import threading
 import time
 from concurrent.futures import Future, InvalidStateError
 
-from common.errors import CongraspError, TransportError
-from common.transport.base import RefusedError, Subscription
+from common import errors
+from common.errors import CongraspError, RefusedError, TransportError
+from common.transport.base import Subscription
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.urls import SCHEMES
 from common.wire.codec import decode, encode
 
-ERRORS = {one.__name__: one for one in (RefusedError, TransportError, CongraspError)}
+ERRORS = {name: one for name, one in vars(errors).items() if isinstance(one, type)}
 LENGTH = struct.Struct("<Q")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from typing import Protocol, Self
 
-from common.errors import CongraspError, TransportError
+from common.errors import CongraspError
 from common.wire.codec import Message
 
 Handler = Callable[[str, Message], Message]
@@ -25,10 +25,6 @@ def join(threads: Iterable[threading.Thread], deadline: float) -> None:
     for thread in threads:
         if thread is not threading.current_thread():
             thread.join(max(0.0, deadline - time.monotonic()))
-
-
-class RefusedError(TransportError):
-    """The peer answered with an error message."""
 
 
 class Subscription:
@@ -100,7 +96,7 @@ class Transport(Protocol):
 
         Args:
           key: key or key expression.
-          handler: makes the reply, in a daemon thread of its own; the text of a CongraspError that it raises is sent.
+          handler: makes the reply, in a daemon thread of its own; message and code of its CongraspError are sent.
           workers: threads that run the handler.
           depth: queries that wait; further ones wait at their senders.
           on_damage: told about requests that cannot be decoded, which are refused without asking the handler.
@@ -117,7 +113,7 @@ class Transport(Protocol):
           timeout: seconds to wait for the answer.
 
         Raises:
-          RefusedError: the peer answered with an error.
+          RefusedError: the peer answered with an error; a subclass where its code names one (`common.errors`).
           TransportError: nobody serves the key, or there was no response in time.
         """
         ...

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import NamedTuple, Self
 
-from common.errors import CongraspError, TransportError
-from common.transport.base import Admission, Answerer, Damage, RefusedError, Subscription, join
+from common.errors import CongraspError, RefusedError, TransportError, error_of
+from common.transport.base import Admission, Answerer, Damage, Subscription, join
 from common.transport.keys import matches
 from common.wire.codec import Message
 
@@ -259,7 +259,7 @@ def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message
         else:
             question.answer.set_result(result)
     except CongraspError as error:
-        question.answer.set_exception(RefusedError(str(error)))
+        question.answer.set_exception(error_of(error.code, str(error)))
     except Exception as error:
         _log.exception("The answer to %s failed.", question.key)
         question.answer.set_exception(RefusedError(f"The peer failed on {question.key}: {type(error).__name__}."))

@@ -24,8 +24,8 @@ from typing import Any, Self
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from common.errors import CongraspError, TransportError
-from common.transport.base import Admission, Answerer, Damage, RefusedError, Subscription, join
+from common.errors import CongraspError, TransportError, error_of
+from common.transport.base import Admission, Answerer, Damage, Subscription, join
 from common.transport.keys import FLOWS, Flow, flow
 from common.transport.ports import shifted
 from common.transport.security import Credentials, refusal, secured
@@ -113,7 +113,7 @@ class ZenohTransport:
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
         payload = self._encode(request)
-        refusal = None
+        refused: zenoh.ReplyError | None = None
         try:
             with self._work.inside():
                 replies = self._session(key).get(
@@ -127,13 +127,14 @@ class ZenohTransport:
                     if reply.ok:
                         return decode(reply.ok.payload.to_bytes(), max_bytes=self._max_message)
                     if reply.err:
-                        refusal = reply.err.payload.to_bytes()
+                        refused = reply.err
         except zenoh.ZError as error:
             raise TransportError(f"The query for {key} failed: {_first_line(error)}.") from None
-        if refusal == b"Timeout":
+        message = refused.payload.to_bytes() if refused else b""
+        if message == b"Timeout":
             raise TransportError(f"No answer for {key} within {timeout:g} s.")
-        if refusal is not None:
-            raise RefusedError(refusal.decode(errors="replace"))
+        if refused is not None:
+            raise error_of(str(refused.encoding).partition(";")[2], message.decode(errors="replace"))
         raise TransportError(f"No response for {key}.", "The process that serves it may have ended.")
 
     def publish(self, key: str, message: Message) -> None:
@@ -350,8 +351,11 @@ def _ask(
 
 
 def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]]) -> None:
-    """Answers a query with what a function returns, once it is there, or with the message of what it raises."""
-    payload, words = b"", ""
+    """Answers a query with what a function returns, once it is there, or with message and code of what it raises.
+
+    The message is the error's payload, and the code the schema of its encoding.
+    """
+    payload, message, code = b"", "", ""
     try:
         result = outcome()
         if isinstance(result, Future):
@@ -359,13 +363,14 @@ def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]
             return
         payload = encode(result)
     except CongraspError as error:
-        words = str(error)
+        message, code = str(error), error.code
     except Exception as error:
         _log.exception("The answer to %s failed.", key)
-        words = f"The peer failed on {key}: {type(error).__name__}."
+        message = f"The peer failed on {key}: {type(error).__name__}."
     with contextlib.suppress(zenoh.ZError), query:
-        if words:
-            query.reply_err(words.encode(errors="replace"))
+        if message:
+            encoding = zenoh.Encoding.TEXT_PLAIN.with_schema(code)
+            query.reply_err(message.encode(errors="replace"), encoding=encoding)
         else:
             query.reply(key, payload)
 

@@ -44,9 +44,9 @@ def grasp(
     """Make grasp motions for objects of your own.
 
     Every object gets a folder in --out: grasp.npz (arrays that say what they mean), grasp.mcap (Foxglove, Rerun),
-    grasp.png, object.png (before and after its import, beside a hand at true scale) and result.json. Several tries are
-    simulated at once, and the best is kept: first one that holds the object for two seconds without the table, then
-    small errors, a quiet object and gentle forces. Interrupted runs go on where they stopped.
+    grasp.png, object.png (before and after its import, beside a hand at true scale) and result.json. Several attempts
+    are simulated at once, and the best is kept: first one that holds the object for two seconds without the table,
+    then small errors, a quiet object and gentle forces. Interrupted runs resume where they stopped.
 
     Args:
       objects: Meshes (STL, OBJ, PLY, GLB), object files, or folders of them.
@@ -55,10 +55,10 @@ def grasp(
       video: Also write grasp.mp4, at half speed, with the constraints drawn.
       pictures: Write pictures.
       policy: A policy file; by default the one that comes with the package.
-      hand: Hand whose shipped policy is taken.
-      tries: Grasps that are simulated side by side.
-      seed: Draws what is tried.
-      again: Also grasp anew what is done already.
+      hand: Hand whose pretrained policy is taken.
+      tries: Attempts that are simulated side by side.
+      seed: Draws what is attempted.
+      again: Also redo finished objects.
       options: How meshes become objects.
     """
     from rich.console import Console
@@ -68,7 +68,7 @@ def grasp(
     from common.policy.pretrained import policy_file
     from services.cli.console import bars
     from services.grasp.grasper import Grasper
-    from services.grasp.jobs import SHEET, Result, Settings, find_jobs, run_job, save_summary
+    from services.grasp.jobs import SHEET, Result, Settings, find_objects, grasp_object, save_summary
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
@@ -79,12 +79,12 @@ def grasp(
     console = Console(highlight=False)
     file = policy_file(policy, hand)
     loaded = bundles.load(file)
-    jobs, results = find_jobs(objects)
+    found, results = find_objects(objects)
     identity = (bundles.content_hash(file.read_bytes()), tries, seed)
     settings = Settings(out, options, dataclasses.asdict(constraints), identity, video, pictures, again)
-    grasper = Grasper(loaded, tries=tries, seed=seed)
+    grasper = Grasper(loaded, attempts=tries, seed=seed)
 
-    def say(result: Result) -> None:
+    def show(result: Result) -> None:
         results.append(result)
         if result.error:
             print(f"congrasp: error: {result.error}", file=sys.stderr)
@@ -96,26 +96,26 @@ def grasp(
 
     for result in results[:]:
         results.remove(result)
-        say(result)
+        show(result)
     with bars() as bar:
-        whole = bar.add_task("Objects", total=len(jobs), visible=len(jobs) > 1)
+        whole = bar.add_task("Objects", total=len(found), visible=len(found) > 1)
         part = bar.add_task("Starting", total=None)
-        for job in jobs:
+        for at in found:
 
-            def progress(what: str, done: int, total: int, name: str = job.name) -> None:
+            def progress(what: str, done: int, total: int, name: str = at.name) -> None:
                 bar.update(part, description=f"{escape(name)}: {what}", completed=done, total=total if done else None)
 
-            say(run_job(job, grasper, settings, progress))
+            show(grasp_object(at, grasper, settings, progress))
             bar.advance(whole)
     grasper.close()
-    if jobs:
+    if found:
         save_summary(out, grasper.hand.name, results)
     held = sum(bool(result.facts.get("success")) for result in results)
     failed = [result for result in results if result.error]
     if len(results) > 1:
-        words = f"{held} of {len(results)} objects are held; {len(failed)} could not be used."
-        console.print(f"{words} {escape(str(out / SHEET))} shows them.", soft_wrap=True)
-    if len(jobs) > len(failed):
+        summary = f"{held} of {len(results)} objects are held; {len(failed)} could not be used."
+        console.print(f"{summary} {escape(str(out / SHEET))} shows them.", soft_wrap=True)
+    if len(found) > len(failed):
         console.print(f"Everything is in {escape(str(out))}.", soft_wrap=True)
     return BAD_INPUT if failed else NOT_HELD if held < len(results) else 0
 

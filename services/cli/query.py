@@ -49,7 +49,7 @@ def query(
         return 0
     with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
         episode = example_episode(object_seed, str(client.health()["hand"]))
-    with PolicyClient(connect, name, hand=episode["hand"], timeout=timeout, certs=certs) as client:
+    with PolicyClient(connect, name, hand=episode.hand, timeout=timeout, certs=certs) as client:
         if repeat == states == 1 and not json:
             print(one_answer(client, episode))
             return 0

@@ -7,6 +7,7 @@ axis points up and the table's top is at z = 0. T frames, F finger joints, L lin
 import dataclasses
 import io
 import json
+import os
 import pathlib
 import zipfile
 from typing import Annotated, Any, get_type_hints
@@ -146,7 +147,7 @@ def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
     }
 
 
-def save_motion(path: pathlib.Path, motion: GraspMotion) -> None:
+def save_motion(path: str | os.PathLike[str], motion: GraspMotion) -> None:
     """Writes a motion as NPZ, whole or not at all.
 
     Raises:
@@ -164,10 +165,10 @@ def save_motion(path: pathlib.Path, motion: GraspMotion) -> None:
     arrays: dict[str, Any] = {**{name: getattr(motion, name) for name in _ARRAYS}, **motion.goal}
     arrays[_META] = np.array(json.dumps(meta))
     np.savez_compressed(buffer, **arrays)
-    write_atomically(path, buffer.getvalue())
+    write_atomically(pathlib.Path(path), buffer.getvalue())
 
 
-def load_motion(path: pathlib.Path) -> GraspMotion:
+def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
     """Reads a motion.
 
     Raises:

@@ -19,7 +19,7 @@ def headings(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of attempts that the table allows.
 
-    Likelier resting poses are tried more often.
+    Likelier resting poses come more often.
     """
     direction, position = request.given("heading", "direction"), request.given("heading", "position")
     restricted = request.avoid is not None
@@ -49,6 +49,7 @@ def headings(
 
 
 def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
+    """Error and remedy where the table leaves room for no approach."""
     if request.given("heading", "direction") is None:
         return (
             f"'{obj.name}' cannot be approached in any of its resting poses.",

@@ -18,14 +18,14 @@ from common.task.bank import ConstraintBank
 from common.wire.codec import Message, decode, encode
 
 SUFFIX = ".constraints.safetensors"
-VARIANTS = ("whole surface", "O+")
+REGIONS = ("whole surface", "graspable region")
 """The axis V: constraints for the whole surface, and for the graspable region alone."""
 Split = Literal["all", "training", "held-out"]
 _FORMAT = 2
 _TRAINING = 0.8
 _MEANING = {
     "surface/points": "(P, 3) m, object frame",
-    "surface/minus": "(P,) bool, the point belongs to the non-graspable region O-",
+    "surface/minus": "(P,) bool, the point belongs to the avoid region",
     "rest": "(R, 7) resting poses in the world, position (m) and quaternion; the table's top is at z = 0",
     "heading/position": "(V, H, 3) m, object frame: where the hand's centre should be",
     "heading/direction": "(V, H, 3) unit, object frame: the way the hand moves",
@@ -82,15 +82,15 @@ def set_of(
 
     Args:
       hand: the hand.
-      row: of the task set, without the axis of the objects.
+      row: of the constraint bank, without the axis of the objects.
       obj: the object.
       seed: of the constraints; the split into training and held-out is drawn from it.
       about: further facts for the file.
     """
-    # The task set fills an object's resting poses up to the most of any object by repeating them.
+    # The bank fills an object's resting poses up to the most of any object by repeating them.
     again = np.flatnonzero((row.rest[1:] == row.rest[0]).all(-1))
     rests = int(again[0]) + 1 if len(again) else len(row.rest)
-    allowed = np.zeros((len(VARIANTS), rests, row.heading_position.shape[1]), bool)
+    allowed = np.zeros((len(REGIONS), rests, row.heading_position.shape[1]), bool)
     back = np.zeros(allowed.shape, np.float32)
     for v, r in np.ndindex(allowed.shape[:2]):
         if v == 0 or row.has_affordance[r] or not row.minus.any():
@@ -125,7 +125,7 @@ def set_of(
         "object_digest": store.digest(obj),
         "object_scale": 1.0,
         "seed": seed,
-        "variants": list(VARIANTS),
+        "variants": list(REGIONS),
         "finger_joints": [joint.name for joint in hand.joints],
         "quaternions": "(w, x, y, z)",
         "object_frame": "origin at the centre of mass, orientation of the object file, lengths times object_scale",
@@ -136,13 +136,13 @@ def set_of(
 
 
 def _split(shape: tuple[int, ...], seed: int) -> np.ndarray:
-    """(V, M) bool, true for 80 % of M (rounded up), the same in both variants."""
+    """(V, M) bool, true for 80 % of M (rounded up), the same in both regions."""
     order = np.random.default_rng(seed).permutation(shape[1])
     return np.broadcast_to(order < np.ceil(_TRAINING * shape[1]), shape).copy()
 
 
 def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
-    """The task set that episodes are drawn from, of constraint sets of one hand.
+    """The constraint bank that episodes are drawn from, of constraint sets of one hand.
 
     Sets may differ in their numbers of resting poses, headings and references: they are repeated to the largest.
 
@@ -178,7 +178,7 @@ def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
 
 
 def _row(made: Message, split: Split) -> ConstraintBank:
-    """One set as a row of a task set, with what belongs to the split alone, and resting poses that allow a heading."""
+    """One set as a row of a constraint bank: what belongs to the split, in resting poses that allow a heading."""
     arrays = made.arrays
     heading, pose = (
         arrays[f"{kind}/allowed"] & _belongs(arrays[f"{kind}/training"], split)[:, None] for kind in ("heading", "pose")
@@ -278,20 +278,21 @@ def load_for(folder: pathlib.Path, objects: Sequence[GraspObject]) -> tuple[list
     return chosen, sets
 
 
-def _scale_in_words(scale: float) -> str:
+def _scale_text(scale: float) -> str:
+    """How much larger than its file the object is; empty where it is not."""
     return "" if scale == 1.0 else f", {scale:g} times as large, for this hand"
 
 
 def describe(constraints: Message) -> dict[str, str]:
-    """What a set holds, in words."""
+    """What a set holds, as text by name."""
     arrays, meta = constraints.arrays, constraints.meta
     allowed, poses = arrays["heading/allowed"], arrays["pose/allowed"]
     waypoints = arrays["trajectory/position"]
     length = np.linalg.norm(np.diff(waypoints, axis=2), axis=-1).sum(-1)
     rows = {
         "hand": f"{meta['hand']}, {len(meta['finger_joints'])} finger joints",
-        "object": f"{meta['object']} ({meta['object_digest']}){_scale_in_words(meta['object_scale'])}",
-        "O-": f"{arrays['surface/minus'].mean():.0%} of {len(arrays['surface/points'])} surface points",
+        "object": f"{meta['object']} ({meta['object_digest']}){_scale_text(meta['object_scale'])}",
+        "avoid region": f"{arrays['surface/minus'].mean():.0%} of {len(arrays['surface/points'])} surface points",
         "headings": f"{allowed.shape[2]} for each of: {', '.join(meta['variants'])}",
         "reference poses": f"{poses.shape[2]} for each",
         "wrist trajectories": f"as many, {waypoints.shape[2]} waypoints, "
@@ -301,8 +302,8 @@ def describe(constraints: Message) -> dict[str, str]:
         rows["captured"] = f"{meta['source']}: {', '.join(meta['demonstrations'])}"
     for r, rest in enumerate(arrays["rest"]):
         counts = [
-            f"{variant}: {int(allowed[v, r].sum())} headings, {int(poses[v, r].sum())} poses"
-            for v, variant in enumerate(meta["variants"])
+            f"{region}: {int(allowed[v, r].sum())} headings, {int(poses[v, r].sum())} poses"
+            for v, region in enumerate(meta["variants"])
         ]
         rows[f"resting pose {r + 1}"] = f"{100 * rest[2]:.1f} cm high; the table leaves on the {'; '.join(counts)}"
     return rows

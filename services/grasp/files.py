@@ -1,4 +1,4 @@
-"""What `congrasp grasp` leaves in an object's folder, and how it knows later that it is all there."""
+"""The files of a grasp: `congrasp grasp` writes them into an object's folder, the result last."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ from services.viz.sheets import save_png
 
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
 THUMBNAIL = "thumbnail.png"
-"""Its last moment."""
+"""A picture of its last frame."""
 OBJECT = "object.png"
 """Pictures of the object before and after its import."""
 
@@ -46,7 +46,7 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
     save_motion(folder / MOTION, found.motion)
     save_recording(folder / RECORDING, found.episode)
     episode = found.episode
-    steps = _moments(np.asarray(episode.arrays["table"], bool))
+    steps = _steps_to_draw(np.asarray(episode.arrays["table"], bool))
     last = steps[-1]
     camera = best_camera(episode, steps) if pictures or video else None
     if pictures:
@@ -57,7 +57,7 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 
 
-def _moments(table: np.ndarray) -> list[int]:
+def _steps_to_draw(table: np.ndarray) -> list[int]:
     """Steps of a grasp worth seeing: six of the approach, one while it is held, and the last."""
     removal, last = int(table.sum()), len(table) - 1
     approach = np.linspace(0, min(removal, last), 6)

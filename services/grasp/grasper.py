@@ -1,11 +1,4 @@
-"""A grasp motion for one object under constraints: several tries at once, of which the best is kept.
-
-from services.grasp.grasper import grasp
-from services.export.motion_file import save_motion
-
-found = grasp("mug.obj", heading="0 0 -1")
-save_motion(pathlib.Path("mug.npz"), found.motion)
-"""
+"""A grasp motion for one object under constraints: several attempts at once, of which the best is kept."""
 
 import dataclasses
 import functools
@@ -21,7 +14,7 @@ from actors.attempts import Attempts, Outcome
 from actors.episode import episode_message
 from actors.initial import RequestedEpisodes
 from actors.rollout import Trace
-from common.errors import CongraspError
+from common.errors import ContradictionError
 from common.hands import get_hand
 from common.objects.spec import GraspObject
 from common.policy import bundle as bundles
@@ -38,10 +31,10 @@ from services.export.motion_file import GraspMotion, motion_of_episode
 from services.grasp.approaches import headings, prescribed, valid_rests
 from services.grasp.parse import read_request
 
-TRIES = 16
+ATTEMPTS = 16
 """Grasps that are simulated side by side."""
 ROUNDS = 4
-"""How often that many others are tried while none holds."""
+"""How often that many others are attempted while none holds."""
 HOLD_SECONDS = 2.0
 """How long the object should be held without the table."""
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
@@ -51,7 +44,7 @@ strongest link's force (N), and the object's way after it went (m)."""
 _UNLIKELY = 0.5
 """What each likelier resting pose weighs against a grasp, likewise."""
 _TOUCHED = 0.2
-"""Share of touches on what must not be touched from which others are tried."""
+"""Share of touches on what must not be touched from which others are attempted."""
 
 Progress = Callable[[str, int, int], None]
 """Told what is done, how much of it, and of how much."""
@@ -59,19 +52,20 @@ Progress = Callable[[str, int, int], None]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Grasp:
-    """The best of some tries."""
+    """The best of some attempts."""
 
     episode: Message
     """The whole episode, as recordings keep it."""
     motion: GraspMotion
     """What the NPZ holds."""
-    tries: int
+    attempts: int
+    """How many were simulated."""
     held: int
-    """How many of the tries held the object to the end."""
+    """How many of them held the object to the end."""
     rest: int
     """Which of the object's resting poses it starts from."""
-    words: tuple[str, ...]
-    """Which constraints are active and why."""
+    active: tuple[str, ...]
+    """Which constraints are active and why, in sentences."""
 
     @property
     def success(self) -> bool:
@@ -79,13 +73,13 @@ class Grasp:
         return self.motion.metrics["held"] > 0
 
     def facts(self) -> dict[str, Any]:
-        """Result, tries and errors, for tables and files."""
+        """Result, attempts and errors, for tables and files."""
         return {
             "object": self.motion.object,
             "hand": self.motion.hand,
             "success": self.success,
             "held_quarter_second": self.motion.success,
-            "tries": self.tries,
+            "tries": self.attempts,
             "tries_held": self.held,
             "rest": self.rest,
             "constraints": list(self.motion.constraints),
@@ -101,7 +95,7 @@ class Grasper:
         self,
         policy: PolicyBundle,
         *,
-        tries: int = TRIES,
+        attempts: int = ATTEMPTS,
         rounds: int = ROUNDS,
         seconds: float = HOLD_SECONDS,
         threads: int = 0,
@@ -111,15 +105,15 @@ class Grasper:
 
         Args:
           policy: the policy, which names the hand.
-          tries: grasps side by side.
-          rounds: how often that many others are tried while none holds.
+          attempts: grasps side by side.
+          rounds: how often that many others are attempted while none holds.
           seconds: how long the object should be held without the table.
           threads: of the physics; 0 takes one a core.
-          seed: draws what is tried.
+          seed: draws what is attempted.
         """
         self.hand = get_hand(policy.spec.hand)
         self.task = dataclasses.replace(policy.task, end_when_fallen=False)
-        self._policy, self._attempts_count, self._rounds, self._seed = policy, tries, rounds, seed
+        self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
         self._compiled = False
         hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
         self._attempts = Attempts(self.hand, self.task, policy, hold=hold, threads=threads or os.cpu_count() or 1)
@@ -127,7 +121,7 @@ class Grasper:
     def grasp(
         self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
     ) -> Grasp:
-        """The best grasp of some tries.
+        """The best grasp of some attempts.
 
         Args:
           obj: the object.
@@ -135,23 +129,25 @@ class Grasper:
           progress: told how far it is.
 
         Raises:
-          CongraspError: the constraints contradict one another, or the table is in the way of all of them.
+          UnknownConstraintError: the policy does not know one of the constraints.
+          ContradictionError: two of them exclude each other.
+          CongraspError: the table is in the way of all attempts.
         """
         request = request or GraspRequest()
         require_known(request.constraints, self.task)
         best: tuple[float, Outcome, Goal, int, int] | None = None
-        held = tried = 0
+        held = attempted = 0
         for round_ in range(self._rounds):
             episodes, rests, different = self._episodes(obj, request, np.random.default_rng((self._seed, round_)))
             progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
             self._compiled = True
-            what = f"Trying others ({round_ + 1})" if round_ else "Trying"
+            what = f"Attempting others ({round_ + 1})" if round_ else "Attempting"
             outcome = self._attempts.run(
                 obj, episodes, functools.partial(lambda what, step: progress(what, step, self._attempts.steps), what)
             )
             _check_aligned(outcome)
             cost = (costs(outcome, tuple(request.constraints)) + _UNLIKELY * rests)[:different]
-            tried += different
+            attempted += different
             holds = outcome.metrics["held"][:different] > 0
             held += int(holds.sum())
             if request.avoid is not None:  # one that holds it by what must not be touched is not what was asked for
@@ -163,7 +159,7 @@ class Grasper:
                 break
         assert best is not None
         _, outcome, wanted, index, rest = best
-        return self._result(obj, request, outcome, wanted, index, rest, tried, held)
+        return self._result(obj, request, outcome, wanted, index, rest, attempted, held)
 
     def close(self) -> None:
         """Ends the physics' threads."""
@@ -192,6 +188,7 @@ class Grasper:
         return RequestedEpisodes(goal, asked, surface, rest), rests, different
 
     def _surface(self, obj: GraspObject) -> Surface:
+        """As many labelled points as the policy looks at."""
         points = self.task.surface_points
         return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points])
 
@@ -203,9 +200,10 @@ class Grasper:
         wanted: Goal,
         index: int,
         rest: int,
-        tries: int,
+        attempts: int,
         held: int,
     ) -> Grasp:
+        """One attempt of an outcome, with its episode, motion and the constraints that were active."""
         metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
         labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
         episode = episode_message(
@@ -220,27 +218,27 @@ class Grasper:
                 "actor": "grasp",
                 "success": metrics["success"] > 0,
                 "metrics": metrics,
-                "tries": tries,
+                "tries": attempts,
                 "tries_held": held,
                 "object_file_scale": obj.file_scale,
                 "object_file_origin": [-x for x in obj.origin],
             },
         )
         asked = tuple(request.constraints)
-        words = explain(asked, bool(outcome.redirected[index]))
+        active = explain(asked, bool(outcome.redirected[index]))
         written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
         avoid = labelled.non_graspable_points
-        words += [found.words for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
-        return Grasp(episode, motion_of_episode(episode), tries, held, rest, tuple(words))
+        active += [found.words for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
+        return Grasp(episode, motion_of_episode(episode), attempts, held, rest, tuple(active))
 
 
 def grasp(
-    thing: str | os.PathLike[str] | GraspObject,
+    mesh: str | os.PathLike[str] | GraspObject,
     *,
     policy: str | os.PathLike[str] | None = None,
     hand: str = "human",
     options: ImportOptions | None = None,
-    tries: int = TRIES,
+    attempts: int = ATTEMPTS,
     seed: int = 0,
     progress: Progress = lambda what, done, total: None,
     **constraints: Any,
@@ -248,30 +246,30 @@ def grasp(
     """The best grasp motion of an object under constraints; what is compiled is kept for the next call.
 
     Args:
-      thing: a mesh (STL, OBJ, PLY, GLB), an object file, or an object.
+      mesh: a mesh (STL, OBJ, PLY, GLB), an object file, or an object.
       policy: a policy file; the one that comes with the package if none is named.
-      hand: name of the hand whose shipped policy is taken.
+      hand: name of the hand whose pretrained policy is taken.
       options: how a mesh becomes an object.
-      tries: grasps that are simulated side by side.
-      seed: draws what is tried.
+      attempts: grasps that are simulated side by side.
+      seed: draws what is attempted.
       progress: told how far it is.
-      **constraints: heading, at, affordance, avoid, pose, trajectory, …; see `services.grasp.parse.read_request`.
+      **constraints: the options of `congrasp grasp`: heading, at, affordance, avoid, pose, trajectory, fingers, …; each
+        is the text that the command line takes, or a sequence of its words or numbers.
 
     Raises:
       CongraspError: the object cannot be imported, or a constraint cannot be read or kept.
     """
     file = policy_file(None if policy is None else pathlib.Path(policy), hand)
-    grasper = _grasper(file, file.stat().st_mtime_ns, tries, seed)
-    obj = (
-        thing if isinstance(thing, GraspObject) else one_object(pathlib.Path(thing), options or ImportOptions("guess"))
-    )
+    grasper = _grasper(file, file.stat().st_mtime_ns, attempts, seed)
+    obj = mesh if isinstance(mesh, GraspObject) else one_object(pathlib.Path(mesh), options or ImportOptions("guess"))
     request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **constraints)
     return grasper.grasp(obj, request, progress)
 
 
 @functools.lru_cache(maxsize=2)
-def _grasper(file: pathlib.Path, changed: int, tries: int, seed: int) -> Grasper:
-    return Grasper(bundles.load(file), tries=tries, seed=seed)
+def _grasper(file: pathlib.Path, changed: int, attempts: int, seed: int) -> Grasper:
+    """The grasper of a policy file as it was when it changed last."""
+    return Grasper(bundles.load(file), attempts=attempts, seed=seed)
 
 
 def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
@@ -282,12 +280,13 @@ def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
 
 
 def _errors_of(constraints: tuple[str, ...]) -> list[str]:
+    """Names of the metrics that count under these constraints."""
     names = [spec.name for c in CONSTRAINTS if not c.optional or c.name in constraints for spec in c.errors]
     return [*names, "moved_at_removal", "force_link_max"]
 
 
 def costs(outcome: Outcome, constraints: tuple[str, ...]) -> np.ndarray:
-    """(B,) what is worse about each try: first whether it held, then whether it did for a while, then all the rest."""
+    """(B,) cost of each attempt: first whether it held, then whether it did for a while, then all the rest."""
     place = outcome.trace.object_position
     removal = int(np.asarray(outcome.trace.table[:, 0]).sum()) - 1
     values = {**outcome.metrics, "slip": np.linalg.norm(place[-1] - place[removal], axis=-1)}
@@ -296,8 +295,9 @@ def costs(outcome: Outcome, constraints: tuple[str, ...]) -> np.ndarray:
 
 
 def _check_aligned(outcome: Outcome) -> None:
+    """Raises a ContradictionError if trajectory and affordance exclude each other."""
     if not outcome.aligned.all():
-        raise CongraspError(
+        raise ContradictionError(
             "The trajectory ends nearer to what must not be touched than to what may be grasped.",
             "Let it end at the graspable part, or leave out --affordance and --avoid.",
         )

@@ -1,4 +1,4 @@
-"""Grasps of many objects, one after another: what is done stays done, and one bad object does not stop the others."""
+"""Grasps of many objects, one after another: finished ones are kept, and one bad object does not stop the others."""
 
 import dataclasses
 import hashlib
@@ -12,13 +12,10 @@ from PIL import Image
 
 from common.errors import CongraspError
 from common.files import write_atomically
-from common.objects import store
 from common.objects.spec import GraspObject
-from services.assets.objects.meshes import import_source
-from services.assets.objects.named import objects_at
+from services.assets.objects.named import ObjectAt, objects_at
 from services.assets.objects.options import ImportOptions, check_options
 from services.assets.objects.sizes import size_in_words
-from services.assets.objects.sources import Source
 from services.grasp.files import OBJECT, THUMBNAIL, VIDEO, finished, key_of, save_grasp
 from services.grasp.grasper import Grasper, Progress
 from services.grasp.parse import numbered, read_request
@@ -29,134 +26,130 @@ SHEET, SUMMARY = "summary.png", "summary.json"
 _COLUMNS = 6
 
 
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """One object to grasp."""
-
-    name: str
-    """Name of its folder."""
-    path: pathlib.Path
-    source: Source | None
-    """The meshes; None for an object file."""
-
-    def content(self) -> str:
-        """A hash of its files."""
-        files = [file.path for file in self.source.files()] if self.source else [self.path]
-        return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
-
-    def load(self, options: ImportOptions) -> GraspObject:
-        """The object; of an object file the scale is all that the options change."""
-        check_options(options)
-        return import_source(self.source, options) if self.source else store.load(self.path).scaled(options.scale)
-
-
 class Settings(NamedTuple):
-    """What all jobs share."""
+    """What the grasps of all objects share."""
 
     out: pathlib.Path
     options: ImportOptions
     constraints: dict[str, Any]
     """See `services.grasp.parse.read_request`."""
     identity: tuple[Any, ...]
-    """What else makes a grasp: policy, seed, tries."""
+    """What else makes a grasp: policy, seed, attempts."""
     video: bool
     pictures: bool
     again: bool
-    """Whether to grasp anew what is done."""
+    """Whether to redo finished objects."""
 
 
 class Result(NamedTuple):
-    """What became of a job."""
+    """The outcome for one object."""
 
     name: str
     facts: dict[str, Any]
     """As in the result file; empty where there is an error."""
     error: str = ""
     skipped: bool = False
-    """It was done before."""
+    """It was finished before."""
 
     def line(self) -> str:
         """One line."""
         if self.error:
             return self.error
         facts = self.facts
-        words = [facts["size"], f"best of {facts['tries']} tries, {facts['tries_held']} of which hold it"]
-        words.insert(1, "held" if facts["success"] else "not held")
+        outcome = "held" if facts["success"] else "not held"
+        best = f"best of {facts['tries']} attempts, {facts['tries_held']} of which hold it"
         errors = [f"{what} {_shown(facts, stem)}" for stem, what in _ERRORS.items() if f"{stem}_m" in facts]
         if "affordance_ratio" in facts:
             errors.append(f"{100 * facts['affordance_ratio']:.0f} % of the touches where there should be none")
-        return "; ".join([*words, *errors, f"strongest link {facts['force_link_max']:.1f} N"])
+        return "; ".join([facts["size"], outcome, best, *errors, f"strongest link {facts['force_link_max']:.1f} N"])
 
 
 _ERRORS = {"heading": "heading off by", "pose": "pose off by", "trajectory": "trajectory off by"}
 
 
 def _shown(facts: dict[str, Any], stem: str) -> str:
+    """Angle and distance of one kind of error."""
     return f"{np.degrees(facts[f'{stem}_rad']):.0f}° and {1000 * facts[f'{stem}_m']:.0f} mm"
 
 
-def find_jobs(paths: Sequence[pathlib.Path]) -> tuple[list[Job], list[Result]]:
-    """The objects of some paths (meshes, object files, folders of either), and errors of paths that hold none."""
-    jobs: list[Job] = []
+def find_objects(paths: Sequence[pathlib.Path]) -> tuple[list[ObjectAt], list[Result]]:
+    """The objects of some paths (meshes, object files, folders of either), and errors of paths that hold none.
+
+    The objects have different names, which become those of their folders.
+    """
+    found: list[ObjectAt] = []
     errors: list[Result] = []
     for path in paths:
         try:
-            jobs += [Job(*found) for found in objects_at(path)]
+            found += objects_at(path)
         except CongraspError as error:
             errors.append(Result(path.name, {}, str(error)))
-    return [dataclasses.replace(job, name=name) for job, name in zip(jobs, _distinct(jobs), strict=True)], errors
+    return [one._replace(name=name) for one, name in zip(found, _distinct(found), strict=True)], errors
 
 
-def _distinct(jobs: Sequence[Job]) -> Iterator[str]:
+def _distinct(found: Sequence[ObjectAt]) -> Iterator[str]:
+    """The names, with a number where one comes again."""
     taken: dict[str, int] = {}
-    for job in jobs:
-        taken[job.name] = taken.get(job.name, 0) + 1
-        yield job.name if taken[job.name] == 1 else f"{job.name}-{taken[job.name]}"
+    for name, *_ in found:
+        taken[name] = taken.get(name, 0) + 1
+        yield name if taken[name] == 1 else f"{name}-{taken[name]}"
 
 
-def run_job(job: Job, grasper: Grasper, settings: Settings, progress: Progress) -> Result:
-    """Grasps one object and writes its folder, unless that is done already."""
-    folder = settings.out / job.name
+def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: Progress) -> Result:
+    """Grasps one object and writes its folder, unless it is finished already."""
+    folder = settings.out / at.name
     try:
         given = {
-            name: [_content(part) for part in ([text] if isinstance(text, str) else text)]
+            name: [_identity(part) for part in ([text] if isinstance(text, str) else text)]
             for name, text in settings.constraints.items()
             if text
         }
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
-        key = key_of(job.content(), options, given, settings.identity)
+        key = key_of(_content(at), options, given, settings.identity)
         before = None if settings.again else finished(folder, key)
         if before is not None and ((folder / VIDEO).exists() or not settings.video):
-            return Result(job.name, before, skipped=True)
+            return Result(at.name, before, skipped=True)
         progress("Importing", 0, 1)
-        obj = job.load(settings.options)
+        obj = _load(at, settings.options)
         request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **settings.constraints)
-        if settings.pictures and job.source:
-            save_png(folder / OBJECT, import_sheet(grasper.hand, obj, mesh_of_file(job.source)))
+        if settings.pictures and at.source:
+            save_png(folder / OBJECT, import_sheet(grasper.hand, obj, mesh_of_file(at.source)))
         found = grasper.grasp(obj, request, progress)
         progress("Drawing", 0, 1)
         about = {
             "key": key,
-            "file": str(job.path),
+            "file": str(at.path),
             "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
             "mass": obj.mass,
             "notes": list(obj.notes),
-            "rules": list(found.words),
+            "rules": list(found.active),
         }
         save_grasp(folder, found, video=settings.video, pictures=settings.pictures, about=about)
-        return Result(job.name, {**found.facts(), **about})
+        return Result(at.name, {**found.facts(), **about})
     except CongraspError as error:
-        return Result(job.name, {}, str(error))
+        return Result(at.name, {}, str(error))
 
 
-def _content(text: str) -> str:
-    """What a constraint says: its file's content, where it names one."""
+def _content(at: ObjectAt) -> str:
+    """A hash of an object's files."""
+    files = [file.path for file in at.source.files()] if at.source else [at.path]
+    return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
+
+
+def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
+    """The object; of an object file the scale is all that the options change."""
+    check_options(options)
+    return at.load(options) if at.source else at.load().scaled(options.scale)
+
+
+def _identity(text: str) -> str:
+    """What a constraint asks for: its file's content, where it names one."""
     path, number = numbered(text)
     return f"{hashlib.sha256(path.read_bytes()).hexdigest()}:{number}" if path.is_file() else text
 
 
 def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> None:
-    """Writes the results of a hand as JSON, and the last moments of all grasps as one picture."""
+    """Writes the results of a hand as JSON, and the last frames of all grasps as one picture."""
     held = sum(bool(result.facts.get("success")) for result in results)
     rows = [{"name": r.name, "error": r.error} if r.error else {"name": r.name, **r.facts} for r in results]
     summary = {"hand": hand, "objects": len(rows), "succeeded": held, "results": rows}

@@ -5,8 +5,9 @@ sets, which know the object's frame, are taken as they are.
 """
 
 import json
+import os
 import pathlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,8 +20,10 @@ from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.task.constraints import CONSTRAINTS
+from common.task.constraints.base import Option
 from common.wire.codec import Message
 from services.assets.objects.sizes import size_in_words
+from services.export.frames import continuous_quaternions
 from services.export.motion_file import GraspMotion, load_motion
 from services.grasp import constraint_sets
 
@@ -46,11 +49,6 @@ class Written(NamedTuple):
         return -np.asarray(self.obj.origin)
 
 
-def option_names() -> tuple[str, ...]:
-    """Names of the options of all constraints."""
-    return tuple(option.name for constraint in CONSTRAINTS for option in constraint.options)
-
-
 def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> GraspRequest:
     """The constraints that a person wrote down for an object.
 
@@ -58,14 +56,17 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
       obj: the object.
       hand: the hand.
       waypoints: K, of wrist trajectories.
-      **texts: by the names of the constraints' options (`Constraint.options`); empty is none.
+      **texts: by the names of the constraints' options (`Constraint.options`); empty is none. Text is split at blanks
+        and commas where an option takes several words; a sequence of words or numbers stands for such a text.
 
     Raises:
       CongraspError: something cannot be read or does not fit; the line names it.
     """
-    written = Written({**dict.fromkeys(option_names(), ""), **texts}, obj, hand, waypoints)
-    if unknown := sorted(set(texts) - set(option_names())):
-        raise CongraspError(f"There is no constraint option '{unknown[0]}'.", f"Known: {', '.join(option_names())}.")
+    options = {option.name: option for constraint in CONSTRAINTS for option in constraint.options}
+    if unknown := sorted(set(texts) - set(options)):
+        raise CongraspError(f"There is no constraint option '{unknown[0]}'.", f"Known: {', '.join(options)}.")
+    plain = {name: _plain(option, texts.get(name, "")) for name, option in options.items()}
+    written = Written(plain, obj, hand, waypoints)
     found: dict[str, dict[str, np.ndarray]] = {}
     for constraint in CONSTRAINTS:
         reader = READERS.get(constraint.name)
@@ -74,6 +75,12 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
             found[constraint.name] = given
     avoid = _avoid(written) if "affordance" in found else None
     return GraspRequest({"heading": {}, **found}, avoid, above=written.texts["heading"] == ABOVE)
+
+
+def _plain(option: Option, value: str | os.PathLike[str] | Iterable[Any]) -> str | tuple[str, ...]:
+    """What was written for an option: its words where it takes several, else one text."""
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else ",".join(map(str, value))
+    return tuple(text.replace(",", " ").split()) if option.many else text
 
 
 def _heading(written: Written) -> dict[str, np.ndarray] | None:
@@ -89,10 +96,12 @@ def _heading(written: Written) -> dict[str, np.ndarray] | None:
 
 
 def _affordance(written: Written) -> dict[str, np.ndarray] | None:
+    """It has no arrays of its own: what it asks for is in the avoid region."""
     return {} if written.texts["affordance"] or written.texts["avoid"] else None
 
 
 def _numbers(text: str, count: int, name: str) -> np.ndarray:
+    """(count,) finite numbers."""
     try:
         values = np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError:
@@ -104,6 +113,7 @@ def _numbers(text: str, count: int, name: str) -> np.ndarray:
 
 
 def _unit(vector: np.ndarray, name: str) -> np.ndarray:
+    """The vector at length 1."""
     size = np.linalg.norm(vector)
     if size < 1e-9:
         raise CongraspError(
@@ -115,25 +125,25 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
 def _avoid(written: Written) -> np.ndarray:
     """(512,) bool, the avoid region; what is named on both sides belongs to the nearer one."""
     obj, affordance, avoid = written.obj, written.texts["affordance"], written.texts["avoid"]
-    plus_distance = _distance(obj, affordance, "--affordance") if affordance else None
-    minus_distance = _distance(obj, avoid, "--avoid") if avoid else None
-    if plus_distance is None:
-        assert minus_distance is not None
-        minus = minus_distance < _NEAR
-    elif minus_distance is None:
-        minus = plus_distance >= _NEAR
+    graspable_distance = _distance(obj, affordance, "--affordance") if affordance else None
+    avoid_distance = _distance(obj, avoid, "--avoid") if avoid else None
+    if graspable_distance is None:
+        assert avoid_distance is not None
+        region = avoid_distance < _NEAR
+    elif avoid_distance is None:
+        region = graspable_distance >= _NEAR
     else:
-        minus = minus_distance < plus_distance
-    if minus.all() and not affordance:
+        region = avoid_distance < graspable_distance
+    if region.all() and not affordance:
         raise CongraspError(f"'{avoid}' is all of '{obj.name}', so that nothing may be touched.", "Avoid a part of it.")
-    if minus.all():
+    if region.all():
         raise CongraspError(
             f"Nothing of '{affordance or avoid}' lies on the surface of '{obj.name}'.",
             "The part must be in the coordinates of the object's file; name it with --affordance.",
         )
-    if not minus.any():
+    if not region.any():
         raise CongraspError(f"'{affordance or avoid}' leaves no difference: all of '{obj.name}' may be touched.")
-    return minus
+    return region
 
 
 def _check_near(obj: GraspObject, position: np.ndarray, what: str) -> None:
@@ -176,6 +186,7 @@ def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
 
 
 def _pose(written: Written) -> dict[str, np.ndarray] | None:
+    """A reference pose from a motion, a constraint set, or JSON."""
     text, hand, obj, origin = written.texts["pose"], written.hand, written.obj, written.origin
     if not text:
         return None
@@ -204,10 +215,12 @@ def _pose(written: Written) -> dict[str, np.ndarray] | None:
 
 
 def _reference(q: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> dict[str, np.ndarray]:
+    """The goal arrays of a reference pose."""
     return {"q": q, "position": position, "quaternion": quaternion}
 
 
 def _trajectory(written: Written) -> dict[str, np.ndarray] | None:
+    """A wrist trajectory from a motion, a constraint set, CSV, or JSON."""
     text, hand, obj, origin = written.texts["trajectory"], written.hand, written.obj, written.origin
     waypoints = written.waypoints
     if not text:
@@ -246,6 +259,7 @@ def numbered(text: str) -> tuple[pathlib.Path, int]:
 
 
 def _motion(path: pathlib.Path, hand: Hand) -> GraspMotion:
+    """A motion of this hand."""
     motion = load_motion(path)
     if motion.hand != hand.name:
         raise CongraspError(f"{path} is a motion of the hand '{motion.hand}', not '{hand.name}'.")
@@ -253,18 +267,19 @@ def _motion(path: pathlib.Path, hand: Hand) -> GraspMotion:
 
 
 def _removal(motion: GraspMotion) -> int:
-    """The last moment with the table."""
+    """The last frame with the table."""
     return max(int(motion.table.sum()) - 1, 0)
 
 
-def _wrist_on_object(motion: GraspMotion, moment: int) -> tuple[np.ndarray, np.ndarray]:
-    """The wrist (T, 3), (T, 4) in the frame of the object as it is at one moment."""
-    turn = Rotation.from_quat(motion.object_quaternion[moment], scalar_first=True).inv()
+def _wrist_on_object(motion: GraspMotion, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """The wrist (T, 3), (T, 4) in the frame of the object as it is in one frame of the motion."""
+    turn = Rotation.from_quat(motion.object_quaternion[frame], scalar_first=True).inv()
     wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)
-    return turn.apply(motion.wrist_position - motion.object_position[moment]), (turn * wrist).as_quat(scalar_first=True)
+    return turn.apply(motion.wrist_position - motion.object_position[frame]), (turn * wrist).as_quat(scalar_first=True)
 
 
 def _set_of(path: pathlib.Path, hand: Hand, obj: GraspObject, index: int) -> Message:
+    """A constraint set of this hand and object, which has a pose and a trajectory of this number."""
     constraints = constraint_sets.load(path)
     if constraints.meta["hand"] != hand.name:
         raise CongraspError(f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'.")
@@ -283,6 +298,7 @@ def _set_of(path: pathlib.Path, hand: Hand, obj: GraspObject, index: int) -> Mes
 
 
 def _json(path: pathlib.Path, name: str, keys: tuple[str, ...]) -> dict[str, Any]:
+    """A JSON file that has these keys."""
     remedy = f"Write a JSON file with {', '.join(keys)}, or name a motion (.npz) or a constraint set."
     try:
         given = json.loads(path.read_text())
@@ -297,6 +313,7 @@ def _json(path: pathlib.Path, name: str, keys: tuple[str, ...]) -> dict[str, Any
 
 
 def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Finite numbers of this shape."""
     try:
         array = np.asarray(values, float)
     except (TypeError, ValueError):
@@ -319,9 +336,8 @@ def _resampled(position: np.ndarray, quaternion: np.ndarray, waypoints: int, wha
     position, quaternion, along = position[kept], quaternion[kept], along[kept]
     wanted = np.linspace(0.0, along[-1], waypoints)
     places = np.stack([np.interp(wanted, along, column) for column in position.T], -1)
-    turns = Slerp(along, Rotation.from_quat(quaternion, scalar_first=True))(wanted).as_quat(scalar_first=True)
-    signs = np.where(np.concatenate([[1.0], np.einsum("ij,ij->i", turns[1:], turns[:-1])]) < 0, -1.0, 1.0)
-    return {"position": places, "quaternion": turns * np.cumprod(signs)[:, None]}  # continuous in sign
+    turns = Slerp(along, Rotation.from_quat(quaternion, scalar_first=True))(wanted)
+    return {"position": places, "quaternion": continuous_quaternions(turns, scalar_first=True)}
 
 
 READERS: dict[str, Callable[[Written], dict[str, np.ndarray] | None]] = {

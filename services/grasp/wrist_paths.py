@@ -19,14 +19,14 @@ _AXES = {
 
 
 class WristPath(NamedTuple):
-    """T moments of a wrist."""
+    """T frames of a wrist."""
 
     position: np.ndarray
     """(T, 3) m."""
     rotation: Rotation
     """T orientations of the wrist frame."""
     seconds: float
-    """Between two moments."""
+    """Between two frames."""
 
 
 def read_wrist_path(
@@ -41,7 +41,7 @@ def read_wrist_path(
     """A wrist's path.
 
     Args:
-      path: `.csv`, a line a moment: x, y, z (m) and a quaternion w, x, y, z; `.npz` with `position` (T, 3) and
+      path: `.csv`, a line a frame: x, y, z (m) and a quaternion w, x, y, z; `.npz` with `position` (T, 3) and
         `quaternion` (T, 4), or a grasp motion; or `.bvh`.
       joint: of a BVH file: the joint that is the wrist.
       unit: of a BVH file: metres per unit.
@@ -113,33 +113,34 @@ _Link = tuple[np.ndarray, list[str], int]
 
 def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
     """Offset (3,), channels and first column of each joint down to the named one; number of columns; all joints."""
-    words = iter(text.split())
+    tokens = iter(text.split())
     stack: list[_Link] = []
     found: list[_Link] | None = None
     names: list[str] = []
     column, name = 0, ""
-    for word in words:
-        if word in ("ROOT", "JOINT"):
-            name = next(words)
+    for token in tokens:
+        if token in ("ROOT", "JOINT"):
+            name = next(tokens)
             names.append(name)
-        elif word == "End":
-            name = next(words)
-        elif word == "{":
+        elif token == "End":
+            name = next(tokens)
+        elif token == "{":
             stack.append((np.zeros(3), [], column))
-        elif word == "OFFSET":
-            stack[-1] = (np.array([float(next(words)) for _ in range(3)]), *stack[-1][1:])
-        elif word == "CHANNELS":
-            channels = [next(words) for _ in range(int(next(words)))]
+        elif token == "OFFSET":
+            stack[-1] = (np.array([float(next(tokens)) for _ in range(3)]), *stack[-1][1:])
+        elif token == "CHANNELS":
+            channels = [next(tokens) for _ in range(int(next(tokens)))]
             stack[-1] = (stack[-1][0], channels, column)
             column += len(channels)
             if name == joint:
                 found = list(stack)
-        elif word == "}":
+        elif token == "}":
             stack.pop()
     return found, column, names
 
 
 def _csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
+    """Positions (T, 3), quaternions (T, 4) and seconds between two frames, of a CSV file."""
     try:
         rows = np.genfromtxt(path, delimiter=",", comments="#", ndmin=2)
     except ValueError as error:
@@ -149,6 +150,7 @@ def _csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
+    """The same of an NPZ file."""
     try:
         with np.load(path, allow_pickle=False) as data:
             keys = ("wrist_position", "wrist_quaternion") if "wrist_position" in data else ("position", "quaternion")
@@ -159,10 +161,11 @@ def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _checked(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """The same of arrays whose shapes and values are right; a file without times has 10 ms a frame."""
     if position.ndim != 2 or position.shape[1] != 3 or quaternion.shape != (len(position), 4):
         raise CongraspError(
             f"{path} has positions {position.shape} and quaternions {quaternion.shape}.",
-            "A moment is x, y, z and a quaternion w, x, y, z.",
+            "A frame is x, y, z and a quaternion w, x, y, z.",
         )
     both = np.concatenate([position, quaternion], 1)
     if not np.isfinite(both).all() or np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > 0.05:

@@ -7,21 +7,15 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Generic, NamedTuple, TypeVar, cast
 
-from common.errors import CongraspError
+from common.errors import CongraspError, LateError, OverloadedError
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 
-class Overloaded(CongraspError):
-    """The queue is full; said at once, so that the caller can do something else within its deadline."""
-
-
-class Late(CongraspError):
-    """The query's deadline passed while it waited."""
-
-
 class _Waiting(NamedTuple):
+    """An item in the queue; times in seconds of the monotonic clock."""
+
     item: object
     future: Future
     arrival: float
@@ -40,7 +34,7 @@ class Batcher(Generic[T, R]):
       run: the function of a batch and its queueing times in seconds; it returns one result or exception for each item.
       size: most that the items of one batch may weigh together.
       window: seconds.
-      depth: most items that wait; one more is refused with `Overloaded`.
+      depth: most items that wait; one more is refused with `OverloadedError`.
       weigh: an item's weight, which is at most `size`.
     """
 
@@ -74,7 +68,7 @@ class Batcher(Generic[T, R]):
         """Queues an item that is worth answering for `timeout` seconds.
 
         Raises:
-          Overloaded: `depth` items wait already.
+          OverloadedError: `depth` items wait already.
         """
         now = time.monotonic()
         waiting = _Waiting(item, Future(), now, now + timeout)
@@ -85,7 +79,7 @@ class Batcher(Generic[T, R]):
             if alone:
                 self._running = True
             elif len(self._queue) >= self._depth:
-                raise Overloaded(f"Overloaded: {self._depth} queries wait already.", "Ask again later.")
+                raise OverloadedError(f"Overloaded: {self._depth} queries wait already.", "Ask again later.")
             else:
                 self._queue.append(waiting)
                 self._changed.notify()
@@ -101,17 +95,19 @@ class Batcher(Generic[T, R]):
         self._thread.join(timeout)
 
     def _work(self) -> None:
+        """Answers batches until the batcher is closed, in the worker."""
         while batch := self._collect():
             self._answer(batch)
         for waiting in self._queue:
             waiting.future.set_exception(CongraspError("The server is shutting down."))
 
     def _answer(self, batch: list[_Waiting]) -> None:
+        """Runs a batch without what is late, and gives every item its outcome."""
         now = time.monotonic()
         for waiting in batch:
             if waiting.deadline < now:
                 late = f"Too late: the query waited {1e3 * (now - waiting.arrival):.0f} ms, beyond its deadline."
-                waiting.future.set_exception(Late(late))
+                waiting.future.set_exception(LateError(late))
         batch = [waiting for waiting in batch if waiting.deadline >= now]
         try:
             items = [cast(T, waiting.item) for waiting in batch]

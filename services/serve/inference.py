@@ -1,34 +1,35 @@
 """The policy as one compiled function from a batch of flat queries to joint targets."""
 
 import itertools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from common.config import TaskConfig
-from common.errors import CongraspError
+from common.errors import CongraspError, ContradictionError
 from common.hands.spec import Hand
 from common.policy.bundle import Acting, mean_action
 from common.task import control, observation
 from common.task.constraints.priority import explain, resolve
 from common.task.features import scene_of
 from common.task.types import SceneState, Surface
-from services.serve.requests import STATES_LIMIT, Layout, Query
+from common.wire.codec import Message
+from services.serve.requests import PACKED, STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)
 """Batches are padded to one of these, so that nothing compiles after the warm-up."""
 
 
-class Answer(NamedTuple):
-    """What the policy says to one query of n states."""
+class Inference(NamedTuple):
+    """The policy's answer to one query of n states."""
 
     vectors: np.ndarray
     """(n, A + F + 6): the policy's mean action in units of action, finger targets (rad), wrist targets (m and rad)."""
-    words: list[list[str]]
-    """For each state which constraints are active, and why."""
+    active: list[list[str]]
+    """For each state which constraints are active and why, in sentences."""
 
 
 class PolicyFunction:
@@ -44,12 +45,12 @@ class PolicyFunction:
         alone = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
         self._compiled = jax.jit(self._infer, compiler_options=alone)
 
-    def warm_up(self, weights: Acting) -> None:
-        """Compiles every batch size."""
-        for size in BATCH_SIZES:
+    def warm_up(self, weights: Acting, sizes: Sequence[int] = BATCH_SIZES) -> None:
+        """Compiles batches of these sizes."""
+        for size in sizes:
             jax.block_until_ready(self._compiled(weights, np.zeros((size, self.layout.size), np.float32)))
 
-    def __call__(self, weights: Acting, queries: Sequence[Query]) -> list[Answer | Exception]:
+    def __call__(self, weights: Acting, queries: Sequence[Query]) -> list[Inference | Exception]:
         """Answers queries of at most `BATCH_SIZES[-1]` states; one that cannot be answered gets its own error."""
         ends = list(itertools.accumulate(len(query.vectors) for query in queries))
         batch = np.zeros((next(size for size in BATCH_SIZES if size >= ends[-1]), self.layout.size), np.float32)
@@ -57,6 +58,23 @@ class PolicyFunction:
         found = np.asarray(self._compiled(weights, batch))
         starts = [0, *ends[:-1]]
         return [self._answer(query, found[a:b]) for query, a, b in zip(queries, starts, ends, strict=True)]
+
+    def reply(self, request: Message, answer: Inference, meta: Mapping[str, Any]) -> Message:
+        """The reply to a query: targets in its own form, and the layout of packed ones where it asks for that.
+
+        Args:
+          request: the query.
+          answer: what was inferred for it.
+          meta: further entries: `version` and `total_ms`, at least.
+        """
+        meta = {**meta, "active": answer.active}
+        if PACKED in request.arrays:
+            return Message({PACKED: answer.vectors}, meta)
+        if request.meta.get("layout"):
+            meta |= {"layout": self.layout.digest, "states": STATES_LIMIT, **self.layout.description()}
+        fingers = len(self.layout.hand.joints)
+        parts = np.split(answer.vectors[0], [fingers + 6, 2 * fingers + 6])
+        return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
 
     def _infer(self, weights: Acting, vectors: jax.Array) -> jax.Array:
         """For states (B, S): answers (A + F + 6), the flags redirected and aligned, and checks (C), in one (B, ...)."""
@@ -72,18 +90,20 @@ class PolicyFunction:
         notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
         return jnp.concatenate([mean, action.q_target, action.u_target, notes, checks], -1)
 
-    def _answer(self, query: Query, found: np.ndarray) -> Answer | Exception:
+    def _answer(self, query: Query, found: np.ndarray) -> Inference | Exception:
+        """What was found for one query, or its own error."""
         size = 2 * len(self.layout.hand.joints) + 12
         vectors, redirected, aligned, checks = found[:, :size], found[:, size], found[:, size + 1], found[:, size + 2 :]
-        if complaint := self.layout.complaint(query, checks):
-            return complaint
+        if error := self.layout.find_error(query, checks):
+            return error
         if not np.isfinite(vectors).all():
             return CongraspError("The policy's answer to this query is not finite.", "Check the state's magnitudes.")
         if not aligned.all():
-            return CongraspError(
-                "The constraints contradict each other: the trajectory ends nearer to O- than to O+ of the affordance.",
+            return ContradictionError(
+                "The constraints contradict each other: the trajectory ends nearer to the avoid region than to the "
+                "graspable region of the affordance.",
                 "Change the trajectory or the affordance.",
             )
         flags = redirected.tolist()
-        words = {flag: explain(query.asked, redirected=flag > 0) for flag in set(flags)}
-        return Answer(vectors, [words[flag] for flag in flags])
+        active = {flag: explain(query.asked, redirected=flag > 0) for flag in set(flags)}
+        return Inference(vectors, [active[flag] for flag in flags])

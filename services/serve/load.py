@@ -8,15 +8,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import psutil
 
-from common.errors import CongraspError, TransportError
+from common.errors import CongraspError, OverloadedError, TransportError
+from common.request import GraspRequest
 from common.transport.ports import local_url
 from services.ops.shutdown import PARENT_VARIABLE, register_child
 from services.serve.client import PolicyClient
+from services.serve.policy import Policy
 
 
 @contextlib.contextmanager
@@ -71,8 +73,21 @@ def wait_until_ready(client: PolicyClient, seconds: float = 180.0) -> None:
             time.sleep(0.2)
 
 
-def example_episode(seed: int, hand: str = "human") -> dict[str, Any]:
-    """The start of an episode with a procedural object and one of its headings: arguments of `reset` and of `act`."""
+class Example(NamedTuple):
+    """The start of an episode."""
+
+    hand: str
+    """Name of the hand."""
+    object: str
+    """Name of the object."""
+    request: GraspRequest
+    """For `reset`."""
+    state: dict[str, np.ndarray]
+    """For `act`."""
+
+
+def example_episode(seed: int, hand: str = "human") -> Example:
+    """The start of an episode with a procedural object and one of its headings."""
     import jax
 
     from actors import initial
@@ -85,28 +100,24 @@ def example_episode(seed: int, hand: str = "human") -> dict[str, Any]:
     task = TaskConfig(hand=hand, constraints=("heading",))
     found = get_hand(hand)
     (obj,) = scale_objects(found, task, [procedural.generate(seed)])
-    begun = initial.sample(found, task, build_bank(found, task, [obj], seed), jax.random.key(seed), 1)
-    world = {name: np.asarray(value)[0] for name, value in begun.world._asdict().items()}
+    initial_conditions = initial.sample(found, task, build_bank(found, task, [obj], seed), jax.random.key(seed), 1)
+    world = {name: np.asarray(value)[0] for name, value in initial_conditions.world._asdict().items()}
     pose = world["object_position"], world["object_quaternion"]
-    return {
-        "hand": found.name,
-        "object": obj.name,
-        "reset": {
-            "q": world["q"],
-            "wrist": (world["base_position"], world["base_quaternion"]),
-            "obj": pose,
-            "surface": np.asarray(begun.surface.points)[0],
-            "constraints": ["heading"],
-            **begun.goal.row(0).flat(),
-        },
-        "state": {"q": world["q"], "u": np.zeros(6), "object_position": pose[0], "object_quaternion": pose[1]},
-    }
+    request = GraspRequest(
+        {"heading": initial_conditions.goal.row(0)["heading"]._asdict()},
+        surface=np.asarray(initial_conditions.surface.points)[0],
+        q=world["q"],
+        wrist=(world["base_position"], world["base_quaternion"]),
+        object_pose=pose,
+    )
+    state = {"q": world["q"], "u": np.zeros(6), "object_position": pose[0], "object_quaternion": pose[1]}
+    return Example(found.name, obj.name, request, state)
 
 
 def measure(
     connect: str,
     name: str,
-    episode: dict[str, Any],
+    episode: Example,
     repeat: int,
     concurrency: int,
     timeout: float,
@@ -120,17 +131,18 @@ def measure(
     share = max(1, repeat // concurrency)
 
     def ask(_: int) -> tuple[list[float], int, int]:
-        times, failed, overloaded, state = [], 0, 0, episode["state"]
-        with PolicyClient(connect, name, hand=episode["hand"], timeout=timeout, certs=certs) as client:
-            client.reset(**episode["reset"])
+        times, failed, overloaded, state = [], 0, 0, episode.state
+        with PolicyClient(connect, name, hand=episode.hand, timeout=timeout, certs=certs) as client:
+            client.reset(episode.request)
             client.act(state)
             for _ in range(share):
                 try:
                     answer = client.act(state) if states == 1 else client.act_each([state] * states)[0]
                     times.append(answer.round_trip_ms)
-                except TransportError as error:
-                    overloaded += "verloaded" in str(error)
-                    failed += "verloaded" not in str(error)
+                except OverloadedError:
+                    overloaded += 1
+                except TransportError:
+                    failed += 1
         return times, failed, overloaded
 
     began = time.perf_counter()
@@ -147,13 +159,13 @@ def measure(
     }
 
 
-def one_answer(client: PolicyClient, episode: dict[str, Any]) -> str:
+def one_answer(policy: Policy, episode: Example) -> str:
     """Asks for the first action of an episode; the answer as text."""
-    client.reset(**episode["reset"])
-    answer = client.act(episode["state"])
+    policy.reset(episode.request)
+    answer = policy.act(episode.state)
     with np.printoptions(precision=3, suppress=True):
         return (
-            f"object       {episode['object']}, constraints: {', '.join(episode['reset']['constraints'])}\n"
+            f"object       {episode.object}, constraints: {', '.join(episode.request.constraints)}\n"
             f"active       {' '.join(answer.active)}\n"
             f"q_target     {answer.q_target} rad\n"
             f"u_target     {answer.u_target} m, rad\n"

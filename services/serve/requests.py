@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from common.config import TaskConfig
-from common.errors import CongraspError
+from common.errors import CongraspError, LayoutError
 from common.hands import get_hand
 from common.hands.spec import Hand
 from common.task.constraints import known, require_known
@@ -107,31 +107,34 @@ class Layout:
         return vectors[..., self._places(name)]
 
     def _places(self, name: str) -> slice:
+        """Where a field's numbers stand in a vector."""
         return slice(self.offsets[name], self.offsets[name] + math.prod(self.shapes[name]))
 
     def parse(self, message: Message) -> Query:
-        """Lays a query out, unless it is packed already; a CongraspError says what is wrong with its form."""
+        """Lays a query out, unless it is packed already; a CongraspError names what is wrong with its form."""
         meta = message.meta
         hand = meta.get("hand", self.hand.name)
         if hand != self.hand.name:
             get_hand(hand)
-            raise CongraspError(f"This server's policy is for the hand '{self.hand.name}', not '{hand}'.")
+            raise CongraspError(f"The policy is for the hand '{self.hand.name}', not '{hand}'.")
         asked = self._asked(meta.get("constraints", ["heading"]))
         vectors = self._packed(message) if PACKED in message.arrays else self._named(message.arrays, asked)[None]
         vectors[:, self._places("asked")] = [constraint.name in asked for constraint in self.known]
         return Query(vectors, asked)
 
     def _packed(self, message: Message) -> np.ndarray:
+        """The vectors (n, S) of a packed query, a copy."""
         vectors, digest = message.arrays[PACKED], message.meta.get("layout")
         if digest != self.digest or len(message.arrays) > 1 or vectors.ndim != 2 or vectors.shape[1] != self.size:
-            raise CongraspError(
-                "The packed query does not follow this server's layout.", "Ask for the layout with a query of names."
+            raise LayoutError(
+                "The packed query does not follow the policy's layout.", "Ask for the layout with a query of names."
             )
         if not 1 <= len(vectors) <= STATES_LIMIT:
             raise CongraspError(f"The query has {len(vectors)} states.", f"Send 1 to {STATES_LIMIT} at a time.")
         return np.array(vectors, np.float32)
 
     def _named(self, arrays: Mapping[str, Any], asked: tuple[str, ...]) -> np.ndarray:
+        """The vector (S,) of a query of names; a CongraspError names a field that is unknown, absent or misshapen."""
         unknown = sorted(arrays.keys() - self.shapes.keys() | arrays.keys() & {"asked"})
         if unknown:
             raise CongraspError(f"The query has an unknown field '{unknown[0]}'.", f"Known: {', '.join(self.shapes)}.")
@@ -159,7 +162,7 @@ class Layout:
           vectors: (B, S).
 
         Returns:
-          The fields (B, ...) by name, zero where a query is not finite, and what `complaint` looks at (B, C): whether
+          The fields (B, ...) by name, zero where a query is not finite, and what `find_error` looks at (B, C): whether
           it is finite and each of its constraints valid, as 1 or 0, and lengths that must be 1.
         """
         finite = jnp.isfinite(vectors).all(1)
@@ -183,8 +186,8 @@ class Layout:
         """The goal arrays of completed fields, before the priority rules."""
         return Goal({c.name: c.goal(**{name: fields[f"{c.name}_{name}"] for name in c.arrays}) for c in self.known}, {})
 
-    def complaint(self, query: Query, checks: np.ndarray) -> CongraspError | None:
-        """What is wrong with the values of a query's first bad state, by what `complete` found (n, C): see there."""
+    def find_error(self, query: Query, checks: np.ndarray) -> CongraspError | None:
+        """The error of a query's first bad state, by what `complete` found (n, C): see there; None if all are good."""
         wrong = ~(np.abs(checks - 1.0) <= _UNIT_TOLERANCE)
         if not wrong.any():
             return None
@@ -206,7 +209,7 @@ class Layout:
         """Names of the constraints that a query asks for, weakest first."""
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise CongraspError("The query's 'constraints' must be a list of names.")
-        require_known(names, self.task, "This server's policy")
+        require_known(names, self.task)
         leading = [constraint.name for constraint in self.known if constraint.guides]
         if not set(leading) & set(names):
             raise CongraspError(
@@ -221,13 +224,13 @@ class Layout:
             raise CongraspError(
                 f"The field 'surface_points' has shape {points.shape}; it must be (N, 3), N at most {SURFACE_LIMIT}."
             )
-        minus = np.asarray(arrays.get("surface_minus", np.zeros(len(points), bool)))
-        if minus.shape != (len(points),):
-            raise CongraspError(f"The field 'surface_minus' has shape {minus.shape}; it must be ({len(points)},).")
+        avoid = np.asarray(arrays.get("surface_minus", np.zeros(len(points), bool)))
+        if avoid.shape != (len(points),):
+            raise CongraspError(f"The field 'surface_minus' has shape {avoid.shape}; it must be ({len(points)},).")
         if len(points) == self.task.surface_points:
-            return points, minus
+            return points, avoid
         index = np.arange(self.task.surface_points) * len(points) // self.task.surface_points
-        return points[index], minus[index]
+        return points[index], avoid[index]
 
 
 def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[jax.Array, jax.Array]:

@@ -8,9 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from common.errors import CongraspError, TransportError
+from common.errors import CongraspError, LateError, OverloadedError, TransportError
 from common.hands import get_hand
 from common.policy import bundle as bundles
 from common.policy.bundle import Acting, PolicyBundle, content_hash
@@ -18,9 +16,9 @@ from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode
 from services.ops.logs import log
-from services.serve.batching import Batcher, Late, Overloaded
-from services.serve.inference import BATCH_SIZES, Answer, PolicyFunction
-from services.serve.requests import PACKED, STATES_LIMIT, Query
+from services.serve.batching import Batcher
+from services.serve.inference import BATCH_SIZES, Inference, PolicyFunction
+from services.serve.requests import Query
 
 Source = Callable[[int], PolicyBundle | None]
 """(version that is held, -1 for none) -> a newer bundle, or None."""
@@ -40,7 +38,7 @@ class _Held(NamedTuple):
     acting: Acting
 
 
-_Answered = tuple[Answer, _Held, float, float]
+_Answered = tuple[Inference, _Held, float, float]
 """An answer, the policy it is of, and the seconds that it waited and was computed in."""
 
 
@@ -135,29 +133,17 @@ class PolicyServer:
 
     def _count(self, error: BaseException | None, began: float) -> None:
         """Notes the outcome of a query."""
-        outcome = type(error).__name__.lower() if isinstance(error, Overloaded | Late) else "refused"
+        lost = error.code if isinstance(error, OverloadedError | LateError) else "refused"
         self._answered += error is None
-        self._on_answer("answered" if error is None else outcome, time.monotonic() - began)
+        self._on_answer("answered" if error is None else lost, time.monotonic() - began)
 
     def _message(self, request: Message, answered: "_Answered", seconds: float) -> Message:
         """The reply: targets in the query's own form, version, times."""
-        (vectors, words), held, queued, inferred = answered
-        layout = self._function.layout
-        meta: dict[str, Any] = {
-            "version": held.bundle.version,
-            "hash": held.hash,
-            "active": words,
-            "queue_ms": round(1e3 * queued, 3),
-            "infer_ms": round(1e3 * inferred, 3),
-            "total_ms": round(1e3 * seconds, 3),
-        }
-        if PACKED in request.arrays:
-            return Message({PACKED: vectors}, meta)
-        if request.meta.get("layout"):
-            meta |= {"layout": layout.digest, "states": STATES_LIMIT, **layout.description()}
-        fingers = len(layout.hand.joints)
-        parts = np.split(vectors[0], [fingers + 6, 2 * fingers + 6])
-        return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
+        answer, held, queued, inferred = answered
+        times = {"queue_ms": queued, "infer_ms": inferred, "total_ms": seconds}
+        meta = {"version": held.bundle.version, "hash": held.hash}
+        meta |= {name: round(1e3 * spent, 3) for name, spent in times.items()}
+        return self._function.reply(request, answer, meta)
 
     @staticmethod
     def _deadline(seconds: Any) -> float:

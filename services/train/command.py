@@ -339,7 +339,7 @@ def _live_query(run_dir: pathlib.Path, hand: str) -> None:
     console.print("\n[bold]One live query[/] of a policy server in a process of its own:")
     with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
         episode = example_episode(HELD_OUT_SEED, hand)
-        with PolicyClient(endpoint, hand=episode["hand"], wait=60.0, timeout=5.0) as client:
+        with PolicyClient(endpoint, hand=episode.hand, wait=60.0, timeout=5.0) as client:
             wait_until_ready(client)
             console.print(one_answer(client, episode), markup=False, soft_wrap=True)
 

@@ -12,8 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from common.errors import CongraspError, TransportError
-from common.transport.base import RefusedError
+from common.errors import CongraspError, OverloadedError, RefusedError, TransportError
 from common.transport.keys import Keys, check_name, flow, matches, parse_alive
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.ports import free_port
@@ -117,6 +116,8 @@ def test_errors_travel_in_words(pair):
     def handler(key, message):
         if message.meta["bug"]:
             raise ValueError("secret")
+        if message.meta.get("busy"):
+            raise OverloadedError("Ask later.")
         raise CongraspError("The hand is unknown.", "Choose another.")
 
     server.serve(KEYS.act, handler)
@@ -124,7 +125,9 @@ def test_errors_travel_in_words(pair):
         client.query(KEYS.act, Message(meta={"bug": False}), timeout=5)
     with pytest.raises(RefusedError, match="ValueError") as caught:
         client.query(KEYS.act, Message(meta={"bug": True}), timeout=5)
-    assert "secret" not in str(caught.value)
+    assert "secret" not in str(caught.value) and type(caught.value) is RefusedError
+    with pytest.raises(OverloadedError, match=r"^Ask later\.$"):
+        client.query(KEYS.act, Message(meta={"bug": False, "busy": True}), timeout=5)
 
 
 def test_silence_has_a_deadline(pair):

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from common.errors import CongraspError
-from common.transport.base import RefusedError
+from common.errors import CongraspError, RefusedError
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
+from common.errors import CongraspError, UnknownConstraintError
 from common.hands import get_hand
 from common.objects import procedural
 from common.policy.bundle import PolicyBundle
@@ -22,7 +22,7 @@ from services.export.policy import describe, export_policy
 from services.grasp.files import RESULT
 from services.grasp.grasper import Grasper
 from services.grasp.parse import read_request
-from services.serve.inference import Answer, PolicyFunction
+from services.serve.inference import Inference, PolicyFunction
 from services.serve.load import example_episode
 from services.serve.requests import Layout
 from services.train.command import untrained
@@ -51,12 +51,12 @@ def policy() -> PolicyBundle:
 def query() -> dict[str, np.ndarray]:
     """The arrays of a query with the heading, from the start of an episode."""
     episode = example_episode(1_000_000)
-    reset, state = episode["reset"], episode["state"]
-    given = {name: value for name, value in reset.items() if name.startswith("heading_")}
-    given |= {"q_target": reset["q"], "q_initial": reset["q"], "u_target": np.zeros(6), "time": np.float32(0)}
-    given |= {"base_position": reset["wrist"][0], "base_quaternion": reset["wrist"][1], "table": np.bool_(True)}
+    request, state = episode.request, episode.state
+    given = {f"heading_{name}": value for name, value in request.constraints["heading"].items()}
+    given |= {"q_target": request.q, "q_initial": request.q, "u_target": np.zeros(6), "time": np.float32(0)}
+    given |= {"base_position": request.wrist[0], "base_quaternion": request.wrist[1], "table": np.bool_(True)}
     given |= {f"{name}_initial": state[name] for name in ("object_position", "object_quaternion")}
-    return {**given, **state, "surface_points": reset["surface"]}
+    return {**given, **state, "surface_points": request.surface}
 
 
 # A policy that does not know it.
@@ -76,7 +76,7 @@ def test_the_command_refuses_it_in_one_line(
 
 def test_a_query_for_it_is_refused_in_one_line(query: dict[str, np.ndarray]) -> None:
     message = Message({**query, "fingers_allowed": PINCH}, {"constraints": ["heading", "fingers"]})
-    with pytest.raises(CongraspError, match=f"^This server's policy {REFUSED}"):
+    with pytest.raises(UnknownConstraintError, match=f"^The policy {REFUSED}"):
         Layout(HAND, TaskConfig()).parse(message)
 
 
@@ -102,6 +102,9 @@ def test_fingers_are_read_by_their_names() -> None:
     request = read_request(MUG, HAND, 15, fingers=("thumb", "index"))
     assert set(request.constraints) == {"heading", "fingers"}
     np.testing.assert_array_equal(request.given("fingers", "allowed"), PINCH)
+    for written in ("thumb index", "thumb, index", "thumb,index", ["thumb", "index"]):
+        request = read_request(MUG, HAND, 15, fingers=written)
+        np.testing.assert_array_equal(request.given("fingers", "allowed"), PINCH)
     assert read_request(MUG, HAND, 15).given("fingers", "allowed") is None
     with pytest.raises(CongraspError, match=r"no finger 'toe'\. Known: thumb, index, middle, ring, "):
         read_request(MUG, HAND, 15, fingers=("thumb", "toe"))
@@ -110,12 +113,12 @@ def test_fingers_are_read_by_their_names() -> None:
 
 
 def test_a_grasp_is_asked_for_with_two_fingers(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
-    grasper = Grasper(policy, tries=2, rounds=1, seconds=0.25, threads=1)
+    grasper = Grasper(policy, attempts=2, rounds=1, seconds=0.25, threads=1)
     found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index")))
     grasper.close()
     assert found.motion.constraints == ("heading", "fingers") and "fingers_ratio" in found.facts()
     np.testing.assert_array_equal(found.motion.goal["fingers_allowed"], PINCH)
-    assert "Only the named fingers may touch the object." in found.words
+    assert "Only the named fingers may touch the object." in found.active
     arrays = found.episode.arrays
     steps = len(arrays["table"])
     other = np.isin(HAND.link_fingers, (2, 3, 4))
@@ -131,15 +134,15 @@ def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: di
     layout = function.layout
     assert layout.shapes["fingers_allowed"] == (5,) and layout.shapes["asked"] == (5,)
 
-    def ask(constraints: list[str], **more: np.ndarray) -> Answer | Exception:
+    def ask(constraints: list[str], **more: np.ndarray) -> Inference | Exception:
         (answer,) = function(policy.acting, [layout.parse(Message({**query, **more}, {"constraints": constraints}))])
         return answer
 
     pinch = ask(["heading", "fingers"], fingers_allowed=PINCH)
-    assert isinstance(pinch, Answer)
-    assert pinch.words == [["Only the named fingers may touch the object.", "The heading guides the wrist."]]
+    assert isinstance(pinch, Inference)
+    assert pinch.active == [["Only the named fingers may touch the object.", "The heading guides the wrist."]]
     free, ignored = ask(["heading"]), ask(["heading"], fingers_allowed=PINCH)
-    assert isinstance(free, Answer) and isinstance(ignored, Answer)
+    assert isinstance(free, Inference) and isinstance(ignored, Inference)
     np.testing.assert_array_equal(free.vectors, ignored.vectors)
     assert np.abs(pinch.vectors - free.vectors).max() > 1e-6
     assert "fewer than two fingers. Allow two or more" in str(ask(["heading", "fingers"], fingers_allowed=0 * PINCH))

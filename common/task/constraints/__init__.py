@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common.errors import CongraspError
+from common.errors import CongraspError, UnknownConstraintError
 from common.hands.spec import Hand
 from common.request import GraspRequest
 from common.task.constraints.affordance import Affordance
@@ -28,7 +28,7 @@ def get_constraint(name: str) -> Constraint:
     """A constraint by its name.
 
     Raises:
-      CongraspError: there is none.
+      UnknownConstraintError: there is none.
     """
     for constraint in CONSTRAINTS:
         if constraint.name == name:
@@ -76,13 +76,13 @@ def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
     return Goal(values, {})
 
 
-def require_known(names: Iterable[str], task: "TaskConfig", who: str = "The policy") -> None:
-    """Raises `CongraspError` if somebody asks for a constraint that the task's policy does not know."""
+def require_known(names: Iterable[str], task: "TaskConfig") -> None:
+    """Raises `UnknownConstraintError` if somebody asks for a constraint that the task's policy does not know."""
     for name in names:
         get_constraint(name)
         if name not in task.constraints:
-            raise CongraspError(
-                f"{who} does not know the constraint '{name}'.",
+            raise UnknownConstraintError(
+                f"The policy does not know the constraint '{name}'.",
                 f"It knows {', '.join(task.constraints)}; train one with --task.constraints … {name}.",
             )
 

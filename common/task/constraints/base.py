@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_type_h
 import jax.numpy as jnp
 import numpy as np
 
-from common.errors import CongraspError
+from common.errors import UnknownConstraintError
 from common.hands.spec import Hand
 from common.task.types import Array, Goal, SceneState, Surface
 
@@ -277,6 +277,6 @@ def symbol_sizes(hand: Hand, task: "TaskConfig") -> dict[str, int]:
     return {"F": len(hand.joints), "G": len(hand.fingers), "K": task.trajectory_points}
 
 
-def unknown_constraint(name: str, known: Sequence[str]) -> CongraspError:
+def unknown_constraint(name: str, known: Sequence[str]) -> UnknownConstraintError:
     """The error of someone who asks for a constraint that is not there."""
-    return CongraspError(f"There is no constraint '{name}'.", f"Choose from: {', '.join(known)}.")
+    return UnknownConstraintError(f"There is no constraint '{name}'.", f"Choose from: {', '.join(known)}.")

@@ -1,4 +1,4 @@
-"""Grasps of one's own objects: a real one by the shipped policy, and the command around made-up ones."""
+"""Grasps of one's own objects: a real one by the pretrained policy, and the command around made-up ones."""
 
 import dataclasses
 import json
@@ -36,21 +36,21 @@ def block(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def grasper():
-    grasper = Grasper(bundles.load(policy_file(None)), tries=4, seconds=0.25, threads=2)
+    grasper = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, threads=2)
     yield grasper
     grasper.close()
 
 
-def test_the_shipped_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
-    told = []
+def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
+    reports = []
     minus = block.points[:, 2] < 0
     heading = {"direction": np.array([0.0, 0.0, -1.0])}
     request = GraspRequest({"heading": heading, "affordance": {}}, avoid=minus)
-    found = grasper.grasp(block, request, lambda what, done, total: told.append((what, done, total)))
-    assert told[0][0].startswith("Compiling") and told[1] == ("Trying", 1, 75) and told[-1][1:] == (75, 75)
-    assert 1 <= found.held <= found.tries <= 12 and found.success
+    found = grasper.grasp(block, request, lambda what, done, total: reports.append((what, done, total)))
+    assert reports[0][0].startswith("Compiling") and reports[1] == ("Attempting", 1, 75) and reports[-1][1:] == (75, 75)
+    assert 1 <= found.held <= found.attempts <= 12 and found.success
     motion = found.motion
-    assert motion.constraints == ("heading", "affordance") and motion.about["tries"] == found.tries
+    assert motion.constraints == ("heading", "affordance") and motion.about["tries"] == found.attempts
     assert len(motion.time) == 75 and motion.table.sum() == 49  # the table goes with the fiftieth step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     np.testing.assert_array_equal(motion.surface_minus, minus[:256])
@@ -118,7 +118,7 @@ def test_a_folder_is_grasped_once_and_bad_meshes_do_not_stop_it(tmp_path, capsys
     assert made_up == ["a", "b"]
     assert "bad.obj" in captured.err and captured.err.count("congrasp: error:") == 1
     line = next(line for line in captured.out.splitlines() if line.startswith("a:"))
-    assert "5.0 x 6.0 x 14.0 cm, about as long as a phone; held; best of 4 tries, 3 of which hold it" in line
+    assert "5.0 x 6.0 x 14.0 cm, about as long as a phone; held; best of 4 attempts, 3 of which hold it" in line
     assert "2 of 3 objects are held; 1 could not be used" in captured.out
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["objects"], summary["succeeded"]) == (3, 2)

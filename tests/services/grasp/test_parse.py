@@ -42,6 +42,8 @@ def test_headings_are_numbers_or_a_word(block):
     given = asked(block, heading="0 0 -2", at="0.1, -0.2, 0.34")
     np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
     np.testing.assert_allclose(given.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
+    for written in ((0, 0, -2), [0.0, 0.0, -1.0], np.array([0, 0, -1], np.float32)):
+        np.testing.assert_allclose(asked(block, heading=written).given("heading", "direction"), [0, 0, -1])
     above = asked(block, heading="above")
     assert above.above and above.given("heading", "direction") is None
     with pytest.raises(CongraspError, match=r"--at lies 39.* m from 'block'"):
@@ -59,10 +61,12 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
     high = block.points[:, 2] > 0.01
     clear = np.abs(block.points[:, 2] - 0.01) > 0.005
     np.testing.assert_array_equal(asked(block, affordance=str(tmp_path / "upper.ply")).avoid[clear], ~high[clear])
-    np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "upper.ply")).avoid[clear], high[clear])
+    np.testing.assert_array_equal(asked(block, avoid=tmp_path / "upper.ply").avoid[clear], high[clear])
     trimesh.PointCloud(np.asarray(upper.sample(4000))).export(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "cloud.ply")).avoid[clear], high[clear])
     np.testing.assert_array_equal(asked(block, affordance="near half").avoid, block.labels == 1)
+    with pytest.raises(CongraspError, match=r"no constraint option 'colour'\. Known: heading, at, affordance, avoid"):
+        asked(block, colour="red")
     with pytest.raises(CongraspError, match=r"has no part 'handle'\. Its parts are: near half, far half"):
         asked(block, affordance="handle")
     with pytest.raises(CongraspError, match=r"there is no file .*none\.ply"):

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import CongraspError
-from services.serve.batching import Batcher, Late, Overloaded
+from common.errors import CongraspError, LateError, OverloadedError
+from services.serve.batching import Batcher
 
 
 class Gate:
@@ -65,7 +65,7 @@ def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=2)
     futures = [running(batcher, gate)]
     futures += [batcher.submit(i, 10.0) for i in (1, 2)]
-    with pytest.raises(Overloaded, match="Overloaded: 2 queries wait"):
+    with pytest.raises(OverloadedError, match="Overloaded: 2 queries wait"):
         batcher.submit(3, 10.0)
     gate.go.set()
     assert [future.result(10) for future in futures] == [0, 10, 20]
@@ -79,7 +79,7 @@ def test_a_query_whose_deadline_passed_is_not_computed(gate):
     time.sleep(0.02)
     gate.go.set()
     assert patient.result(10) == 20
-    with pytest.raises(Late, match="deadline"):
+    with pytest.raises(LateError, match="deadline"):
         late.result(10)
     assert gate.batches == [[0], [2]]
     batcher.close()

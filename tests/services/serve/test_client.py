@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from common.config import TaskConfig
-from common.errors import CongraspError, TransportError
+from common.errors import RefusedError, TransportError
 from common.hands import get_hand
+from common.request import GraspRequest
 from common.transport.keys import Keys
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
@@ -15,19 +16,19 @@ from common.wire.codec import Message
 from services.serve.client import PolicyClient
 from services.serve.requests import PACKED, Layout
 
-RESET = {
-    "q": np.full(20, 0.1),
-    "wrist": (np.array([0.0, 0.0, 0.3]), np.array([1.0, 0.0, 0.0, 0.0])),
-    "obj": (np.array([0.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.0, 0.0])),
-    "surface": np.zeros((4, 3)),
-    "heading_position": np.zeros(3),
-    "heading_direction": np.array([0.0, 0.0, -1.0]),
-}
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+REQUEST = GraspRequest(
+    {"heading": {"position": np.zeros(3), "direction": np.array([0.0, 0.0, -1.0])}},
+    surface=np.zeros((4, 3)),
+    q=np.full(20, 0.1),
+    wrist=(np.array([0.0, 0.0, 0.3]), IDENTITY),
+    object_pose=(np.array([0.0, 0.0, 0.05]), IDENTITY),
+)
 STATE = {
     "q": np.full(20, 0.2),
     "u": np.zeros(6),
-    "object_position": RESET["obj"][0],
-    "object_quaternion": RESET["obj"][1],
+    "object_position": np.array([0.0, 0.0, 0.05]),
+    "object_quaternion": IDENTITY,
 }
 
 
@@ -69,29 +70,29 @@ def endpoint():
 def test_the_client_remembers_the_episode_and_the_previous_targets(endpoint):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
-        client.reset(**RESET)
+        client.reset(REQUEST)
         answer = client.act(STATE)
         client.act({**STATE, "table": False})
-        client.reset(**RESET)
+        client.reset(REQUEST)
         client.act(STATE)
     server.close()
     first, second, third = server.fields
     assert server.forms == ["named", "packed", "named"]
     assert answer.version == 3 and answer.active == ("words",) and answer.server_ms == 0.5
     np.testing.assert_array_equal(answer.u_target, np.full(6, -1.0))
-    np.testing.assert_allclose(first["q_target"], RESET["q"], rtol=1e-6)
+    np.testing.assert_allclose(first["q_target"], REQUEST.q, rtol=1e-6)
     np.testing.assert_array_equal(second["q_target"], np.full(20, 1.0))
     np.testing.assert_array_equal(second["u_target"], np.full(6, -1.0))
-    np.testing.assert_allclose(third["q_target"], RESET["q"], rtol=1e-6)
+    np.testing.assert_allclose(third["q_target"], REQUEST.q, rtol=1e-6)
     assert [float(arrays["time"]) for arrays in (first, second, third)] == [0.0, 1.0, 0.0]
     assert [bool(arrays["table"]) for arrays in (first, second, third)] == [True, False, True]
-    np.testing.assert_allclose(second["q_initial"], RESET["q"], rtol=1e-6)
+    np.testing.assert_allclose(second["q_initial"], REQUEST.q, rtol=1e-6)
 
 
 def test_the_client_finds_a_server_again_that_was_started_anew(endpoint):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
-        client.reset(**RESET)
+        client.reset(REQUEST)
         client.act(STATE)
         server.close()
         with pytest.raises(TransportError):
@@ -114,7 +115,7 @@ def test_the_client_finds_a_server_again_that_was_started_anew(endpoint):
 def test_a_server_of_another_layout_in_the_first_ones_place_is_asked_by_names(endpoint):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
-        client.reset(**RESET)
+        client.reset(REQUEST)
         client.act(STATE)
         assert client.act(STATE).q_target[0] == 2.0
         server.close()
@@ -136,14 +137,14 @@ def test_a_server_of_another_layout_in_the_first_ones_place_is_asked_by_names(en
     ("state", "words"),
     [({**STATE, "weight": np.zeros(1)}, "unknown field 'weight'"), ({**STATE, "u": np.zeros(5)}, r"shape \(5,\)")],
 )
-def test_a_bad_state_is_refused_in_the_same_words_before_and_after_packing(endpoint, state, words):
+def test_a_bad_state_is_refused_with_the_same_error_before_and_after_packing(endpoint, state, words):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
-        client.reset(**RESET)
-        with pytest.raises(CongraspError, match=words):
+        client.reset(REQUEST)
+        with pytest.raises(RefusedError, match=words):
             client.act(state)
         client.act(STATE)
-        with pytest.raises(CongraspError, match=words):
+        with pytest.raises(RefusedError, match=words):
             client.act(state)
         assert client.act(STATE).version == 3
     server.close()

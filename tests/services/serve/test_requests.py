@@ -38,8 +38,8 @@ def parse(constraints=("heading",), meta=None, **changes):
 
 def completed(query):
     fields, checks = COMPLETE(query.vectors)
-    if complaint := LAYOUT.complaint(query, np.asarray(checks)):
-        raise complaint
+    if error := LAYOUT.find_error(query, np.asarray(checks)):
+        raise error
     return query, {name: np.asarray(value[0]) for name, value in fields.items()}
 
 
@@ -129,7 +129,7 @@ def test_a_packed_query_is_the_vector_of_the_named_one():
         Message({"packed": vector[None], "q": np.zeros(20)}, meta),
         Message({"packed": vector[None]}, {"constraints": ["heading"]}),
     ):
-        with pytest.raises(CongraspError, match="does not follow this server's layout"):
+        with pytest.raises(CongraspError, match="does not follow the policy's layout"):
             LAYOUT.parse(wrong)
 
 
@@ -140,7 +140,7 @@ def test_a_bad_query_of_a_batch_spoils_no_other():
     )
     queries = good, bad, good, third
     fields, checks = COMPLETE(np.concatenate([query.vectors for query in queries]))
-    errors = [LAYOUT.complaint(query, row[None]) for query, row in zip(queries, np.asarray(checks), strict=True)]
+    errors = [LAYOUT.find_error(query, row[None]) for query, row in zip(queries, np.asarray(checks), strict=True)]
     assert [error is not None for error in errors] == [False, True, False, True]
     assert "'u' is not finite" in str(errors[1]) and "base_quaternion" in str(errors[3])
     _, alone = parse()

@@ -1,4 +1,4 @@
-"""The live policy: answers, refusals in words, and swaps of weights, over both ends of the real wire."""
+"""The live policy: answers, refusals, and swaps of weights, over both ends of the real wire."""
 
 import concurrent.futures
 import contextlib
@@ -11,8 +11,16 @@ import numpy as np
 import pytest
 
 from common.config import NetworkConfig
-from common.errors import CongraspError, TransportError
+from common.errors import (
+    CongraspError,
+    ContradictionError,
+    OverloadedError,
+    RefusedError,
+    TransportError,
+    UnknownConstraintError,
+)
 from common.policy import bundle as bundles
+from common.request import GraspRequest
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.ports import free_port
@@ -53,8 +61,8 @@ def served(tmp_path_factory, metrics):
 def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
     _, endpoint, episode = served
     with PolicyClient(endpoint) as client:
-        client.reset(**episode["reset"])
-        first, second = (client.act(episode["state"]) for _ in range(2))
+        client.reset(episode.request)
+        first, second = (client.act(episode.state) for _ in range(2))
         assert client.health()["ready"] and client.health()["hand"] == "human"
     assert first.q_target.shape == (20,) and first.u_target.shape == (6,) and first.action.shape == (26,)
     assert first.version == 0 and first.active == ("The heading guides the wrist.",)
@@ -68,12 +76,12 @@ def test_answers_refusals_and_batches_are_counted(served, metrics):
     port = free_port()
     with PolicyClient(endpoint) as client, exposed(port, "127.0.0.1", metrics):
         before = scrape(port)
-        client.reset(**episode["reset"])
+        client.reset(episode.request)
         for _ in range(3):
-            client.act(episode["state"])
-        client.reset(**{**episode["reset"], "constraints": ["levitation"]})
+            client.act(episode.state)
+        client.reset(dataclasses.replace(episode.request, constraints={"levitation": {}}))
         with pytest.raises(TransportError):
-            client.act(episode["state"])
+            client.act(episode.state)
         after = scrape(port)
     grown = {name: value - before[name] for name, value in after.items()}
     assert grown["congrasp_policy_queries_total", "answered"] == 3 == grown["congrasp_policy_seconds_count",]
@@ -82,46 +90,54 @@ def test_answers_refusals_and_batches_are_counted(served, metrics):
     assert after["congrasp_policy_ready",] == 1 and after["congrasp_policy_version",] == 0
 
 
+HEADING = {"position": np.zeros(3), "direction": np.array([0.0, 0.0, -1.0])}
+
+
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "error", "message"),
     [
-        ({"constraints": ["levitation"]}, "no constraint 'levitation'"),
-        ({"constraints": ["affordance"]}, "nothing that guides the wrist. Add one of: heading, pose, trajectory"),
-        ({"constraints": ["pose"]}, "lacks the field 'pose_q'"),
-        ({"heading_direction": np.array([0.0, 0.0, 2.0])}, "not 1"),
-        ({"heading_position": np.array([np.nan, 0.0, 0.0])}, "not finite"),
-        ({"surface": np.zeros((5, 2))}, "surface_points"),
-        ({"q": np.zeros(7)}, "shape"),
+        ({"constraints": {"levitation": {}}}, UnknownConstraintError, "no constraint 'levitation'"),
+        ({"constraints": {"fingers": {}}}, UnknownConstraintError, "does not know the constraint 'fingers'"),
+        ({"constraints": {"affordance": {}}}, RefusedError, "that guides the wrist. Add one of: heading, pose, traj"),
+        ({"constraints": {"pose": {}}}, RefusedError, "lacks the field 'pose_q'"),
+        ({"constraints": {"heading": HEADING | {"direction": np.array([0.0, 0.0, 2.0])}}}, RefusedError, "not 1"),
+        ({"constraints": {"heading": HEADING | {"position": np.full(3, np.nan)}}}, RefusedError, "not finite"),
+        ({"surface": np.zeros((5, 2))}, RefusedError, "surface_points"),
+        ({"q": np.zeros(7)}, RefusedError, "shape"),
     ],
 )
-def test_bad_queries_are_refused_in_words_and_nobody_else_suffers(served, change, words):
+def test_bad_queries_are_refused_by_class_and_nobody_else_suffers(served, change, error, message):
     _, endpoint, episode = served
     with PolicyClient(endpoint) as client:
-        client.reset(**{**episode["reset"], **change})
-        with pytest.raises(TransportError, match=words):
-            client.act(episode["state"])
-        client.reset(**episode["reset"])
-        assert client.act(episode["state"]).version == 0
+        client.reset(dataclasses.replace(episode.request, **change))
+        with pytest.raises(RefusedError, match=message) as caught:
+            client.act(episode.state)
+        assert type(caught.value) is error
+        client.reset(episode.request)
+        assert client.act(episode.state).version == 0
 
 
 def test_constraints_that_contradict_each_other_are_refused_alone(served):
     """A trajectory that ends on the part that must not be touched; one that ends on the other part is answered."""
     _, endpoint, episode = served
-    points = np.asarray(episode["reset"]["surface"])
-    minus = points[:, 0] > np.median(points[:, 0])
+    points = np.asarray(episode.request.surface)
     count = CONFIG.task.trajectory_points
-    asked = {
-        **episode["reset"],
-        "constraints": ["trajectory", "affordance"],
-        "surface_minus": minus,
-        "trajectory_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-    }
+
+    def ending_at(point: np.ndarray) -> GraspRequest:
+        path = {"position": np.tile(point, (count, 1)), "quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))}
+        constraints = {"trajectory": path, "affordance": {}}
+        return dataclasses.replace(
+            episode.request, constraints=constraints, avoid=points[:, 0] > np.median(points[:, 0])
+        )
+
     with PolicyClient(endpoint) as client:
-        client.reset(**asked, trajectory_position=np.tile(points[points[:, 0].argmax()], (count, 1)))
-        with pytest.raises(TransportError, match=r"contradict each other: the trajectory ends nearer to O-"):
-            client.act(episode["state"])
-        client.reset(**asked, trajectory_position=np.tile(points[points[:, 0].argmin()], (count, 1)))
-        assert "The affordance keeps the fingers off O-." in client.act(episode["state"]).active
+        client.reset(ending_at(points[points[:, 0].argmax()]))
+        with pytest.raises(
+            ContradictionError, match="the trajectory ends nearer to the avoid region than to the grasp"
+        ):
+            client.act(episode.state)
+        client.reset(ending_at(points[points[:, 0].argmin()]))
+        assert "The affordance keeps the fingers off O-." in client.act(episode.state).active
 
 
 def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(served, monkeypatch):
@@ -133,10 +149,10 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
     def ask(_):
         versions = []
         with PolicyClient(endpoint, timeout=5.0) as client:
-            client.reset(**episode["reset"])
+            client.reset(episode.request)
             while not swapped.is_set():
-                versions.append(client.act(episode["state"]).version)
-            versions.append(client.act(episode["state"]).version)
+                versions.append(client.act(episode.state).version)
+            versions.append(client.act(episode.state).version)
         return versions
 
     with concurrent.futures.ThreadPoolExecutor(4) as pool, PolicyClient(endpoint) as watcher:
@@ -156,14 +172,14 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
 
 def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(served):
     _, endpoint, episode = served
-    poses = [episode["state"]["q"] + 0.01 * i for i in range(11)]
-    states = [{**episode["state"], "q": pose, "q_target": pose} for pose in poses]
+    poses = [episode.state["q"] + 0.01 * i for i in range(11)]
+    states = [{**episode.state, "q": pose, "q_target": pose} for pose in poses]
     alone = []
     with PolicyClient(endpoint, timeout=5.0) as client:
         for state in states:
-            client.reset(**episode["reset"])
+            client.reset(episode.request)
             alone.append(client.act(state))
-        client.reset(**episode["reset"])
+        client.reset(episode.request)
         together = client.act_each(states)
         first = client.act(states[0])
     for one, other in zip([*together, first], [*alone, alone[0]], strict=True):
@@ -173,12 +189,12 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
     assert np.abs(together[0].q_target - together[10].q_target).max() > 0.01
 
 
-def test_bad_lists_of_states_are_refused_in_words(served):
+def test_bad_lists_of_states_are_refused(served):
     _, endpoint, episode = served
-    good, bad = episode["state"], {**episode["state"], "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])}
+    good, bad = episode.state, {**episode.state, "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])}
     with PolicyClient(endpoint) as client:
-        client.reset(**episode["reset"])
-        with pytest.raises(TransportError, match=r"'object_quaternion' of state 2 has length 2\.000, not 1"):
+        client.reset(episode.request)
+        with pytest.raises(RefusedError, match=r"'object_quaternion' of state 2 has length 2\.000, not 1"):
             client.act_each([good, good, bad])
         with pytest.raises(CongraspError, match="65 states"):
             client.act_each([good] * 65)
@@ -190,9 +206,9 @@ def test_bad_lists_of_states_are_refused_in_words(served):
 def test_a_client_of_another_hand_is_refused(served):
     _, endpoint, episode = served
     with PolicyClient(endpoint, hand="paw") as client:
-        client.reset(**episode["reset"])
-        with pytest.raises(TransportError, match="no hand 'paw'"):
-            client.act(episode["state"])
+        client.reset(episode.request)
+        with pytest.raises(RefusedError, match="no hand 'paw'"):
+            client.act(episode.state)
 
 
 def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, metrics, monkeypatch):
@@ -208,8 +224,8 @@ def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, me
     monkeypatch.setattr(PolicyFunction, "__call__", hold)
 
     def ask(client: PolicyClient) -> int:
-        client.reset(**episode["reset"])
-        return client.act(episode["state"]).version
+        client.reset(episode.request)
+        return client.act(episode.state).version
 
     with contextlib.ExitStack() as stack:
         clients = [stack.enter_context(PolicyClient(endpoint, timeout=50.0)) for _ in range(DEPTH + 2)]
@@ -222,7 +238,7 @@ def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, me
         while clients[-1].health()["queue"] < DEPTH:
             assert time.monotonic() < deadline, "the queue never filled"
             time.sleep(0.01)
-        with pytest.raises(TransportError, match="Overloaded"):
+        with pytest.raises(OverloadedError, match="Overloaded"):
             ask(clients[-1])
         assert metrics.outcomes["overloaded"] == 1
         assert not any(future.done() for future in asked)

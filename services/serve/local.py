@@ -1,0 +1,58 @@
+"""The policy in this process: what a server answers, without one."""
+
+import os
+import pathlib
+import time
+
+from common.errors import CongraspError, error_of
+from common.hands import HANDS, get_hand
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle
+from common.policy.pretrained import policy_file
+from common.wire.codec import Message
+from services.serve.episode import EpisodePolicy
+from services.serve.inference import BATCH_SIZES, PolicyFunction
+from services.serve.policy import Policy
+
+
+class LocalPolicy(EpisodePolicy):
+    """The `Policy` of a bundle."""
+
+    def __init__(self, bundle: PolicyBundle):
+        """Compiles `act`, so that no control step waits for it; `act_each` follows at its first call.
+
+        Args:
+          bundle: the policy, which names the hand.
+        """
+        super().__init__()
+        self._bundle = bundle
+        self._function = PolicyFunction(get_hand(bundle.spec.hand), bundle.task)
+        self._function.warm_up(bundle.acting, BATCH_SIZES[:1])
+
+    def _query(self, query: Message) -> Message:
+        """The reply of a server with this bundle."""
+        began = time.perf_counter()
+        try:
+            parsed = self._function.layout.parse(query)
+            (answer,) = self._function(self._bundle.acting, [parsed])
+            if isinstance(answer, Exception):
+                raise answer
+        except CongraspError as error:
+            raise error_of(error.code, str(error)) from None
+        meta = {"version": self._bundle.version, "total_ms": 1e3 * (time.perf_counter() - began)}
+        return self._function.reply(query, answer, meta)
+
+
+def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:
+    """The policy of a file, or the pretrained one of a hand, in this process.
+
+    Args:
+      policy: a policy file (`policy.safetensors` in a run's folder), or the name of a hand.
+
+    Raises:
+      CongraspError: there is no such file or hand, or the file is damaged.
+    """
+    path = pathlib.Path(policy)
+    if str(policy) in HANDS or not (path.suffix or path.exists()):
+        path = policy_file(None, str(policy))
+    return LocalPolicy(bundles.load(path))

@@ -1,0 +1,171 @@
+"""The two implementations of `Policy`, a bundle in this process and a server's client, asked the same."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from common.config import NetworkConfig, RunConfig, TaskConfig
+from common.errors import CongraspError, ContradictionError, RefusedError, UnknownConstraintError
+from common.policy import bundle as bundles
+from common.request import GraspRequest
+from common.transport import urls
+from common.transport.ports import free_port
+from services.serve.client import PolicyClient
+from services.serve.episode import EpisodePolicy
+from services.serve.load import example_episode
+from services.serve.local import load_policy
+from services.serve.policy import Policy
+from services.serve.server import PolicyServer, follow_file
+from services.train.command import untrained
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))
+CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
+COMBINATIONS = (
+    "heading",
+    "affordance heading",
+    "fingers heading",
+    "pose",
+    "trajectory",
+    "pose trajectory affordance",
+    "heading affordance pose trajectory fingers",
+)
+
+
+@pytest.fixture(scope="module")
+def episode():
+    """The start of an episode whose request has a goal for every constraint."""
+    return example_episode(1_000_000)
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory) -> tuple[Policy, Policy]:
+    """The same bundle in this process and behind a server."""
+    path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
+    bundles.save(dataclasses.replace(untrained(CONFIG), version=7), path)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with urls.listen(endpoint, "server") as transport:
+        server = PolicyServer(transport, "policy", follow_file(path))
+        with load_policy(path) as local, PolicyClient(endpoint, timeout=10.0) as remote:
+            yield local, remote
+        server.close()
+
+
+def goals(request: GraspRequest) -> dict[str, dict[str, np.ndarray]]:
+    """Goal arrays of every constraint around the heading of a request; the trajectory ends where O+ is."""
+    heading = request.constraints["heading"]
+    graspable = request.surface[request.surface[:, 2].argmin()]
+    path = graspable + np.linspace(0.2, 0.0, TASK.trajectory_points)[:, None] * np.array([0.0, 0.0, 1.0])
+    turns = np.tile(IDENTITY, (TASK.trajectory_points, 1))
+    return {
+        "heading": dict(heading),
+        "affordance": {},
+        "pose": {"q": np.full(20, 0.2), "position": heading["position"], "quaternion": IDENTITY},
+        "trajectory": {"position": path, "quaternion": turns},
+        "fingers": {"allowed": np.array([True, True, False, False, False])},
+    }
+
+
+def asked(request: GraspRequest, names: str) -> GraspRequest:
+    """The request with these constraints, and with the object's upper half as avoid region."""
+    chosen = {name: goals(request)[name] for name in names.split()}
+    upper = request.surface[:, 2] > np.median(request.surface[:, 2])
+    return dataclasses.replace(request, constraints=chosen, avoid=upper)
+
+
+def same(one, other):
+    """Whether two answers are the same to the last digit; times apart."""
+    assert (one.version, one.active) == (other.version, other.active)
+    for name in ("action", "q_target", "u_target"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+@pytest.mark.parametrize("names", COMBINATIONS)
+def test_both_give_the_same_answers_to_the_last_digit(policies, episode, names):
+    states = [{**episode.state, "q": episode.state["q"] + 0.01 * i, "table": np.bool_(i < 3)} for i in range(5)]
+    answers = []
+    for policy in policies:
+        policy.reset(asked(episode.request, names))
+        answers.append([*(policy.act(state) for state in states), *policy.act_each(states), policy.act(states[0])])
+        policy.reset(asked(episode.request, names))
+        answers[-1] += [*policy.act_each(states), policy.act(states[0])]
+    for one, other in zip(*answers, strict=True):
+        same(one, other)
+    first, second = answers[0][:2]
+    assert first.version == 7 and first.active and not np.array_equal(first.action, second.action)
+
+
+BAD_REQUESTS = [
+    ({"constraints": {"levitation": {}}}, UnknownConstraintError),
+    ({"constraints": {"heading": {}}}, RefusedError),
+    ({"constraints": {"heading": {"weight": np.zeros(1)}}}, RefusedError),
+    ({"constraints": {"affordance": {}}}, RefusedError),
+    ({"surface": np.zeros((5, 2))}, RefusedError),
+    ({"wrist": (np.full(3, np.nan), IDENTITY)}, RefusedError),
+    ({"q": "open"}, RefusedError),
+    ({"q": None, "object_pose": None}, RefusedError),
+    ({"above": True}, RefusedError),
+]
+BAD_STATES = [{"u": np.zeros(5)}, {"weight": np.zeros(1)}, {"u": np.full(6, np.inf)}, {"u": "still"}]
+
+
+@pytest.mark.parametrize(("change", "error"), BAD_REQUESTS)
+def test_both_refuse_a_bad_request_with_the_same_error(policies, episode, change, error):
+    messages = []
+    for policy in policies:
+        with pytest.raises(CongraspError) as caught:
+            policy.reset(dataclasses.replace(episode.request, **change))
+            policy.act(episode.state)
+        assert type(caught.value) is error
+        messages.append(str(caught.value))
+    assert messages[0] == messages[1] and "\n" not in messages[0]
+
+
+@pytest.mark.parametrize("change", BAD_STATES)
+@pytest.mark.parametrize("before", [0, 1])
+def test_both_refuse_a_bad_state_with_the_same_error_and_the_episode_stays(policies, episode, change, before):
+    messages, answers = [], []
+    for policy in policies:
+        policy.reset(asked(episode.request, "heading"))
+        for _ in range(before):
+            policy.act(episode.state)
+        with pytest.raises(RefusedError) as caught:
+            policy.act({**episode.state, **change})
+        messages.append(str(caught.value))
+        answers.append(policy.act(episode.state))
+    assert messages[0] == messages[1]
+    same(*answers)
+
+
+def test_what_a_request_lacks_is_named_at_once(policies, episode):
+    for policy in policies:
+        with pytest.raises(RefusedError, match=r"^The request lacks 'surface' and 'wrist'"):
+            policy.reset(dataclasses.replace(episode.request, surface=None, wrist=None))
+
+
+def test_both_refuse_a_contradiction(policies, episode):
+    highest = episode.request.surface[episode.request.surface[:, 2].argmax()]
+    request = asked(episode.request, "trajectory affordance")
+    path = {**goals(episode.request)["trajectory"], "position": np.tile(highest, (TASK.trajectory_points, 1))}
+    for policy in policies:
+        policy.reset(dataclasses.replace(request, constraints={"affordance": {}, "trajectory": path}))
+        with pytest.raises(ContradictionError):
+            policy.act(episode.state)
+
+
+def test_an_episode_must_have_begun(episode):
+    policy = EpisodePolicy()
+    for ask in (lambda: policy.act(episode.state), lambda: policy.act_each([episode.state])):
+        with pytest.raises(RefusedError, match="no episode yet"):
+            ask()
+
+
+def test_policies_are_loaded_by_hand_and_by_file(tmp_path, episode):
+    with load_policy() as policy:
+        policy.reset(episode.request)
+        assert policy.act(episode.state).q_target.shape == (20,)
+    with pytest.raises(CongraspError, match="no hand 'paw'"):
+        load_policy("paw")
+    with pytest.raises(CongraspError, match=r"none\.safetensors cannot be read"):
+        load_policy(tmp_path / "none.safetensors")
