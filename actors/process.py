@@ -15,7 +15,8 @@ from actors.episode import episode_message
 from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes
-from common.config import PhysicsName, RunConfig, run_config_from_json
+from common.config import RunConfig, run_config_from_json
+from common.engines import PhysicsName
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.journal import Journal

@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 import dacite
 from typing_extensions import Doc
 
+from common.engines import PhysicsName
 from common.errors import CongraspError
 from common.task.constraints import CONSTRAINTS, PAPER
 
-PhysicsName = Literal["auto", "warp", "jax", "native"]
 MetricWriter = Literal["tensorboard", "wandb", "wandb-offline"]
 """Where else a learner's metrics are written, beside the recordings."""
 

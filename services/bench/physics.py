@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.table import Table
 
 from actors.bank import build_bank
-from actors.physics import make_physics
+from actors.physics import make_physics, resolve_physics
 from actors.physics.engine import Physics, Readout
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker
-from common.config import PhysicsName
+from common.engines import ENGINES, PhysicsName
 from common.hands import get_hand
 from common.objects.pool import load_pool, scale_objects
 from common.policy.bundle import PolicyBundle, sample_action
@@ -36,8 +36,8 @@ _DEFINITION = (
 
 
 def engines() -> list[PhysicsName]:
-    """Engines that this machine has; `jax` only where it is not a CPU's second choice."""
-    return ["native"] if jax.default_backend() == "cpu" else ["native", "warp", "jax"]
+    """Engines to compare on this machine: all of them, but on a CPU the one that it is best at."""
+    return [resolve_physics("auto")] if jax.default_backend() == "cpu" else list(ENGINES)
 
 
 class Recorder(NativePhysics):

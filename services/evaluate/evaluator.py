@@ -14,7 +14,8 @@ from actors.bank import build_bank
 from actors.env import EnvState, metric_names
 from actors.episode import episode_message
 from actors.rollout import RolloutWorker, Trace, finished_episodes
-from common.config import PhysicsName, TaskConfig
+from common.config import TaskConfig
+from common.engines import ENGINES, PhysicsName
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects.pool import scale_objects
@@ -28,7 +29,6 @@ from services.evaluate.noise import LEVELS, Noise, disturbed
 from services.evaluate.scores import Row, Sample, active_mask, joined, matching, summarise
 from services.evaluate.worlds import NOMINAL_FRICTION, acting, mixture, protocol, two_seconds
 
-_BATCH = {"native": 64, "warp": 4096, "jax": 256}
 _PATIENCE = 100
 _TRIES = 40
 _REFERENCES = 4
@@ -77,7 +77,7 @@ class Evaluator:
         self._hand = get_hand(bundle.spec.hand)
         self.objects = scale_objects(self._hand, self.task, objects)
         self._physics, self._threads, self._seed = physics, threads, seed
-        self._batch = batch or _BATCH[physics]
+        self._batch = batch or ENGINES[physics].batch
         self._bank = bank or build_bank(self._hand, self.task, self.objects, seed)
         self._referred = bank is not None
         self._kept: dict[str, dict[bool, list[Message]]] = {}

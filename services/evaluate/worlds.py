@@ -11,7 +11,8 @@ import numpy as np
 
 from actors.physics import make_physics
 from actors.rollout import RolloutWorker
-from common.config import PhysicsName, TaskConfig
+from common.config import TaskConfig
+from common.engines import PhysicsName
 from common.hands import get_hand
 from common.objects.mjcf import CONTACT
 from common.objects.pool import object_scale

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from rich.console import Console
 
-from common.config import MetricWriter, ObjectsConfig, PhysicsName, RunConfig
+from common.config import MetricWriter, ObjectsConfig, RunConfig
+from common.engines import ENGINES, PhysicsName
 from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.policy import bundle as bundles
@@ -152,7 +153,7 @@ def _plan(config: RunConfig, actors: int | None, ranks: int, *, listens: bool) -
     gpus = ranks > 1 and leave_gpus_to(ranks)
     physics = engine_of(config.physics, gpus)
     if actors is None:
-        actors = 0 if physics == "warp" and not listens else 2
+        actors = 0 if ENGINES[physics].on_device and not listens else 2
     return _Plan(ranks, actors, physics, gpus)
 
 
