@@ -11,7 +11,7 @@ import pytest
 
 from actors.bank import build_bank
 from actors.initial import InitialConditions, sample
-from common.config import GraspWeights, RewardWeights, TaskConfig
+from common.config import RewardWeights, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
@@ -20,7 +20,7 @@ from common.task.constraints import CONSTRAINTS, PAPER, blocks, get_constraint, 
 from common.task.constraints.priority import active_blocks
 from common.task.features import scene_of
 from common.task.observation import fields, layout, observe
-from common.task.reward import reward_terms, terms
+from common.task.reward import GRASP, reward_terms, terms
 from tests.scenes import HAND, active, scene
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
@@ -76,7 +76,7 @@ def test_names_are_unique_over_all_constraints():
         "columns": [error.column or error.name for error in errors],
         "weights": [
             *(weight.name for constraint in CONSTRAINTS for weight in constraint.weights),
-            *(field.name for field in dataclasses.fields(GraspWeights)),
+            *(term.name for term in GRASP),
         ],
         "blocks": ["state", *(block for c in CONSTRAINTS for block in c.blocks or (c.name,)), "mask"],
         "options": [option.name for constraint in CONSTRAINTS for option in constraint.options],
