@@ -1,4 +1,4 @@
-"""One world's episode as a message for logs, pictures and exports."""
+"""One environment's episode as a message for logs, pictures and exports."""
 
 import functools
 from typing import Any
@@ -35,8 +35,8 @@ def episode_message(
     Args:
       hand: the hand.
       task: its control step is written down.
-      trace: T steps of one world.
-      goal: that world's goal, without a batch axis.
+      trace: T steps of one environment.
+      goal: that environment's goal, without a batch axis.
       surface: its surface, without a batch axis.
       obj: its object.
       meta: further entries: version, actor, success, metrics.
@@ -63,7 +63,7 @@ def episode_message(
         **{f"goal/{name}": value for name, value in goal.flat().items()},
         **{f"active/{name}": value for name, value in goal.active.items()},
         "surface_points": surface.points,
-        "surface_minus": surface.minus,
+        "surface_minus": surface.avoid,
         **_geometry(obj),
     }
     return Message(

@@ -95,7 +95,7 @@ class TaskConfig(_Shares):
     hand_table_collision: bool = False
     """Whether the hand collides with the table."""
     hand_self_collision: bool = False
-    """Whether the hand's links collide with one another (slower; the shipped policy learnt without)."""
+    """Whether the hand's links collide with one another (slower; the pretrained policies learnt without)."""
     back_off: float = 0.15
     """Metres from the aligned wrist to its start, against the heading direction."""
     surface_points: int = 256

@@ -1,4 +1,4 @@
-"""Work that is spread over processes when there is enough of it to pay for starting them."""
+"""Work that is divided among processes when there is enough of it to pay for starting them."""
 
 import multiprocessing
 import os

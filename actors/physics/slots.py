@@ -1,4 +1,4 @@
-"""One model for a whole pool of objects: what differs between objects becomes arrays that are batched over worlds.
+"""One model for a whole pool of objects: what differs between objects becomes arrays batched over environments.
 
 Primitive pieces of every object share a fixed number of geom slots, whose sizes and poses are swapped; a slot that an
 object does not use shrinks to 0.4 mm inside it. Mesh pieces cannot be swapped in a `Pool`: each mesh object owns its
@@ -103,7 +103,7 @@ class Pool:
 
 
 def empty_slots() -> list[Piece]:
-    """The primitive slots of a world that has no object in them."""
+    """The primitive slots of an environment that has no object in them."""
     return [Piece(kind, _shrunk(kind)) for kind, count in PRIMITIVE_SLOTS.items() for _ in range(count)]  # type: ignore[arg-type]
 
 

@@ -23,7 +23,7 @@ class Draft(NamedTuple):
     part_names: tuple[str, ...] = ()
     """Empty: the object is labelled by its two halves."""
     graspable: tuple[bool, ...] = ()
-    """Which parts form O+."""
+    """Which parts form the graspable region."""
     weight: tuple[float, ...] = ()
     """Relative density of each part; empty means equal."""
 

@@ -55,7 +55,7 @@ def grasp(
       video: Also write grasp.mp4, at half speed, with the constraints drawn.
       pictures: Write pictures.
       policy: A policy file; by default the one that comes with the package.
-      hand: Hand whose shipped policy is taken.
+      hand: Hand whose pretrained policy is taken.
       tries: Grasps that are simulated side by side.
       seed: Draws what is tried.
       again: Also grasp anew what is done already.

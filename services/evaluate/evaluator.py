@@ -186,7 +186,7 @@ class Evaluator:
             filled = idle = 0
             while filled < places and idle < _TRIES * regions.sum():
                 worker.restart()
-                worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
+                worker.collect(self.bundle.inference_parameters, self.task.approach_steps + self.task.hold_steps)
                 worker.renew_references()
                 before, filled = filled, int(np.any(worker.bank.pose_valid, axis=2)[regions].sum())
                 idle = 0 if filled > before else idle + self._batch
@@ -231,7 +231,7 @@ class Evaluator:
         wanted = _REFERENCES * len(self.objects)
         for _ in range(0, 2 * wanted, self._batch):
             worker.restart()
-            worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
+            worker.collect(self.bundle.inference_parameters, self.task.approach_steps + self.task.hold_steps)
             worker.renew_references()
         made = int(np.asarray(worker.bank.pose_valid).any(2).sum())
         if made < wanted // 4:  # a policy that hardly grasps: those that closing the hand gave are all there is
@@ -335,7 +335,7 @@ class Evaluator:
             trace,
             begun.goal.row(world),
             Surface(*(np.asarray(field)[world] for field in begun.surface)),
-            self.objects[int(np.asarray(begun.world.object_index)[world])],
+            self.objects[int(np.asarray(begun.reset_state.object_index)[world])],
             {
                 "version": self.bundle.version,
                 "actor": "evaluation",
@@ -347,7 +347,7 @@ class Evaluator:
     def _worker(
         self, task: TaskConfig, episodes: int, traced: bool = False
     ) -> contextlib.AbstractContextManager[RolloutWorker]:
-        """Acting worlds, not many more than `episodes` of each row need."""
+        """InferenceParameters worlds, not many more than `episodes` of each row need."""
         rows = 2 ** sum(getattr(task, f"p_{constraint.name}") not in (0.0, 1.0) for constraint in optional(task))
         return acting(
             self.bundle,
@@ -380,7 +380,7 @@ class Evaluator:
         traces: list[Trace] = []
         begun = self._begin(worker)
         for step in range(0, length, piece):
-            rollout = worker.collect(self.bundle.acting, piece)
+            rollout = worker.collect(self.bundle.inference_parameters, piece)
             traces.append(rollout.trace)
             if step + piece > start and step < start + window:
                 rows = slice(max(0, start - step), start + window - step)

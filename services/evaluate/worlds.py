@@ -108,7 +108,7 @@ def acting(
     engine = make_physics(physics, hand, task, objects, threads=threads)
     try:
         yield RolloutWorker(
-            hand, task, engine, bank, policy, batch=batch, seed=seed, half=False, probe=probe, traced=traced
+            hand, task, engine, bank, policy, batch=batch, seed=seed, half_precision=False, probe=probe, traced=traced
         )
     finally:
         engine.close()

@@ -230,7 +230,7 @@ class Grasper:
         words = explain(asked, bool(outcome.redirected[index]))
         written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
         avoid = labelled.non_graspable_points
-        words += [found.words for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
+        words += [found.message for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
         return Grasp(episode, motion_of_episode(episode), tries, held, rest, tuple(words))
 
 
@@ -250,7 +250,7 @@ def grasp(
     Args:
       thing: a mesh (STL, OBJ, PLY, GLB), an object file, or an object.
       policy: a policy file; the one that comes with the package if none is named.
-      hand: name of the hand whose shipped policy is taken.
+      hand: name of the hand whose pretrained policy is taken.
       options: how a mesh becomes an object.
       tries: grasps that are simulated side by side.
       seed: draws what is tried.

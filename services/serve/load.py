@@ -86,7 +86,7 @@ def example_episode(seed: int, hand: str = "human") -> dict[str, Any]:
     found = get_hand(hand)
     (obj,) = scale_objects(found, task, [procedural.generate(seed)])
     begun = initial.sample(found, task, build_bank(found, task, [obj], seed), jax.random.key(seed), 1)
-    world = {name: np.asarray(value)[0] for name, value in begun.world._asdict().items()}
+    world = {name: np.asarray(value)[0] for name, value in begun.reset_state._asdict().items()}
     pose = world["object_position"], world["object_quaternion"]
     return {
         "hand": found.name,

@@ -48,7 +48,9 @@ def test_rollouts_are_made_on_it():
         return 0.3 * jax.random.normal(key, (BATCH, len(HAND.joints) + 6)), jnp.zeros(BATCH)
 
     bank = build_bank(HAND, TASK, OBJECTS, 0)
-    rollout = RolloutWorker(HAND, TASK, physics, bank, policy, batch=BATCH, seed=0, half=False).collect(None, 3)
+    rollout = RolloutWorker(HAND, TASK, physics, bank, policy, batch=BATCH, seed=0, half_precision=False).collect(
+        None, 3
+    )
     assert CountingPhysics.steps == 3 * BATCH and np.all(np.isfinite(rollout.reward))
     physics.close()
 

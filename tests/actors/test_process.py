@@ -61,7 +61,7 @@ def invented(episodes: np.ndarray) -> Rollout:
     given = {
         **FORM.zeros(),
         "episodes": episodes,
-        "usage": np.zeros((T, 2), np.float32),
+        "occupancy": np.zeros((T, 2), np.float32),
         "has_episode": np.ones(B, bool),
         "trace": Trace(**{name: np.zeros(shape, np.float32) for name, shape in zeros.items()}, **flags),
     }
@@ -78,8 +78,8 @@ class InventedWorker:
         neutral = goal_of(HAND, CONFIG.task, GraspRequest())
         goal = jax.tree.map(lambda array: array[None], neutral)
         surface = Surface(np.zeros((1, 8, 3), np.float32), np.zeros((1, 8), bool))
-        world = types.SimpleNamespace(object_index=np.zeros(1, int))
-        self.state = types.SimpleNamespace(time=np.zeros(1), goal=goal, surface=surface, world=world)
+        reset_state = types.SimpleNamespace(object_index=np.zeros(1, int))
+        self.state = types.SimpleNamespace(time=np.zeros(1), goal=goal, surface=surface, reset_state=reset_state)
 
     def configure(self, *args, **options):
         pass
@@ -134,8 +134,8 @@ def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
 
 
 def test_steps_in_which_the_physics_left_contacts_out_are_counted():
-    usage = np.array([[0.5, 0.1], [1.0, 0.2], [1.25, 0.2], [0.3, 1.5]], np.float32)
-    assert process.physics_usage(usage) == {"overflow": 2.0, "contacts_peak": 1.25, "rows_peak": 1.5}
+    occupancy = np.array([[0.5, 0.1], [1.0, 0.2], [1.25, 0.2], [0.3, 1.5]], np.float32)
+    assert process.buffer_occupancy(occupancy) == {"overflow": 2.0, "contacts_peak": 1.25, "rows_peak": 1.5}
 
 
 @pytest.mark.timeout(60)

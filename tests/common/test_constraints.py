@@ -226,7 +226,7 @@ def _same(some: InitialConditions, more: InitialConditions, but: str) -> None:
     for one, other in (goals, actives):
         for name in one:
             np.testing.assert_array_equal(one[name], other[name], err_msg=name)
-    for name in ("world", "surface", "region", "hold"):
+    for name in ("reset_state", "surface", "region", "hold"):
         jax.tree.map(np.testing.assert_array_equal, getattr(some, name), getattr(more, name))
 
 

@@ -89,7 +89,7 @@ def episodes(task):
 
     worker = RolloutWorker(
         hand, task, physics, build_bank(hand, task, objects, 0), policy,
-        batch=batch, seed=0, half=False, traced=slice(None),
+        batch=batch, seed=0, half_precision=False, traced=slice(None),
     )  # fmt: skip
     goal = jax.device_get(worker.state.goal)
     rollout = worker.collect(None, task.approach_steps + task.hold_steps)

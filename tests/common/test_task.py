@@ -93,24 +93,24 @@ def test_features_against_numpy():
     distance = np.linalg.norm(offsets, axis=-1)
     nearest = offsets[np.arange(len(points)), distance.argmin(1)]
     np.testing.assert_allclose(seen.nearest[b], nearest, atol=1e-4)
-    minus = np.where(surface.minus[b], distance, np.inf)
+    avoid = np.where(surface.avoid[b], distance, np.inf)
     np.testing.assert_allclose(
-        avoided.distance[b], (minus.min(1) - HAND.keypoint_radii)[1:].min(), atol=1e-4
+        avoided.distance[b], (avoid.min(1) - HAND.keypoint_radii)[1:].min(), atol=1e-4
     )  # the palm does not count as a finger
     forces = wrist.inv().apply(state.contact_force[b].reshape(-1, 3)).reshape(L, -1, 3)
     forces *= state.contact_found[b][..., None]
     np.testing.assert_allclose(seen.force[b], forces.sum(1), atol=1e-4)
     where = body.inv().apply(state.contact_position[b].reshape(-1, 3) - state.object_position[b])
-    label = surface.minus[b][np.linalg.norm(where[:, None] - surface.points[b][None], axis=-1).argmin(1)].reshape(L, -1)
+    label = surface.avoid[b][np.linalg.norm(where[:, None] - surface.points[b][None], axis=-1).argmin(1)].reshape(L, -1)
     np.testing.assert_array_equal(avoided.touching[b], (state.contact_found[b] & label).any(1))
     np.testing.assert_array_equal(avoided.touching_graspable[b], (state.contact_found[b] & ~label).any(1))
     np.testing.assert_allclose(avoided.force[b], (forces * label[..., None]).sum(1), atol=1e-4)
     np.testing.assert_allclose(seen.force[b] - avoided.force[b], (forces * ~label[..., None]).sum(1), atol=1e-4)
 
 
-def test_without_o_minus_there_is_nothing_to_avoid():
+def test_without_an_avoid_region_there_is_nothing_to_avoid():
     state, surface, goal = scene(8)
-    seen = FEATURES(state, surface._replace(minus=np.zeros_like(surface.minus)), goal).of["affordance"]
+    seen = FEATURES(state, surface._replace(avoid=np.zeros_like(surface.avoid)), goal).of["affordance"]
     assert np.all(np.asarray(seen.distance) == np.float32(FAR))
     assert not np.any(seen.nearest) and not np.any(seen.touching)
 
@@ -165,10 +165,10 @@ def test_reward_terms_against_numpy(near):
     d = np.linalg.norm(np.asarray(seen.nearest)[b], axis=-1)
     weights = HAND.contact_weights
     np.testing.assert_allclose(paid["distance"][b], -(HAND.keypoint_weights * d).sum(), rtol=1e-4)
-    plus = np.asarray(avoided.touching_graspable)[b]
-    np.testing.assert_allclose(paid["contact"][b], (weights * plus).sum(), rtol=1e-5)
-    plus_force = np.linalg.norm(np.asarray(seen.force - avoided.force)[b], axis=-1)
-    np.testing.assert_allclose(paid["force"][b], (weights * plus * np.minimum(plus_force, 5) / 5).sum(), rtol=1e-4)
+    graspable = np.asarray(avoided.touching_graspable)[b]
+    np.testing.assert_allclose(paid["contact"][b], (weights * graspable).sum(), rtol=1e-5)
+    pressed = np.linalg.norm(np.asarray(seen.force - avoided.force)[b], axis=-1)
+    np.testing.assert_allclose(paid["force"][b], (weights * graspable * np.minimum(pressed, 5) / 5).sum(), rtol=1e-4)
     force = np.linalg.norm(np.asarray(seen.force)[b], axis=-1)
     np.testing.assert_allclose(paid["force_excess"][b], -np.clip(force - 5, 0, 50).sum(), rtol=1e-4)
     shift = state.object_position[b] - state.object_position_initial[b]
@@ -213,8 +213,8 @@ def test_reward_terms_against_numpy(near):
     )
     barrier = np.logaddexp(0.0, (0.01 - float(avoided.distance[b])) / 0.002)
     np.testing.assert_allclose(paid["affordance_distance"][b], -barrier, rtol=1e-3)
-    minus_force = np.linalg.norm(np.asarray(avoided.force)[b], axis=-1)
-    np.testing.assert_allclose(paid["affordance_force"][b], -np.minimum(minus_force, 10).sum(), rtol=1e-4)
+    avoided_force = np.linalg.norm(np.asarray(avoided.force)[b], axis=-1)
+    np.testing.assert_allclose(paid["affordance_force"][b], -np.minimum(avoided_force, 10).sum(), rtol=1e-4)
 
 
 def test_without_affordance_every_contact_is_rewarded():

@@ -96,7 +96,7 @@ class Affordance(Constraint):
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
         """Redirects a heading that comes nearer to the avoid region than to the graspable one."""
         heading = goal["heading"]
-        weights = (~surface.minus)[..., None].astype(jnp.float32)
+        weights = (~surface.avoid)[..., None].astype(jnp.float32)
         middle = jnp.sum(surface.points * weights, 1) / jnp.maximum(jnp.sum(weights, 1), 1.0)
         towards = middle - (heading.position - REACH * heading.direction)
         towards = towards / jnp.linalg.norm(towards, axis=-1, keepdims=True)
@@ -106,9 +106,9 @@ class Affordance(Constraint):
     def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> AffordanceFeatures:
         """Distances, contacts and forces by region: each contact has the label of the nearest surface point."""
         surface = contacts.surface
-        index = nearest_index(jnp.where(surface.minus[..., None], contacts.squared, jnp.inf))
-        avoided = jnp.take_along_axis(surface.minus, flat(contacts.nearest), -1).reshape(contacts.nearest.shape)
-        has_any = jnp.any(surface.minus, -1)
+        index = nearest_index(jnp.where(surface.avoid[..., None], contacts.squared, jnp.inf))
+        avoided = jnp.take_along_axis(surface.avoid, flat(contacts.nearest), -1).reshape(contacts.nearest.shape)
+        has_any = jnp.any(surface.avoid, -1)
         nearest = jnp.take_along_axis(surface.points, index[..., None], -2) - contacts.keypoints
         nearest = jnp.where(has_any[..., None, None], nearest, 0.0)
         skin = jnp.linalg.norm(nearest, axis=-1) - jnp.array(hand.keypoint_radii)
@@ -149,14 +149,14 @@ class Affordance(Constraint):
 
     def valid(self, surface: Surface, own: AffordanceGoal) -> Array:
         """Both regions have points."""
-        return jnp.any(surface.minus, -1) & ~jnp.all(surface.minus, -1)
+        return jnp.any(surface.avoid, -1) & ~jnp.all(surface.avoid, -1)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
         """It keeps the fingers off its region unless a reference pose names its own contacts."""
         if overridden:
             return ["The affordance is overridden by the reference pose, which names its own contacts."]
-        turned = "The heading came nearer to O- than to O+ and was turned towards O+."
-        return ["The affordance keeps the fingers off O-.", *([turned] if redirected else [])]
+        turned = "The heading came nearer to the avoid region and was turned towards the graspable region."
+        return ["The affordance keeps the fingers off the avoid region.", *([turned] if redirected else [])]
 
 
 def _count(flags: Array) -> Array:
@@ -168,8 +168,8 @@ def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, A
     heading = goal["heading"]
     start = heading.position - REACH * heading.direction
     return {
-        "avoid": least_distance_to_segment(surface.points, surface.minus, start, heading.position),
-        "graspable": least_distance_to_segment(surface.points, ~surface.minus, start, heading.position),
+        "avoid": least_distance_to_segment(surface.points, surface.avoid, start, heading.position),
+        "graspable": least_distance_to_segment(surface.points, ~surface.avoid, start, heading.position),
     }
 
 

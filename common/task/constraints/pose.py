@@ -193,8 +193,8 @@ def _touches(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
     points = kinematics.keypoints(hand, kinematics.link_transforms(hand, own.q))
     points = rotations.transform(own.position, own.quaternion, points)
     away = squared_distances(surface.points, points)
-    avoid = jnp.min(jnp.where(surface.minus[..., None], away, jnp.inf), -2)
-    graspable = jnp.min(jnp.where(surface.minus[..., None], jnp.inf, away), -2)
+    avoid = jnp.min(jnp.where(surface.avoid[..., None], away, jnp.inf), -2)
+    graspable = jnp.min(jnp.where(surface.avoid[..., None], jnp.inf, away), -2)
     return {"touching": (avoid < TOUCHING**2) & (avoid < graspable)}
 
 

@@ -82,7 +82,7 @@ def test_the_rules_are_told_in_words_and_masks(studio: Studio) -> None:
 def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studio) -> None:
     studio.paint([studio.arrow.position - INWARD * studio.arrow.direction], 0.03, minus=True)
     view = studio.view()
-    assert view["active"]["overruled"] and any("turned towards O+" in line for line in view["words"])
+    assert view["active"]["overruled"] and any("turned towards the graspable region" in line for line in view["words"])
     assert np.linalg.norm(np.subtract(view["active"]["direction"], studio.arrow.direction)) > 0.02
 
 
