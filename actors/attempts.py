@@ -95,6 +95,7 @@ class Attempts:
             self._worker.physics.close()
 
     def _new_worker(self, obj: GraspObject, batch: int) -> RolloutWorker:
+        """A worker of `batch` environments on this object, that acts by the mean and traces all of them."""
         layout = self._bundle.spec.layout
 
         def policy(parameters: Any, observation: Array, key: Array) -> tuple[Array, Array]:

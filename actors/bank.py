@@ -198,6 +198,7 @@ def headings_of(
 
 
 def _reachable(task: TaskConfig, headings: Headings, rest: np.ndarray) -> np.ndarray:
+    """(H,) bool: headings that can be followed in a resting pose (7,), moved clear of the table where they must be."""
     return feasible(clear_table(headings, rest), rest, back_off=task.back_off)
 
 

@@ -81,6 +81,7 @@ def _frames(hand: Hand, q: Array, wrist_position: Array, wrist_quaternion: Array
 
 
 def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
+    """The object's convex pieces and its mesh, as arrays of the message."""
     pieces = obj.pieces
     return {
         "piece_kind": np.array([PIECE_KINDS.index(piece.kind) for piece in pieces], np.int32),
@@ -94,4 +95,5 @@ def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
 
 
 def _plain(array: np.ndarray) -> np.ndarray:
+    """The array, in float32 instead of float64."""
     return array.astype(np.float32) if array.dtype == np.float64 else array

@@ -158,6 +158,7 @@ class _Actor:
             self._worker.restart()
 
     def _configure(self, version: int) -> None:
+        """Sets the curriculum's weights and phase under the policy of this version."""
         config = self._config
         self._worker.configure(
             config.curriculum.weights(config.task.reward, version), stationary=config.curriculum.stationary(version)
@@ -173,6 +174,7 @@ class _Actor:
         return self._bundle is not None
 
     def _rollout(self, bundle: PolicyBundle, ticket: Ticket, since: "_Since") -> None:
+        """Makes a rollout under a ticket and hands it over, with metrics and logs."""
         config, before = self._config, self._worker.state
         began = time.monotonic()
         self._configure(bundle.version)
@@ -237,6 +239,7 @@ class _Actor:
         self._publish("episode", message)
 
     def _publish(self, kind: str, message: Message) -> None:
+        """Publishes a message for logs under this actor's name."""
         # JSON has no NaN: one such number would cost the whole message.
         message = Message(message.arrays, finite(message.meta))
         self._transport.publish(self._link.keys.log(kind, "actor", self._link.actor), message)

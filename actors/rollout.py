@@ -130,9 +130,7 @@ class RolloutWorker:
         self._begin_jit = jax.jit(self.env.state_of)
         self._decide_jit = jax.jit(self._decide)
         self._advance_jit = jax.jit(self._advance)
-        self._merge_jit = jax.jit(
-            lambda state, mask, fresh: self.env.merge(state, mask, self.env.state_of(fresh, None))
-        )
+        self._merge_jit = jax.jit(self._merge)
         self._with_scene_jit = jax.jit(self.env.with_scene)
         self._scan_jit = jax.jit(self._scan, static_argnames="steps")
         self.state: EnvState | None = None
@@ -188,6 +186,7 @@ class RolloutWorker:
         self._forget_grasps()
 
     def _forget_grasps(self) -> None:
+        """Marks the grasps as taken."""
         assert self.state is not None
         grasps = self.state.grasps
         self.state = self.state._replace(grasps=grasps._replace(found=jnp.zeros_like(grasps.found)))
@@ -208,20 +207,25 @@ class RolloutWorker:
         return self._collect_stepwise(parameters, key, steps, progress)
 
     def _sample(self, bank: ConstraintBank, key: Array, stationary: Array) -> InitialConditions:
+        """Fresh episodes for all environments, drawn from the bank."""
         return initial.sample(self._hand, self._task, bank, key, self.batch, stationary)
 
     def _merge(self, state: EnvState, mask: Array, fresh: InitialConditions) -> EnvState:
+        """Fresh episodes in the masked environments (B,), whose engine was reset apart."""
         return self.env.merge(state, mask, self.env.state_of(fresh, None))
 
     def _observe(self, state: EnvState) -> Array:
+        """(B, D) observation, in the precision that the learner gets."""
         return observe(self.env.scene_of(state)).astype(self._dtype)
 
     def _decide(self, parameters: Any, settings: Settings, state: EnvState, key: Array) -> _Decision:
+        """Observation, action and joint targets of the coming step."""
         observation = self._observe(state)
         action, log_probability = self._policy(parameters, observation.astype(jnp.float32), key)
         return _Decision(observation, action, log_probability, *self.env.targets(state, action, settings))
 
     def _kept(self, state: EnvState, action: Array, transition: Transition) -> tuple[Trace, Any]:
+        """What trace and probe keep of a step."""
         return _traced(state, action, transition, self._task, self._traced), self._probe(self.env.scene_of(state))
 
     def _advance(
@@ -246,6 +250,7 @@ class RolloutWorker:
         return changed, transition, kept, following
 
     def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
+        """A rollout with an engine that JAX cannot trace; see `collect`."""
         # One key more than there are steps: what is decided after the last one only yields `last_observation`.
         keys = jax.random.split(key, steps + 1)
         key_data = jax.random.key_data(keys)
@@ -280,6 +285,7 @@ class RolloutWorker:
         return Rollout(*(*columns, decision.observation, *finished, trace, probed))
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
+        """A rollout as one program; see `collect`."""
         # Committed to the device, whether they were there already or not: anything else would compile once more.
         parameters, bank, carry = jax.device_put(
             (parameters, self._bank, (self.state, self._episode_key)), jax.local_devices()[0]
@@ -299,6 +305,8 @@ class RolloutWorker:
         key: Array,
         steps: int,
     ) -> tuple[tuple[EnvState, Array], Rollout]:
+        """`steps` control steps and the fresh episodes where some end; traced."""
+
         def renew(operand: Any) -> Any:
             state, episode_key, terminal = operand
             episode_key, own = jax.random.split(episode_key)

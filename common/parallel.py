@@ -35,6 +35,7 @@ def _prepare_worker() -> None:
     assert parent is not None
 
     def wait() -> None:
+        """Ends this process after its parent."""
         parent.join()
         os._exit(1)
 

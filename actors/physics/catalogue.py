@@ -89,6 +89,7 @@ class Catalogue:
         return first + count
 
     def _row(self) -> dict[str, np.ndarray]:
+        """The present object's values of the fields that differ between objects."""
         model, body = self.model, self._body
         row = {name: getattr(model, name)[self.geoms].copy() for name in _SLOT_FIELDS}
         row |= {name: getattr(model, name)[body].copy() for name in _BODY_FIELDS}

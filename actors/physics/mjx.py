@@ -136,12 +136,14 @@ class MjxPhysics:
         """Nothing to release."""
 
     def _leaves(self, objects: Sequence[GraspObject]) -> dict[str, Array]:
+        """Fields (N, ...) of the model for each object, on the device."""
         return {
             name: jnp.asarray(value, jnp.float32).reshape(len(objects), *getattr(self._model, name).shape)
             for name, value in self._pool.leaves(objects).items()
         }
 
     def _place(self, data: Any, pool: dict[str, Array], reset_state: ResetState) -> MjxState:
+        """Environments at their start, with the fields of their objects from the rows `pool` (N, ...)."""
         where, batch = self._where, reset_state.object_index.shape[0]
         body = self._object_body
         leaves = {name: value[reset_state.object_index] for name, value in pool.items()}

@@ -127,11 +127,13 @@ class NativePhysics:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _scene(self, index: int) -> Scene:
+        """The compiled scene of an object, compiled on first use."""
         if index not in self._scenes:
             self._scenes[index] = Scene(compile_scene(self._hand, self._task, self._objects[index]))
         return self._scenes[index]
 
     def _start_instance(self, i: int, reset_state: ResetState) -> None:
+        """Puts environment i to row i of its reset states, in an instance of its object's scene."""
         where, scene = self._where, self._scene(int(reset_state.object_index[i]))
         self.instances[i].scene.spare.append(self.instances[i])
         instance = self.instances[i] = scene.take()
@@ -154,6 +156,7 @@ class NativePhysics:
         self._copy_out(i)
 
     def _restore(self, i: int) -> None:
+        """Puts a diverged environment back to its start."""
         model, data = self.instances[i].model, self.instances[i].data
         mocap = data.mocap_pos.copy(), data.mocap_quat.copy()
         weld = int(data.eq_active[self._where.weld])
@@ -164,10 +167,12 @@ class NativePhysics:
         self._copy_out(i)
 
     def _copy_out(self, i: int) -> None:
+        """Copies an instance's state into row i of the batch's arrays."""
         instance = self.instances[i]
         self._qpos[i], self._qvel[i], self._sensors[i] = instance.qpos, instance.qvel, instance.sensordata
 
     def _step_instances(self, environments: Iterator[int], target: np.ndarray) -> None:
+        """One control step of the environments that the iterator, which threads share, still has."""
         substeps = self._task.substeps
         with np.errstate(over="ignore"):  # a diverged environment's values may be too large for float32
             for i in environments:
@@ -177,6 +182,7 @@ class NativePhysics:
                 self._copy_out(i)
 
     def _current_state(self, diverged: np.ndarray) -> PhysicsState:
+        """The physics state from the batch's arrays; `diverged` (B,) is passed through."""
         # Copies: the next step writes into the buffers while JAX may still read.
         return self._physics_state(
             self._qpos.copy(), self._qvel.copy(), self._sensors.copy(), diverged, np.zeros(2, np.float32)

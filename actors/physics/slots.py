@@ -152,10 +152,12 @@ def fill_body(model: mujoco.MjModel, data: mujoco.MjData, obj: GraspObject) -> N
 
 
 def _shrunk(kind: str) -> tuple[float, float, float]:
+    """Size of an unused slot."""
     return (_UNUSED, _UNUSED, 0.0) if kind in ("cylinder", "capsule") else (_UNUSED, _UNUSED, _UNUSED)
 
 
 def _half_extent(piece: Piece) -> tuple[float, float, float]:
+    """Half the edges of a primitive's bounding box in its own frame, m."""
     a, b, c = piece.size
     if piece.kind == "cylinder":
         return a, a, b
@@ -163,6 +165,7 @@ def _half_extent(piece: Piece) -> tuple[float, float, float]:
 
 
 def _bounding_radius(piece: Piece) -> float:
+    """Radius of the sphere around its centre that holds a primitive, m."""
     a, b, c = piece.size
     if piece.kind == "box":
         return float(np.linalg.norm(piece.size))

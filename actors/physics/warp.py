@@ -148,6 +148,7 @@ class WarpPhysics:
         self._buffers.clear()
 
     def _load(self, objects: Sequence[GraspObject]) -> None:
+        """Puts objects on the device, and every batch's buffers on them."""
         rows, meshes = self._catalogue.rows(objects)
         self._objects = objects
         self._loaded = objects_on(self._device, rows), meshes_on(self._device, meshes)
@@ -156,6 +157,7 @@ class WarpPhysics:
             buffers.fill(*self._loaded)
 
     def _fresh(self, reset_state: ResetState) -> WarpState:
+        """The state of environments that start now; types as the compiled calls expect them."""
         index, stationary = jnp.asarray(reset_state.object_index, jnp.int32), jnp.asarray(reset_state.stationary, bool)
         reset_state = ResetState(*(jnp.asarray(leaf, jnp.float32) for leaf in reset_state))
         reset_state = reset_state._replace(object_index=index, stationary=stationary)

@@ -107,6 +107,7 @@ class WarpBuffers:
             wp.copy(given, mine)
 
     def _capture(self) -> wp.Graph:
+        """Records the kernels of one control step as a CUDA graph."""
         with wp.ScopedCapture() as capture:
             self._substep_all()
         return capture.graph
@@ -169,6 +170,7 @@ def _control_step(
     sensordata: wp.array2d[float],
     occupancy: wp.array[int],
 ) -> None:
+    """What JAX calls: finds the buffers by their handle and steps them; arrays as in `WarpPhysics.step`."""
     placed = [table, row, mass_scale, friction, base_position, base_quaternion]
     placed += [anchor_position, anchor_quaternion, stationary]
     _buffers[handle].control_step(qpos, qvel, qacc_warmstart, ctrl, placed, sensordata, occupancy)

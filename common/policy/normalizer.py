@@ -78,6 +78,7 @@ def merge(*parts: Statistics) -> Statistics:
 
 
 def _std(statistics: Statistics) -> np.ndarray:
+    """Standard deviations, none of them close to zero."""
     return np.maximum(np.sqrt(statistics.m2 / statistics.count), _SMALLEST_STD)
 
 

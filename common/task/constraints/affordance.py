@@ -174,6 +174,7 @@ def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, A
 
 
 def _contradicts_heading(apart: Mapping[str, Array]) -> Array:
+    """(B,) bool: the approach comes nearer to the avoid region."""
     return apart["avoid"] < apart["graspable"]
 
 

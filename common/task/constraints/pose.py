@@ -172,6 +172,7 @@ def pose_gate(distance: Array) -> Array:
 
 
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
+    """(B,) rad between the heading and that of the reference."""
     return {"turn": heading_turn(hand, goal["heading"], goal["pose"].quaternion)}
 
 

@@ -115,21 +115,38 @@ def sample_headings(
         total += len(good)
         if total >= count:
             break
-    if total == 0 and avoid.any():
-        if not (lenient and clean):
+    if total == 0:
+        last = _last_resort(points, avoid, position, direction, faults, rng, lenient=lenient)
+        if last is None:
             return None
-        bare = points[~avoid]
-        position, direction = position[:clean], direction[:clean]
-        cross, _ = _roll(bare, np.zeros(len(bare), bool), position, direction, rng)
-        found.append(Headings(position, direction, cross))
-    elif total == 0:
-        cross, width = _roll(points, avoid, position, direction, rng)
-        # Faults count whole numbers and a width in metres less than one: together they sort in the right order.
-        best = (faults + width).argsort(kind="stable")[: _BATCH // 16]
-        found.append(Headings(position[best], direction[best], cross[best]))
+        found.append(last)
     pool = Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     chosen = np.resize(np.arange(len(pool.position)), count)
     return Headings(*(part[chosen].astype(np.float32) for part in pool))
+
+
+def _last_resort(
+    points: np.ndarray,
+    avoid: np.ndarray,
+    position: np.ndarray,
+    direction: np.ndarray,
+    faults: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    lenient: bool,
+) -> Headings | None:
+    """Headings among candidates (N, 3) of which none keeps all rules, see `sample_headings`; `faults` (N,) ascend."""
+    if avoid.any():
+        clean = int((faults == 0).sum())
+        if not (lenient and clean):
+            return None
+        bare = points[~avoid]
+        cross, _ = _roll(bare, np.zeros(len(bare), bool), position[:clean], direction[:clean], rng)
+        return Headings(position[:clean], direction[:clean], cross)
+    cross, width = _roll(points, avoid, position, direction, rng)
+    # Faults count whole numbers and a width in metres less than one: together they sort in the right order.
+    best = (faults + width).argsort(kind="stable")[: _BATCH // 16]
+    return Headings(position[best], direction[best], cross[best])
 
 
 def clear_table(
@@ -210,6 +227,7 @@ def _frame(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _spin(side: np.ndarray, other: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Unit vectors at an angle (rad) from the first towards the second of two orthogonal ones."""
     return np.cos(turn)[..., None] * side + np.sin(turn)[..., None] * other
 
 
