@@ -1,4 +1,4 @@
-"""One of two ranks that steps a world of the engine warp; says on whose devices it lies. Arguments: rank, port."""
+"""One of two ranks that steps an environment in warp; says on whose devices it lies. Arguments: rank, port."""
 
 import sys
 

@@ -100,7 +100,7 @@ def test_a_grasp_replaces_one_reference_of_its_object_and_region(bank):
     jax.tree.map(np.testing.assert_array_equal, nothing, flat)
 
 
-def test_only_masked_worlds_are_exchanged():
+def test_only_masked_environments_are_exchanged():
     mask = jnp.array([True, False])
     new, old = {"a": jnp.ones((2, 3)), "b": jnp.array([True, True])}, {"a": jnp.zeros((2, 3)), "b": jnp.zeros(2, bool)}
     merged = where_environments(mask, new, old)

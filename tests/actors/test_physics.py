@@ -201,7 +201,7 @@ def test_a_world_that_was_used_before_is_as_good_as_new(env):
     fresh.close()
 
 
-def test_reset_changes_only_the_masked_worlds(env):
+def test_reset_changes_only_the_masked_environments(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     start = above(env.reset_state, 0.3)
     state = physics.start(start)
@@ -257,7 +257,7 @@ def test_jax_agrees_with_native(env):
     np.testing.assert_allclose(x.q, y.q, atol=0.25)
     np.testing.assert_allclose(x.object_position, y.object_position, atol=0.03)
     np.testing.assert_allclose(force[0], force[1], rtol=0.35, atol=20.0)
-    # A reset puts the masked worlds back and leaves the rest.
+    # A reset puts the masked environments back and leaves the rest.
     mask = jnp.array([True, False, False])
     again = other.read(other.reset(b, mask, jax.tree.map(jnp.asarray, start)))
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)

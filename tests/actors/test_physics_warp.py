@@ -1,4 +1,4 @@
-"""The engine warp on a CPU: a mesh for each world, resets, other objects, compiled loops, agreement with native."""
+"""Warp on a CPU: a mesh for each environment, resets, other objects, compiled loops, agreement with native."""
 
 import dataclasses
 import os
@@ -31,18 +31,18 @@ OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "bo
 OTHERS = [procedural.generate(i, family) for i, family in enumerate(["ring", "cylinder", "bowl", "bowl", "box"], 7)]
 
 
-def _worlds(objects: Sequence[GraspObject]) -> ResetState:
+def _starts(objects: Sequence[GraspObject]) -> ResetState:
     return jax.tree.map(jnp.asarray, above(one_each(objects).reset_state, 0.19))
 
 
 @pytest.fixture(scope="module")
 def start():
-    return _worlds(OBJECTS)
+    return _starts(OBJECTS)
 
 
 @pytest.fixture(scope="module")
 def others():
-    return _worlds(OTHERS)
+    return _starts(OTHERS)
 
 
 def _same(a, b):
@@ -104,7 +104,7 @@ def _scanned(folder: pathlib.Path) -> GraspObject:
 def test_scanned_objects_agree_with_native(shared_objects):
     objects = [_scanned(shared_objects / name) for name in ("camera", "flashlight", "hammer")]
     assert max(len(obj.pieces) for obj in objects) > 1
-    _agrees_with_native(objects, _worlds(objects))
+    _agrees_with_native(objects, _starts(objects))
 
 
 def test_rows_are_what_mujoco_compiles():
@@ -131,7 +131,7 @@ def test_rows_are_what_mujoco_compiles():
     assert set(rows["geom_dataid"][rows["geom_dataid"] >= 0]) == set(range(meshes.nmesh))
 
 
-def test_a_reset_picks_each_worlds_object_and_leaves_the_others(start):
+def test_a_reset_picks_each_environments_object_and_leaves_the_others(start):
     warp, native = WarpPhysics(HAND, TASK, OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
     step, table = jax.jit(warp.step), jnp.ones(4, bool)
     state = warp.start(start)
@@ -158,7 +158,7 @@ def test_a_reset_picks_each_worlds_object_and_leaves_the_others(start):
     native.close()
 
 
-def test_other_objects_need_no_compiling_and_worlds_under_way_keep_theirs(start, others):
+def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(start, others):
     warp, untouched = WarpPhysics(HAND, TASK, OBJECTS), WarpPhysics(HAND, TASK, OBJECTS)
     step, step_untouched, table = jax.jit(warp.step), jax.jit(untouched.step), jnp.ones(4, bool)
     state, expected = warp.start(start), untouched.start(start)

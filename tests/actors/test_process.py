@@ -46,7 +46,7 @@ FIELDS = episode_fields(CONFIG.task)
 
 
 def invented(episodes: np.ndarray) -> Rollout:
-    """A rollout of zeros in which every world ended an episode with these metrics (B, fields)."""
+    """A rollout of zeros in which every environment ended an episode with these metrics (B, fields)."""
     zeros = {
         **dict.fromkeys(("q", "q_target"), (T, len(HAND.joints))),
         **dict.fromkeys(("u", "u_target"), (T, 6)),
@@ -70,7 +70,7 @@ def invented(episodes: np.ndarray) -> Rollout:
 
 
 class InventedWorker:
-    """Stands in for worlds: gives the same rollout again and again."""
+    """Stands in for environments: gives the same rollout again and again."""
 
     rollout: Rollout
 
@@ -146,7 +146,7 @@ def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(he
     batch, logs = heard(invented(episodes))
     assert batch is not None, "the learner refused the rollout"
     arrays = batch[0].arrays
-    for i, name in enumerate(FIELDS):  # world 1's
+    for i, name in enumerate(FIELDS):  # environment 1's
         np.testing.assert_array_equal(arrays[name], [i], err_msg=name)
     assert logs["metrics"].meta["values"]["episodes_left_out"] == 2
     episode = logs["episode"].meta["metrics"]

@@ -53,9 +53,9 @@ def _without(whole, constraint):
 def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
     described, sizes = fields(HAND, TASK), dict(layout(HAND, TASK))
     names = constraint.blocks or (constraint.name,)
-    seen = constraint.observe(whole)
-    assert len(seen) == len(names) == len(constraint.fields(HAND, TASK))
-    for name, parts in zip(names, seen, strict=True):
+    observed = constraint.observe(whole)
+    assert len(observed) == len(names) == len(constraint.fields(HAND, TASK))
+    for name, parts in zip(names, observed, strict=True):
         assert [part.shape[-1] for part in parts] == [field.size for field in described[name]], name
         assert sum(part.shape[-1] for part in parts) == sizes[name]
         assert all(field.name and field.meaning for field in described[name])

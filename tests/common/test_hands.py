@@ -188,14 +188,14 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
         target[:, 6:] = np.clip(firm, hand.lower, hand.upper)
         if step == 60:
             physics.instances[0].data.eq_active[physics._where.weld] = False
-        state, seen = physics.step(state, target, np.zeros(1, bool))
-        touched |= seen.contact_found[0].any(-1)
+        state, after = physics.step(state, target, np.zeros(1, bool))
+        touched |= after.contact_found[0].any(-1)
         if step >= 180:
-            speeds.append(np.linalg.norm(seen.object_velocity))
+            speeds.append(np.linalg.norm(after.object_velocity))
     physics.close()
     fingers = {hand.links[i].name.partition("_")[0] for i in np.flatnonzero(touched)}
     assert "thumb" in fingers and len(fingers - {"palm"}) >= 3, fingers
-    moved = np.asarray(seen.object_position[0]) - reset_state.object_position[0]
+    moved = np.asarray(after.object_position[0]) - reset_state.object_position[0]
     assert moved[2] > -0.02 and np.linalg.norm(moved) < 0.10, "the object fell"  # fingers may pull it into the palm
     assert max(speeds) < 0.05, "the object shakes"
 

@@ -196,9 +196,9 @@ if __name__ == "__main__":
     TASK = dataclasses.replace(
         TaskConfig(constraints=(*constraints.PAPER, "level")), approach_steps=2, hold_steps=1, hold_steps_max=1
     )
-    seen = episodes(TASK)
+    metrics = episodes(TASK)
     print("episodes")
-    tables(TASK, seen)
+    tables(TASK, metrics)
     print("tables")
     server(TASK)
     print("server")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from common import rotations
 from common.hands.spec import Hand
 from common.task.constraints.base import Constraint, ErrorSpec, ObservationField, Option, Relation, Scene, Weight
-from common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, squash
+from common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, squash
 from common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
@@ -144,8 +144,7 @@ class Affordance(Constraint):
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
         """Links that touch the avoid region, among all that touch (a link on both counts once)."""
-        touching = scene.features.of["affordance"].touching
-        return {"affordance_ratio": (_count(touching), _count(scene.features.touching))}
+        return {"affordance_ratio": share(scene.features.of["affordance"].touching, scene.features.touching)}
 
     def valid(self, surface: Surface, own: AffordanceGoal) -> Array:
         """Both regions have points."""
@@ -157,10 +156,6 @@ class Affordance(Constraint):
             return ["The affordance is overridden by the reference pose, which names its own contacts."]
         turned = "The heading came nearer to the avoid region and was turned towards the graspable region."
         return ["The affordance keeps the fingers off the avoid region.", *([turned] if redirected else [])]
-
-
-def _count(flags: Array) -> Array:
-    return jnp.sum(flags, -1).astype(jnp.float32)
 
 
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:

@@ -89,12 +89,7 @@ def sample_headings(
       H headings, float32; None if the graspable region cannot be approached.
     """
     avoid = obj.non_graspable_points & use_affordance
-    sources = np.flatnonzero(~avoid)
-    if len(sources) == 0:
-        sources = np.arange(len(avoid))
-    if along is not None:
-        facing = -obj.normals[sources] @ along
-        sources = sources[facing >= min(_FACING, facing.max())]
+    sources = _sources(obj, avoid, along)
     points = obj.points.astype(np.float32)
     found: list[Headings] = []
     total = 0
@@ -123,6 +118,17 @@ def sample_headings(
     pool = Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     chosen = np.resize(np.arange(len(pool.position)), count)
     return Headings(*(part[chosen].astype(np.float32) for part in pool))
+
+
+def _sources(obj: GraspObject, avoid: np.ndarray, along: np.ndarray | None) -> np.ndarray:
+    """Indices of the surface points that headings come to: outside of the avoid region, and facing what is given."""
+    sources = np.flatnonzero(~avoid)
+    if len(sources) == 0:
+        sources = np.arange(len(avoid))
+    if along is not None:
+        facing = -obj.normals[sources] @ along
+        sources = sources[facing >= min(_FACING, facing.max())]
+    return sources
 
 
 def _last_resort(
