@@ -78,7 +78,7 @@ class Attempts:
             self._worker = self._new_worker(obj, batch)
         self._worker.replace_objects([obj], None)
         self._worker.begin(conditions)
-        rollout = self._worker.collect(self._bundle.acting, self.steps, progress)
+        rollout = self._worker.collect(self._bundle.inference_parameters, self.steps, progress)
         names = metric_names(self._task)
         values = np.asarray(rollout.episodes)[:, : len(names)].T
         flags = (np.asarray(resolution.redirected), np.asarray(resolution.aligned))
@@ -95,6 +95,7 @@ class Attempts:
             self._worker.physics.close()
 
     def _new_worker(self, obj: GraspObject, batch: int) -> RolloutWorker:
+        """A worker of `batch` environments on this object, that acts by the mean and traces all of them."""
         layout = self._bundle.spec.layout
 
         def policy(parameters: Any, observation: Array, key: Array) -> tuple[Array, Array]:
@@ -102,5 +103,5 @@ class Attempts:
 
         physics = NativePhysics(self._hand, self._task, [obj], self._threads)
         return RolloutWorker(
-            self._hand, self._task, physics, None, policy, batch=batch, seed=0, half=False, traced=slice(None)
+            self._hand, self._task, physics, None, policy, batch=batch, seed=0, half_precision=False, traced=slice(None)
         )

@@ -156,12 +156,12 @@ def headings_of(
     """
     rng = np.random.default_rng(seed)
     inward, width = scale * INWARD, scale * MAX_WIDTH
-    whole, plus = (
+    whole, graspable = (
         given or sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width)
         for use in (False, True)
     )
-    assert whole is not None, "only O+ may be out of reach"
-    sets = [whole, plus or whole]
+    assert whole is not None, "only the graspable region may be out of reach"
+    sets = [whole, graspable or whole]
     reachable = np.array([[_reachable(task, headings, rest) for rest in obj.rest_poses] for headings in sets])
     if task.headings == "above" and reachable[0].any():
         steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
@@ -178,7 +178,7 @@ def headings_of(
     # Reference poses are made at headings that some resting pose allows, where there are any.
     chosen = [_some(rng, region.any(0)) for region in reachable]
     keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
-    minus = obj.non_graspable_points[keep]
+    avoid = obj.non_graspable_points[keep]
     floats = {
         "points": obj.points[keep],
         "rest": rest,
@@ -191,13 +191,14 @@ def headings_of(
     }
     return {
         **{name: value.astype(np.float32) for name, value in floats.items()},
-        "minus": minus,
+        "avoid": avoid,
         "heading_index": index.astype(np.int32),
-        "has_affordance": (plus is not None) & minus.any() & reachable[1].any(-1),
+        "has_affordance": (graspable is not None) & avoid.any() & reachable[1].any(-1),
     }
 
 
 def _reachable(task: TaskConfig, headings: Headings, rest: np.ndarray) -> np.ndarray:
+    """(H,) bool: headings that can be followed in a resting pose (7,), moved clear of the table where they must be."""
     return feasible(clear_table(headings, rest), rest, back_off=task.back_off)
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from actors import harvest, success
 from actors.harvest import Grasps
 from actors.initial import InitialConditions
-from actors.physics.engine import Physics, Readout, World, where_worlds
+from actors.physics.engine import Physics, PhysicsState, ResetState, where_environments
 from actors.success import Success
 from common.config import ControlConfig, RewardWeights, TaskConfig
 from common.hands.spec import Hand
@@ -24,6 +24,7 @@ from common.task.reward import reward_terms, terms
 from common.task.types import Action, Array, Goal, SceneState, Surface
 
 _FORCES = ("force_sum", "force_link_max")
+_DIVERGED = "bad"  # the metric's name on the wire and in recordings
 
 
 def metric_names(task: TaskConfig) -> tuple[str, ...]:
@@ -37,7 +38,7 @@ def metric_names(task: TaskConfig) -> tuple[str, ...]:
         "moved_at_removal",
         *(spec.name for spec in metrics.specs(task)),
         *_FORCES,
-        "bad",
+        _DIVERGED,
         *(f"mask_{name}" for name in blocks(task)),
         "object_index",
     )
@@ -62,7 +63,7 @@ class EnvState(NamedTuple):
     """The engine's state; None where the engine keeps it in place."""
     scene: tuple[Any, ...]
     """`SceneState` and `Features` after the step; empty inside of a loop around an engine that is not compiled."""
-    world: World
+    reset_state: ResetState
     """What the present episodes started from."""
     goal: Goal
     """Active constraints."""
@@ -103,8 +104,8 @@ class Transition(NamedTuple):
     """(B, terms) weighted reward terms."""
     errors: dict[str, tuple[Array, Array]]
     """Numerator and denominator (B,) of every error of the constraints."""
-    usage: Array
-    """(2,) occupancy of the engine's buffers, see `actors.physics.engine.Readout`."""
+    occupancy: Array
+    """(2,) occupancy of the engine's buffers, see `actors.physics.engine.PhysicsState`."""
 
 
 class GraspEnv:
@@ -123,45 +124,45 @@ class GraspEnv:
 
     def reset(self, initial: InitialConditions) -> EnvState:
         """Episodes that begin as they are told, in every environment."""
-        return self.state_of(initial, self.physics.start(initial.world))
+        return self.state_of(initial, self.physics.start(initial.reset_state))
 
     def state_of(self, initial: InitialConditions, physics: Any) -> EnvState:
-        """Episodes that have just begun in an engine that was started from their `world`."""
-        batch = initial.world.q.shape[0]
+        """Episodes that have just begun in an engine that was started from their `reset_state`."""
+        batch = initial.reset_state.q.shape[0]
         zero, no, index = jnp.zeros(batch), jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32)
-        world = initial.world
+        reset_state = initial.reset_state
         sums = {**metrics.empty_sums(self.task, batch), **dict.fromkeys(("return", *_FORCES), zero)}
         state = EnvState(
             physics=physics if self.physics.compiled else None,
             scene=(),
-            world=world,
+            reset_state=reset_state,
             goal=initial.goal,
             surface=initial.surface,
             region=initial.region,
             hold=initial.hold,
             time=index,
-            q_target=world.q,
+            q_target=reset_state.q,
             u_target=jnp.zeros((batch, 6)),
-            success=success.begin(world.object_position[:, 2]),
+            success=success.begin(reset_state.object_position[:, 2]),
             sums=sums,
             terms=jnp.zeros((batch, len(terms(self.task)))),
-            grasps=Grasps(no, index, index, world.q, world.base_position, world.base_quaternion),
+            grasps=Grasps(no, index, index, reset_state.q, reset_state.base_position, reset_state.base_quaternion),
             finished=jnp.zeros((batch, len(episode_fields(self.task)))),
             has_finished=no,
         )
-        return self.seen(state, self.physics.read(physics)) if self.physics.compiled else state
+        return self.with_scene(state, self.physics.read(physics)) if self.physics.compiled else state
 
     def restart(self, state: EnvState, mask: Array, initial: InitialConditions) -> EnvState:
         """New episodes in the masked environments (B,); the others go on, with their contacts."""
-        physics = self.physics.reset(state.physics, mask, initial.world)
+        physics = self.physics.reset(state.physics, mask, initial.reset_state)
         return self.merge(state, mask, self.state_of(initial, physics))
 
     def merge(self, state: EnvState, mask: Array, fresh: EnvState) -> EnvState:
         """`fresh` in the masked environments (B,), but for what is not of the episode; its engine is merged already."""
         kept: dict[str, Any] = {name: getattr(state, name) for name in ("grasps", "finished", "has_finished")}
-        scene = where_worlds(mask, fresh.scene, state.scene) if self.physics.compiled else ()
+        scene = where_environments(mask, fresh.scene, state.scene) if self.physics.compiled else ()
         apart: dict[str, Any] = {"physics": None, "scene": ()}
-        merged = where_worlds(mask, fresh._replace(**kept, **apart), state._replace(**apart))
+        merged = where_environments(mask, fresh._replace(**kept, **apart), state._replace(**apart))
         return merged._replace(physics=fresh.physics, scene=scene)
 
     def step(self, state: EnvState, action: Array, settings: Settings | None = None) -> tuple[EnvState, Transition]:
@@ -174,8 +175,8 @@ class GraspEnv:
         """
         settings = settings or self.settings
         target, joints, table = self.targets(state, action, settings)
-        physics, readout = self.physics.step(state.physics, joints, table)
-        return self.advance(state._replace(physics=physics), target, readout, settings)
+        physics, physics_state = self.physics.step(state.physics, joints, table)
+        return self.advance(state._replace(physics=physics), target, physics_state, settings)
 
     def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, Array, Array]:
         """Joint targets of an action; in the order of the engine (B, 6 + F); and (B,) bool where the table stands."""
@@ -183,25 +184,25 @@ class GraspEnv:
         return target, jnp.concatenate([target.u_target, target.q_target], -1), self.table_present(state)
 
     def advance(
-        self, state: EnvState, target: Action, readout: Readout, settings: Settings
+        self, state: EnvState, target: Action, physics_state: PhysicsState, settings: Settings
     ) -> tuple[EnvState, Transition]:
         """What follows from a control step that the engine has made.
 
         Args:
           state: before the step; its `physics` is after it already.
           target: the joint targets of the step.
-          readout: the engine after it.
+          physics_state: the engine after it.
           settings: see `step`.
         """
         task, had_table = self.task, self.table_present(state)
         state = state._replace(
             time=state.time + 1,
-            q_target=jnp.where(readout.bad[:, None], state.world.q, target.q_target),
-            u_target=jnp.where(readout.bad[:, None], 0.0, target.u_target),
+            q_target=jnp.where(physics_state.diverged[:, None], state.reset_state.q, target.q_target),
+            u_target=jnp.where(physics_state.diverged[:, None], 0.0, target.u_target),
         )
-        state = self.seen(state, readout)
+        state = self.with_scene(state, physics_state)
         scene = self.scene_of(state)
-        tracked, up = success.track(task, state.success, scene, readout.bad)
+        tracked, up = success.track(task, state.success, scene, physics_state.diverged)
         found = reward_terms(scene, settings.weights)
         found["drop"] = jnp.where(tracked.diverged, -settings.weights.drop, found["drop"])
         stacked = jnp.stack([found[name] for name in terms(task)], -1)
@@ -226,30 +227,30 @@ class GraspEnv:
             terminal |= (state.time >= task.approach_steps + task.hold_steps) & ~up
         finished = jnp.where(terminal[:, None], self._episode(state, up), state.finished)
         state = state._replace(finished=finished, has_finished=state.has_finished | terminal)
-        return state, Transition(reward, terminal, stacked, error, readout.usage)
+        return state, Transition(reward, terminal, stacked, error, physics_state.occupancy)
 
-    def seen(self, state: EnvState, readout: Readout) -> EnvState:
+    def with_scene(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
         """The environments with the scene that the engine shows."""
-        world = state.world
+        reset_state = state.reset_state
         scene = SceneState(
-            q=readout.q,
-            u=readout.u,
-            q_velocity=readout.q_velocity,
-            u_velocity=readout.u_velocity,
+            q=physics_state.q,
+            u=physics_state.u,
+            q_velocity=physics_state.q_velocity,
+            u_velocity=physics_state.u_velocity,
             q_target=state.q_target,
             u_target=state.u_target,
-            object_position=readout.object_position,
-            object_quaternion=readout.object_quaternion,
-            object_velocity=readout.object_velocity,
-            object_angular_velocity=readout.object_angular_velocity,
-            contact_force=readout.contact_force,
-            contact_position=readout.contact_position,
-            contact_found=readout.contact_found,
-            base_position=world.base_position,
-            base_quaternion=world.base_quaternion,
-            q_initial=world.q,
-            object_position_initial=world.object_position,
-            object_quaternion_initial=world.object_quaternion,
+            object_position=physics_state.object_position,
+            object_quaternion=physics_state.object_quaternion,
+            object_velocity=physics_state.object_velocity,
+            object_angular_velocity=physics_state.object_angular_velocity,
+            contact_force=physics_state.contact_force,
+            contact_position=physics_state.contact_position,
+            contact_found=physics_state.contact_found,
+            base_position=reset_state.base_position,
+            base_quaternion=reset_state.base_quaternion,
+            q_initial=reset_state.q,
+            object_position_initial=reset_state.object_position,
+            object_quaternion_initial=reset_state.object_quaternion,
             time=state.time.astype(jnp.float32),
             table=self.table_present(state),
         )
@@ -257,12 +258,12 @@ class GraspEnv:
 
     def scene_of(self, state: EnvState) -> Scene:
         """The present control step as the task's terms see it."""
-        scene, seen = state.scene
-        return Scene(self.hand, self.task, scene, seen, state.goal)
+        scene, features = state.scene
+        return Scene(self.hand, self.task, scene, features, state.goal)
 
     def table_present(self, state: EnvState) -> Array:
         """(B,) bool: whether the table stands in the coming control step."""
-        return (state.time < self.task.approach_steps) | state.world.stationary
+        return (state.time < self.task.approach_steps) | state.reset_state.stationary
 
     def _episode(self, state: EnvState, up: Array) -> Array:
         """(B, fields) metrics of the present episodes, as if they ended now."""
@@ -277,9 +278,9 @@ class GraspEnv:
             "moved_at_removal": known.moved_at_removal,
             **metrics.episode_errors(task, sums),
             **{name: sums[name] / after for name in _FORCES},
-            "bad": known.diverged,
+            _DIVERGED: known.diverged,
             **{f"mask_{name}": state.goal.active[name] for name in blocks(task)},
-            "object_index": state.world.object_index,
+            "object_index": state.reset_state.object_index,
         }
         columns = [jnp.asarray(values[name], jnp.float32) for name in metric_names(task)]
         return jnp.concatenate([jnp.stack(columns, -1), state.terms], -1)

@@ -1,4 +1,4 @@
-"""One world's episode as a message for logs, pictures and exports."""
+"""One environment's episode as a message for logs, pictures and exports."""
 
 import functools
 from typing import Any
@@ -35,8 +35,8 @@ def episode_message(
     Args:
       hand: the hand.
       task: its control step is written down.
-      trace: T steps of one world.
-      goal: that world's goal, without a batch axis.
+      trace: T steps of one environment.
+      goal: that environment's goal, without a batch axis.
       surface: its surface, without a batch axis.
       obj: its object.
       meta: further entries: version, actor, success, metrics.
@@ -63,7 +63,7 @@ def episode_message(
         **{f"goal/{name}": value for name, value in goal.flat().items()},
         **{f"active/{name}": value for name, value in goal.active.items()},
         "surface_points": surface.points,
-        "surface_minus": surface.minus,
+        "surface_minus": surface.avoid,
         **_geometry(obj),
     }
     return Message(
@@ -81,6 +81,7 @@ def _frames(hand: Hand, q: Array, wrist_position: Array, wrist_quaternion: Array
 
 
 def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
+    """The object's convex pieces and its mesh, as arrays of the message."""
     pieces = obj.pieces
     return {
         "piece_kind": np.array([PIECE_KINDS.index(piece.kind) for piece in pieces], np.int32),
@@ -94,4 +95,5 @@ def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
 
 
 def _plain(array: np.ndarray) -> np.ndarray:
+    """The array, in float32 instead of float64."""
     return array.astype(np.float32) if array.dtype == np.float64 else array

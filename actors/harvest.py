@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from actors.bank import make_references
-from actors.physics.engine import where_worlds
+from actors.physics.engine import where_environments
 from common import rotations
 from common.config import TaskConfig
 from common.hands.spec import Hand
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 
 class Grasps(NamedTuple):
-    """Final states of the grasps of a batch of worlds, in the object frame."""
+    """Final states of the grasps of a batch of environments, in the object frame."""
 
     found: Array
-    """(B,) bool: the world had a successful episode since its grasp was last taken."""
+    """(B,) bool: the environment had a successful episode since its grasp was last taken."""
     object_index: Array
     """(B,) int."""
     region: Array
@@ -59,8 +59,8 @@ def collect(
         scene.features.wrist_position,
         scene.features.wrist_quaternion,
     )
-    fresh = Grasps(now, state.world.object_index, state.region, scene.state.q, position, quaternion)
-    taken = where_worlds(now, fresh[1:], state.grasps[1:])
+    fresh = Grasps(now, state.reset_state.object_index, state.region, scene.state.q, position, quaternion)
+    taken = where_environments(now, fresh[1:], state.grasps[1:])
     return Grasps(state.grasps.found | now, *taken)
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from actors.physics.engine import World
+from actors.physics.engine import ResetState
 from common import rotations
 from common.config import TaskConfig
 from common.hands.spec import Hand
@@ -20,7 +20,7 @@ from common.task.types import Array, Goal, Surface
 class InitialConditions(NamedTuple):
     """B episodes that are about to begin."""
 
-    world: World
+    reset_state: ResetState
     """Object, hand and masses at the start."""
     goal: Goal
     """Active constraints, after the priority rules."""
@@ -72,11 +72,11 @@ def sample(
     order = jax.random.uniform(next(keys), draw.allowed.shape)
     draw = draw._replace(reference=jnp.argmax(jnp.where(draw.allowed, order, -1.0), -1))
     values = {c.name: c.sample(hand, draw, own_key(key, c.name, 1)) for c in known(task)}
-    surface = Surface(bank.points[objects], bank.minus[objects])
+    surface = Surface(bank.points[objects], bank.avoid[objects])
     goal = resolve(hand, surface, Goal(values, {}), asked).goal
     low, high = task.mass_range
     friction_low, friction_high = task.friction_range
-    world = start(
+    reset_state = start(
         hand,
         task,
         goal,
@@ -89,7 +89,7 @@ def sample(
     # Squared, so that short holds, whose beginning every episode shares, stay the rule.
     longer = jnp.floor(uniform() ** 2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
     hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
-    return InitialConditions(world, goal, surface, draw.region, hold)
+    return InitialConditions(reset_state, goal, surface, draw.region, hold)
 
 
 def own_key(key: Array, name: str, stage: int) -> Array:
@@ -109,7 +109,7 @@ def given(hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int) -
     resolution = resolve(hand, request.surface, request.goal, request.asked)
     batch = request.rest.shape[0]
     nominal, index = jnp.ones(batch), jnp.zeros(batch, jnp.int32)
-    world = start(
+    reset_state = start(
         hand,
         task,
         resolution.goal,
@@ -119,7 +119,7 @@ def given(hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int) -
         friction=nominal,
         stationary=jnp.zeros(batch, bool),
     )
-    initial = InitialConditions(world, resolution.goal, request.surface, index, jnp.full(batch, hold, jnp.int32))
+    initial = InitialConditions(reset_state, resolution.goal, request.surface, index, jnp.full(batch, hold, jnp.int32))
     return initial, resolution
 
 
@@ -133,10 +133,10 @@ def start(
     mass_scale: Array,
     friction: Array,
     stationary: Array,
-) -> World:
+) -> ResetState:
     """The hand where its constraints let it begin, beside the objects in their resting poses (B, 7)."""
     q, base_position, base_quaternion = initial_hand(hand, task, goal, rest)
-    return World(
+    return ResetState(
         object_index=objects,
         mass_scale=mass_scale,
         friction=friction,

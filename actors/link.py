@@ -252,9 +252,11 @@ class ActorLink:
         self.close()
 
     def _identity(self, ticket: str) -> dict[str, Any]:
+        """Who asks, and by which ticket: meta entries of the actor's requests."""
         return {"actor": self.actor, "incarnation": self.incarnation, "ticket": ticket}
 
     def _check(self) -> None:
+        """Raises what stops the link: a failure of the uploads, the end of the run, or its own closing."""
         if self._uploads.failure:
             raise self._uploads.failure
         if self._finished:
@@ -301,9 +303,11 @@ class ActorLink:
                     raise
 
     def _write(self, **entry: Any) -> None:
+        """Writes an entry into the journal, if there is one."""
         if self._journal is not None:
             self._journal.write(**entry)
 
 
 def _restarted(before: str, now: Any) -> RunRestarted:
+    """The error of a run id that is another than before."""
     return RunRestarted(f"The learner began another training (run id {now} after {before}).", "The actor starts over.")

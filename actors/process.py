@@ -1,4 +1,4 @@
-"""The actor process: pulls weights, steps worlds, uploads rollouts, until the run ends."""
+"""The actor process: pulls weights, steps environments, uploads rollouts, until the run ends."""
 
 import functools
 import threading
@@ -15,7 +15,8 @@ from actors.episode import episode_message
 from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes
-from common.config import PhysicsName, RunConfig, run_config_from_json
+from common.config import RunConfig, run_config_from_json
+from common.engines import PhysicsName
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.journal import Journal
@@ -75,8 +76,8 @@ def run_actor(
                 continue
 
 
-def first_worlds(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:
-    """The arrays of the first `count` worlds of a rollout."""
+def first_environments(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:
+    """The arrays of the first `count` environments of a rollout."""
     return {
         name: np.asarray(array[(slice(None),) * RECORDED[name].worlds_axis + (slice(count),)])
         for name, array in arrays.items()
@@ -84,7 +85,7 @@ def first_worlds(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:
 
 
 class _Actor:
-    """Worlds, policy and counters of one actor."""
+    """Environments, policy and counters of one actor."""
 
     def __init__(
         self,
@@ -117,7 +118,7 @@ class _Actor:
             batch=config.environments,
             # Another incarnation must not repeat the episodes of the one that it replaces.
             seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
-            half=config.half_observations,
+            half_precision=config.half_observations,
         )
         self._on_rollout = on_rollout
         self._bundle: PolicyBundle | None = None
@@ -152,11 +153,12 @@ class _Actor:
                 self._link.give_back(ticket)
         assert self._bundle is not None
         self._configure(self._bundle.version)
-        for _ in range(2):  # the second time, worlds have been restarted, which is traced apart
-            self._worker.collect(self._bundle.acting, self._config.rollout_steps)
+        for _ in range(2):  # the second time, environments have been restarted, which is traced apart
+            self._worker.collect(self._bundle.inference_parameters, self._config.rollout_steps)
             self._worker.restart()
 
     def _configure(self, version: int) -> None:
+        """Sets the curriculum's weights and phase under the policy of this version."""
         config = self._config
         self._worker.configure(
             config.curriculum.weights(config.task.reward, version), stationary=config.curriculum.stationary(version)
@@ -172,11 +174,12 @@ class _Actor:
         return self._bundle is not None
 
     def _rollout(self, bundle: PolicyBundle, ticket: Ticket, since: "_Since") -> None:
+        """Makes a rollout under a ticket and hands it over, with metrics and logs."""
         config, before = self._config, self._worker.state
         began = time.monotonic()
         self._configure(bundle.version)
         started_fresh = before is not None and bool(np.asarray(before.time)[0] == 0)
-        rollout = self._worker.collect(bundle.acting, config.rollout_steps)
+        rollout = self._worker.collect(bundle.inference_parameters, config.rollout_steps)
         steps = config.rollout_steps * config.environments
         taken = {name: getattr(rollout, name) for name in self._arrays}
         episodes, left_out = countable(finished_episodes(rollout, config.task))
@@ -193,7 +196,7 @@ class _Actor:
             "share/transport": (began - since.granted + ended - collected) / (ended - since.asked),
             "rollouts": self._rollouts + 1.0,
             "episodes_left_out": float(left_out),
-            **physics_usage(np.asarray(rollout.usage)),
+            **buffer_occupancy(np.asarray(rollout.occupancy)),
         }
         self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
         self._on_rollout({"version": float(bundle.version), **values})
@@ -205,7 +208,7 @@ class _Actor:
         self._rollouts += 1
 
     def _sampled(self, bundle: PolicyBundle, arrays: dict[str, Array]) -> Message:
-        """A rollout's first worlds, with what a reader needs to take the arrays apart."""
+        """A rollout's first environments, with what a reader needs to take the arrays apart."""
         meta = {
             "time": time.time(),
             "version": bundle.version,
@@ -216,15 +219,15 @@ class _Actor:
             "layout": [[name, size] for name, size in self._spec.layout],
             "environments": self._config.environments,
         }
-        return Message(first_worlds(arrays, self._config.log_rollout_worlds or self._config.environments), meta)
+        return Message(first_environments(arrays, self._config.log_rollout_worlds or self._config.environments), meta)
 
-    def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, begun: EnvState) -> None:
-        """World 0's episode, from the rollout that it began in."""
+    def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, first_state: EnvState) -> None:
+        """Environment 0's episode, from the rollout that it began in."""
         episodes = dict(zip(episode_fields(self._config.task), np.asarray(rollout.episodes)[0], strict=True))
         metrics = {name.removeprefix("episode/"): float(v) for name, v in episodes.items() if "episode/" in name}
-        surface = Surface(*(np.asarray(field)[0] for field in begun.surface))
-        obj = self._objects[int(np.asarray(begun.world.object_index)[0])]
-        goal = begun.goal.row(0)
+        surface = Surface(*(np.asarray(field)[0] for field in first_state.surface))
+        obj = self._objects[int(np.asarray(first_state.reset_state.object_index)[0])]
+        goal = first_state.goal.row(0)
         meta = {
             "time": time.time(),
             "version": bundle.version,
@@ -236,13 +239,14 @@ class _Actor:
         self._publish("episode", message)
 
     def _publish(self, kind: str, message: Message) -> None:
+        """Publishes a message for logs under this actor's name."""
         # JSON has no NaN: one such number would cost the whole message.
         message = Message(message.arrays, finite(message.meta))
         self._transport.publish(self._link.keys.log(kind, "actor", self._link.actor), message)
 
 
 class _Since(NamedTuple):
-    """Moments of one rollout, on the monotonic clock."""
+    """Times of one rollout, on the monotonic clock."""
 
     asked: float
     """The actor began to ask for a ticket."""
@@ -250,11 +254,11 @@ class _Since(NamedTuple):
     """It had one, and goes on to take the newest weights."""
 
 
-def physics_usage(usage: np.ndarray) -> dict[str, float]:
-    """Metrics of `Rollout.usage`: steps in which the engine had no room for some contacts or rows, and the fullest."""
-    contacts, rows = usage.max(0)
+def buffer_occupancy(occupancy: np.ndarray) -> dict[str, float]:
+    """Metrics of `Rollout.occupancy`: steps in which the engine had no room for contacts or rows, and the fullest."""
+    contacts, rows = occupancy.max(0)
     return {
-        "overflow": float((usage > 1.0).any(-1).sum()),
+        "overflow": float((occupancy > 1.0).any(-1).sum()),
         "contacts_peak": float(contacts),
         "rows_peak": float(rows),
     }

@@ -14,7 +14,7 @@ import numpy as np
 from actors import harvest, initial
 from actors.env import EnvState, GraspEnv, Settings, Transition, episode_fields
 from actors.initial import InitialConditions
-from actors.physics.engine import Physics, Readout
+from actors.physics.engine import Physics, PhysicsState
 from common.config import RewardWeights, TaskConfig
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
@@ -65,8 +65,8 @@ class Rollout(NamedTuple):
     """(T, B)."""
     terminal: Array
     """(T, B) bool."""
-    usage: Array
-    """(T, 2), see `actors.physics.engine.Readout`."""
+    occupancy: Array
+    """(T, 2), see `actors.physics.engine.PhysicsState`."""
     last_observation: Array
     """(B, D)."""
     episodes: Array
@@ -102,7 +102,7 @@ class RolloutWorker:
         *,
         batch: int,
         seed: int,
-        half: bool,
+        half_precision: bool,
         probe: Probe = lambda scene: None,
         traced: int | slice = 0,
     ):
@@ -116,24 +116,22 @@ class RolloutWorker:
           policy: a pure function; parameters are given at each rollout.
           batch: B, number of environments.
           seed: seed of episodes and actions.
-          half: observations are rounded to half precision, for the policy as well as for the learner.
+          half_precision: observations are rounded to half precision, for the policy as well as for the learner.
           probe: what else to keep of every step.
           traced: of which environments a trace is kept.
         """
         self.physics, self.env = physics, GraspEnv(hand, task, physics)
         self._hand, self._task, self._bank, self._policy = hand, task, bank, policy
         self._probe, self._traced, self.batch = probe, traced, batch
-        self._dtype = jnp.float16 if half else jnp.float32
+        self._dtype = jnp.float16 if half_precision else jnp.float32
         self._settings, self._stationary = self.env.settings, np.array(False)
         self._episode_key, self._key = jax.random.split(jax.random.key(seed))
         self._sample_jit = jax.jit(self._sample)
         self._begin_jit = jax.jit(self.env.state_of)
         self._decide_jit = jax.jit(self._decide)
         self._advance_jit = jax.jit(self._advance)
-        self._merge_jit = jax.jit(
-            lambda state, mask, fresh: self.env.merge(state, mask, self.env.state_of(fresh, None))
-        )
-        self._seen_jit = jax.jit(self.env.seen)
+        self._merge_jit = jax.jit(self._merge)
+        self._with_scene_jit = jax.jit(self.env.with_scene)
         self._scan_jit = jax.jit(self._scan, static_argnames="steps")
         self.state: EnvState | None = None
         if bank is not None:
@@ -159,14 +157,14 @@ class RolloutWorker:
     def begin(self, conditions: InitialConditions) -> None:
         """Goes on with these episodes, which are about to begin, one for each environment."""
         if self.state is None:
-            physics = self.physics.start(conditions.world)
+            physics = self.physics.start(conditions.reset_state)
         else:
             everywhere = np.ones(self.batch, bool)
-            physics = self.physics.reset(self.state.physics, everywhere, conditions.world)
+            physics = self.physics.reset(self.state.physics, everywhere, conditions.reset_state)
         kept = self.state
         self.state = self._begin_jit(conditions, physics if self.physics.compiled else None)
         if not self.physics.compiled:
-            self.state = self._seen_jit(self.state._replace(scene=()), self.physics.read(None))
+            self.state = self._with_scene_jit(self.state._replace(scene=()), self.physics.read(None))
         if kept is not None:
             self.state = self.state._replace(grasps=kept.grasps)
 
@@ -188,6 +186,7 @@ class RolloutWorker:
         self._forget_grasps()
 
     def _forget_grasps(self) -> None:
+        """Marks the grasps as taken."""
         assert self.state is not None
         grasps = self.state.grasps
         self.state = self.state._replace(grasps=grasps._replace(found=jnp.zeros_like(grasps.found)))
@@ -208,20 +207,25 @@ class RolloutWorker:
         return self._collect_stepwise(parameters, key, steps, progress)
 
     def _sample(self, bank: ConstraintBank, key: Array, stationary: Array) -> InitialConditions:
+        """Fresh episodes for all environments, drawn from the bank."""
         return initial.sample(self._hand, self._task, bank, key, self.batch, stationary)
 
     def _merge(self, state: EnvState, mask: Array, fresh: InitialConditions) -> EnvState:
+        """Fresh episodes in the masked environments (B,), whose engine was reset apart."""
         return self.env.merge(state, mask, self.env.state_of(fresh, None))
 
     def _observe(self, state: EnvState) -> Array:
+        """(B, D) observation, in the precision that the learner gets."""
         return observe(self.env.scene_of(state)).astype(self._dtype)
 
     def _decide(self, parameters: Any, settings: Settings, state: EnvState, key: Array) -> _Decision:
+        """Observation, action and joint targets of the coming step."""
         observation = self._observe(state)
         action, log_probability = self._policy(parameters, observation.astype(jnp.float32), key)
         return _Decision(observation, action, log_probability, *self.env.targets(state, action, settings))
 
     def _kept(self, state: EnvState, action: Array, transition: Transition) -> tuple[Trace, Any]:
+        """What trace and probe keep of a step."""
         return _traced(state, action, transition, self._task, self._traced), self._probe(self.env.scene_of(state))
 
     def _advance(
@@ -229,7 +233,7 @@ class RolloutWorker:
         parameters: Any,
         settings: Settings,
         state: EnvState,
-        readout: Readout,
+        physics_state: PhysicsState,
         decision: _Decision,
         keys: Array,
         step: Array,
@@ -238,7 +242,7 @@ class RolloutWorker:
 
         Of the state only what changed is returned, because every array that passes through a call has its price.
         """
-        after, transition = self.env.advance(state, decision.target, readout, settings)
+        after, transition = self.env.advance(state, decision.target, physics_state, settings)
         kept = self._kept(after, decision.action, transition)
         following = self._decide(parameters, settings, after, jax.random.wrap_key_data(keys[step]))
         changed = {name: new for name, new in after._asdict().items() if new is not getattr(state, name)}
@@ -246,6 +250,7 @@ class RolloutWorker:
         return changed, transition, kept, following
 
     def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
+        """A rollout with an engine that JAX cannot trace; see `collect`."""
         # One key more than there are steps: what is decided after the last one only yields `last_observation`.
         keys = jax.random.split(key, steps + 1)
         key_data = jax.random.key_data(keys)
@@ -255,29 +260,32 @@ class RolloutWorker:
         state = self.state._replace(scene=())
         rows, extras = [], []
         for step in range(1, steps + 1):
-            _, readout = self.physics.step(None, np.asarray(decision.joints), np.asarray(decision.table))
+            _, physics_state = self.physics.step(None, np.asarray(decision.joints), np.asarray(decision.table))
             row = decision[:3]
             changed, transition, kept, decision = self._advance_jit(
-                parameters, settings, state, readout, decision, key_data, step
+                parameters, settings, state, physics_state, decision, key_data, step
             )
             state = state._replace(**changed)
-            rows.append((*row, transition.reward, transition.terminal, transition.usage))
+            rows.append((*row, transition.reward, transition.terminal, transition.occupancy))
             extras.append(kept)
             if self._bank is not None and np.asarray(transition.terminal).any():
                 self._episode_key, episode_key = jax.random.split(self._episode_key)
                 fresh = self._sample_jit(self._bank, episode_key, self._stationary)
-                self.physics.reset(None, transition.terminal, fresh.world)
+                self.physics.reset(None, transition.terminal, fresh.reset_state)
                 state = self._merge_jit(state, transition.terminal, fresh)
-                readout = self.physics.read(None)
-                decision = self._decide_jit(parameters, settings, self._seen_jit(state, readout), keys[step])
+                physics_state = self.physics.read(None)
+                decision = self._decide_jit(
+                    parameters, settings, self._with_scene_jit(state, physics_state), keys[step]
+                )
             progress(step)
-        self.state = self._seen_jit(state, readout)
+        self.state = self._with_scene_jit(state, physics_state)
         columns = [np.stack(column) for column in zip(*rows, strict=True)]
         trace, probed = jax.tree.map(lambda *x: np.stack(x), *extras)
         finished = self.state.finished, self.state.has_finished
         return Rollout(*(*columns, decision.observation, *finished, trace, probed))
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
+        """A rollout as one program; see `collect`."""
         # Committed to the device, whether they were there already or not: anything else would compile once more.
         parameters, bank, carry = jax.device_put(
             (parameters, self._bank, (self.state, self._episode_key)), jax.local_devices()[0]
@@ -297,6 +305,8 @@ class RolloutWorker:
         key: Array,
         steps: int,
     ) -> tuple[tuple[EnvState, Array], Rollout]:
+        """`steps` control steps and the fresh episodes where some end; traced."""
+
         def renew(operand: Any) -> Any:
             state, episode_key, terminal = operand
             episode_key, own = jax.random.split(episode_key)
@@ -313,7 +323,7 @@ class RolloutWorker:
             if bank is not None:
                 ended = jnp.any(transition.terminal)
                 carry = jax.lax.cond(ended, renew, lambda x: x[:2], (*carry, transition.terminal))
-            row = (observation, action, log_probability, transition.reward, transition.terminal, transition.usage)
+            row = (observation, action, log_probability, transition.reward, transition.terminal, transition.occupancy)
             return carry, (*row, kept)
 
         carry, (*columns, (trace, probed)) = jax.lax.scan(body, carry, jax.random.split(key, steps))

@@ -25,6 +25,8 @@ _SLOWEST = 100e3  # bytes a second of a link that is waited for
 
 
 class _Upload(NamedTuple):
+    """A rollout in the queue."""
+
     message: Message
     outcome: "Future[Outcome] | None"
     """None for one that is sent again."""
@@ -131,6 +133,7 @@ class Uploads:
         self._queue.put(None)
 
     def _send_all(self) -> None:
+        """Sends rollouts from the queue until it is closed; one thread of `window`."""
         while (upload := self._queue.get()) is not None:
             outcome = upload.outcome or Future[Outcome]()
             try:
@@ -189,6 +192,7 @@ class Uploads:
         raise TransportError("The link was closed before the rollout was acknowledged.")
 
     def _refused(self, why: str) -> Outcome:
+        """Counts a refusal; too many in a row are the failure of the uploads."""
         self._refusals += 1
         if self._refusals >= self._max_refusals:
             self.failure = CongraspError(

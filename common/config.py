@@ -11,51 +11,31 @@ from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import dacite
+import jax
 from typing_extensions import Doc
 
+from common.engines import PhysicsName
 from common.errors import CongraspError
 from common.task.constraints import CONSTRAINTS, PAPER
+from common.task.reward import GRASP
 
-PhysicsName = Literal["auto", "warp", "jax", "native"]
 MetricWriter = Literal["tensorboard", "wandb", "wandb-offline"]
 """Where else a learner's metrics are written, beside the recordings."""
 
 
-@dataclasses.dataclass(frozen=True)
-class GraspWeights:
-    """Weights of the grasp reward's terms, all in units of reward per control step (paper, section Reward Function)."""
-
-    distance: float = 0.3
-    """w_dis: per metre of the weighted distance from the hand's keypoints to the object's surface (0.3 m at most)."""
-    contact: float = 1.0
-    """w_c: for all links in contact (shared out by the links' contact weights, which sum to one)."""
-    force: float = 0.5
-    """w_f: for all links pressing with `force_max` or more."""
-    force_max: float = 5.0
-    """f_max, N per link: force beyond it earns nothing."""
-    force_excess: float = 0.01
-    """Penalty per newton above `force_max`, per link (ours: the paper only clamps, and hands then squeeze hard)."""
-    object_position: float = 20.0
-    """w_o: per square metre of the object's displacement (clipped at 0.04 m^2)."""
-    object_rotation: float = 0.1
-    """w_R: per square radian of the object's rotation (clipped at 1 rad^2)."""
-    wrist_velocity: float = 0.01
-    """w_u: per squared velocity of the six wrist joints (m/s and rad/s)."""
-    finger_deviation: float = 0.002
-    """w_q of the regulariser: per squared radian from the initial finger pose."""
-    drop: float = 1.0
-    """w_drop: per step with the object fallen."""
+def _declared(fields: Iterable[tuple[str, float, str]]) -> Any:
+    """A frozen dataclass of numbers that are declared elsewhere: name, default, and the text that documents them."""
+    made = [(name, Annotated[float, Doc(text)], dataclasses.field(default=value)) for name, value, text in fields]
+    return dataclasses.make_dataclass("Declared", made, frozen=True)
 
 
-def _declared(base: type, fields: Iterable[tuple[str, float, str]]) -> Any:
-    """A frozen dataclass with numbers that constraints declare, documented as other fields are."""
-    made = [(field, Annotated[float, Doc(said)], dataclasses.field(default=value)) for field, value, said in fields]
-    return dataclasses.make_dataclass("Declared", made, bases=(base,), frozen=True)
-
-
-_Weights: Any = _declared(GraspWeights, (weight for constraint in CONSTRAINTS for weight in constraint.weights))
+_Weights: Any = _declared(
+    (
+        *(term[:3] for term in GRASP),
+        *(weight for constraint in CONSTRAINTS for weight in constraint.weights),
+    )
+)
 _Shares: Any = _declared(
-    object,
     (
         (f"p_{c.name}", 0.5, f"Probability that an episode has the constraint '{c.name}', where the object allows it.")
         for c in CONSTRAINTS
@@ -64,9 +44,10 @@ _Shares: Any = _declared(
 )
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RewardWeights(_Weights):
-    """Weights of all terms of the reward: the grasp's, and those that each constraint declares."""
+    """Weights of all terms of the reward, in units of reward per control step: the grasp's, and each constraint's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +95,7 @@ class TaskConfig(_Shares):
     hand_table_collision: bool = False
     """Whether the hand collides with the table."""
     hand_self_collision: bool = False
-    """Whether the hand's links collide with one another (slower; the shipped policy learnt without)."""
+    """Whether the hand's links collide with one another (slower; the pretrained policies learnt without)."""
     back_off: float = 0.15
     """Metres from the aligned wrist to its start, against the heading direction."""
     surface_points: int = 256

@@ -1,4 +1,4 @@
-"""Work that is spread over processes when there is enough of it to pay for starting them."""
+"""Work that is divided among processes when there is enough of it to pay for starting them."""
 
 import multiprocessing
 import os
@@ -35,6 +35,7 @@ def _prepare_worker() -> None:
     assert parent is not None
 
     def wait() -> None:
+        """Ends this process after its parent."""
         parent.join()
         os._exit(1)
 

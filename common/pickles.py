@@ -210,12 +210,14 @@ def _since_mark(stack: list[Any]) -> list[Any]:
 
 
 def _of(kind: type, stack: list[Any]) -> Any:
+    """The top of the stack, which must be of this type."""
     if not isinstance(stack[-1], kind):
         raise _Refused("is damaged")
     return stack[-1]
 
 
 def _known(name: str, known: set[str]) -> _Name:
+    """A name that stands for an array or a part of one."""
     if name not in known:
         raise _Refused(f"names {name[:80]!r}, which stands for no array")
     return _Name(name)
@@ -229,6 +231,7 @@ class _Plain:
         self._done: dict[int, Any] = {}
 
     def __call__(self, value: Any) -> Any:
+        """The plain value; the same for the same object."""
         if not isinstance(value, (list, tuple, dict, _Made)):
             return None if isinstance(value, _Name) else value
         key = id(value)
@@ -240,6 +243,7 @@ class _Plain:
         return self._done[key]
 
     def _turned(self, value: Any) -> Any:
+        """One value, for the first time."""
         if isinstance(value, (list, tuple)):
             return type(value)(self(item) for item in value)
         if isinstance(value, dict):
@@ -288,6 +292,7 @@ class _Plain:
 
 
 def _bytes(data: Any) -> bytes:
+    """Bytes that older protocols write as Latin-1 text."""
     return data.encode("latin-1") if isinstance(data, str) else bytes(data)
 
 

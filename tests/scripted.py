@@ -52,7 +52,7 @@ def grasps(
         close(hand, task, firmness),
         batch=batch,
         seed=seed,
-        half=False,
+        half_precision=False,
     )
     rollout = worker.collect(None, task.approach_steps + task.hold_steps_max)
     physics.close()

@@ -1,51 +1,86 @@
-"""Physics engines behind one interface; `make_physics` chooses."""
+"""Physics engines behind one interface: the project's own are registered here; `make_physics` builds one by name."""
 
 import importlib.util
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 
 from actors.physics.engine import Physics
-from common.config import PhysicsName, TaskConfig
+from common.config import TaskConfig
+from common.engines import ENGINES, Engine, PhysicsName
 from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 
+_NVIDIA = ("gpu", "cuda")
 
-def resolve_physics(name: PhysicsName) -> PhysicsName:
-    """`auto` becomes `warp` on an NVIDIA GPU, `native` on a CPU and `jax` elsewhere.
 
-    Raises:
-      CongraspError: `warp` is demanded where there is no NVIDIA GPU, or is not installed.
-    """
-    backend = jax.default_backend()
-    if name == "auto":
-        if backend == "cpu":
-            return "native"
-        return "warp" if backend in ("gpu", "cuda") else "jax"
-    if name == "warp" and backend not in ("gpu", "cuda"):
-        raise CongraspError(
+def _make_warp(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int) -> Physics:
+    """MuJoCo Warp; has no use for threads."""
+    from actors.physics.warp import WarpPhysics
+
+    return WarpPhysics(hand, task, objects)
+
+
+def _make_jax(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int) -> Physics:
+    """MJX-JAX; has no use for threads."""
+    from actors.physics.mjx import MjxPhysics
+
+    return MjxPhysics(hand, task, objects)
+
+
+def _make_native(*arguments: Any) -> Physics:
+    """MuJoCo C on threads."""
+    from actors.physics.native import NativePhysics
+
+    return NativePhysics(*arguments)
+
+
+def _missing_warp(backend: str) -> CongraspError | None:
+    """An NVIDIA GPU, or the package."""
+    if backend not in _NVIDIA:
+        return CongraspError(
             "The 'warp' engine needs an NVIDIA GPU, and JAX sees none.",
             "Install the 'cuda' extra and look at 'congrasp doctor', or choose --physics native.",
         )
-    if name == "warp" and importlib.util.find_spec("warp") is None:
-        raise CongraspError("The 'warp' engine is not installed.", "Run: pip install 'congrasp[cuda]'.")
+    if importlib.util.find_spec("warp") is None:
+        return CongraspError("The 'warp' engine is not installed.", "Run: pip install 'congrasp[cuda]'.")
+    return None
+
+
+ENGINES["warp"] = Engine(_make_warp, 4096, lambda backend: backend in _NVIDIA, _missing_warp, on_device=True)
+ENGINES["jax"] = Engine(_make_jax, 256, lambda backend: backend not in ("cpu", *_NVIDIA))
+ENGINES["native"] = Engine(_make_native, 64, lambda backend: backend == "cpu")
+
+
+def resolve_physics(name: PhysicsName, backend: str = "") -> PhysicsName:
+    """The engine of a name; `auto` is `warp` on an NVIDIA GPU, `native` on a CPU and `jax` elsewhere.
+
+    Args:
+      name: `auto` or a key of `ENGINES`.
+      backend: JAX's name of the hardware; this process's own by default.
+
+    Raises:
+      CongraspError: there is no such engine, or this machine lacks what it needs.
+    """
+    backend = backend or jax.default_backend()
+    if name == "auto":
+        name = next(key for key, engine in ENGINES.items() if engine.automatic(backend))
+    if name not in ENGINES:
+        raise CongraspError(f"There is no physics engine '{name}'.", f"Choose from: {', '.join(('auto', *ENGINES))}.")
+    if missing := ENGINES[name].missing(backend):
+        raise missing
     return name
 
 
 def make_physics(
     name: PhysicsName, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], *, threads: int
 ) -> Physics:
-    """An engine with a pool of objects; `threads` counts for `native` only."""
-    chosen = resolve_physics(name)
-    if chosen == "native":
-        from actors.physics.native import NativePhysics
+    """An engine with a pool of objects; `threads` counts for those that step on the CPU.
 
-        return NativePhysics(hand, task, objects, threads)
-    if chosen == "warp":
-        from actors.physics.warp import WarpPhysics
-
-        return WarpPhysics(hand, task, objects)
-    from actors.physics.mjx import MjxPhysics
-
-    return MjxPhysics(hand, task, objects)
+    Raises:
+      CongraspError: see `resolve_physics`.
+    """
+    physics: Physics = ENGINES[resolve_physics(name)].make(hand, task, objects, threads)
+    return physics

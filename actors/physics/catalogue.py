@@ -1,4 +1,4 @@
-"""Any number of objects for worlds of one model: each is a row of arrays, whose meshes are numbers of shared meshes."""
+"""Any number of objects for environments of one model: a row of arrays each, whose meshes index shared meshes."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _BODY_FIELDS = ("body_mass", "body_inertia", "body_iquat", "body_subtreemass", "
 
 
 class Catalogue:
-    """The model that worlds share, and objects as rows that fill its slots."""
+    """The model that environments share, and objects as rows that fill its slots."""
 
     def __init__(self, hand: Hand, task: TaskConfig, example: GraspObject, mesh_slots: int):
         """Compiles the model.
@@ -28,7 +28,7 @@ class Catalogue:
         Args:
           hand: the hand.
           task: timing and collision settings.
-          example: any object; the rows of others take its place in every world.
+          example: any object; the rows of others take its place in every environment.
           mesh_slots: most mesh pieces of an object.
         """
         spec = scene_spec(hand, task)
@@ -63,7 +63,7 @@ class Catalogue:
             count = sum(piece.kind == "mesh" for piece in obj.pieces)
             if count > len(self._meshes):
                 raise CongraspError(
-                    f"The object '{obj.name}' has {count} mesh pieces, and the worlds have room for"
+                    f"The object '{obj.name}' has {count} mesh pieces, and the environments have room for"
                     f" {len(self._meshes)}.",
                     "Import it with fewer pieces.",
                 )
@@ -89,6 +89,7 @@ class Catalogue:
         return first + count
 
     def _row(self) -> dict[str, np.ndarray]:
+        """The present object's values of the fields that differ between objects."""
         model, body = self.model, self._body
         row = {name: getattr(model, name)[self.geoms].copy() for name in _SLOT_FIELDS}
         row |= {name: getattr(model, name)[body].copy() for name in _BODY_FIELDS}

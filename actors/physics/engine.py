@@ -1,4 +1,4 @@
-"""What every physics engine offers: a batch of worlds with one hand and one object each.
+"""What every physics engine offers: a batch of environments with one hand and one object each.
 
 `warp` and `jax` are pure functions over pytrees that are traced into a compiled rollout; `native` steps MuJoCo C on
 threads and keeps its state in place. Both go through the same three calls.
@@ -14,8 +14,8 @@ from common.objects.spec import GraspObject
 from common.task.types import Array
 
 
-class World(NamedTuple):
-    """What an episode starts from, for a batch of worlds B; world frame."""
+class ResetState(NamedTuple):
+    """What an episode starts from, for a batch of environments B; world frame."""
 
     object_index: Array
     """(B,) int, index into the engine's objects."""
@@ -37,8 +37,8 @@ class World(NamedTuple):
     """(B,) bool: the object is welded to where it is."""
 
 
-class Readout(NamedTuple):
-    """State of the worlds after a control step; see `common.task.types.SceneState` for shapes and frames."""
+class PhysicsState(NamedTuple):
+    """State of the environments after a control step; see `common.task.types.SceneState` for shapes and frames."""
 
     q: Array
     u: Array
@@ -51,41 +51,41 @@ class Readout(NamedTuple):
     contact_force: Array
     contact_position: Array
     contact_found: Array
-    bad: Array
-    """(B,) bool: the world diverged in this step (`readout.diverged`) and was put back to its start."""
-    usage: Array
-    """(2,) contacts and constraint rows at the step's fullest moment, as shares of what the engine has room for: what
+    diverged: Array
+    """(B,) bool: the environment diverged in this step (`has_diverged`) and was put back to its start."""
+    occupancy: Array
+    """(2,) contacts and constraint rows in the step's fullest substep, as shares of what the engine has room for: what
     is beyond 1 was left out of the simulation. Zero where room is made as it is needed."""
 
 
 class Physics(Protocol):
-    """A batch of worlds. `state` is a pytree for compiled engines and an opaque handle for `native`."""
+    """A batch of environments. `state` is a pytree for compiled engines and an opaque handle for `native`."""
 
     name: str
     compiled: bool
     """Whether the calls can be traced by JAX."""
 
-    def start(self, world: World) -> Any:
-        """State of fresh worlds."""
+    def start(self, reset_state: ResetState) -> Any:
+        """State of fresh environments."""
 
-    def reset(self, state: Any, mask: Array, world: World) -> Any:
-        """Worlds where mask (B,) is true start anew from `world`; the others go on."""
+    def reset(self, state: Any, mask: Array, reset_state: ResetState) -> Any:
+        """Environments where mask (B,) is true start anew from `reset_state`; the others go on."""
 
-    def step(self, state: Any, target: Array, table: Array) -> tuple[Any, Readout]:
+    def step(self, state: Any, target: Array, table: Array) -> tuple[Any, PhysicsState]:
         """One control step with joint targets (B, 6 + F), wrist first; table (B,) says where the table stands."""
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> Any:
-        """Other objects, as many as before, for the worlds that start anew from now on; present ones go on."""
+        """Other objects, as many as before, for the environments that start anew from now on; present ones go on."""
 
-    def read(self, state: Any) -> Readout:
-        """The worlds as they are, without contacts after a reset."""
+    def read(self, state: Any) -> PhysicsState:
+        """The environments as they are, without contacts after a reset."""
 
     def close(self) -> None:
         """Releases threads and memory; safe to call twice."""
 
 
-def where_worlds(mask: Array, new: Any, old: Any) -> Any:
-    """Arrays (B, ...) of `new` in the masked worlds (B,), those of `old` elsewhere, for any pytree."""
+def where_environments(mask: Array, new: Any, old: Any) -> Any:
+    """Arrays (B, ...) of `new` in the masked environments (B,), those of `old` elsewhere, for any pytree."""
 
     def pick(a: Array, b: Array) -> Array:
         return jnp.where(mask.reshape(-1, *([1] * (a.ndim - 1))), a, b)
@@ -94,6 +94,6 @@ def where_worlds(mask: Array, new: Any, old: Any) -> Any:
 
 
 MAX_SPEED = 400.0
-"""A joint faster than this (m/s or rad/s) marks a diverged world."""
+"""A joint faster than this (m/s or rad/s) marks a diverged environment."""
 MAX_DISTANCE = 25.0
-"""A joint position beyond this (m or rad) marks a diverged world; free fall of 2 s stays below it."""
+"""A joint position beyond this (m or rad) marks a diverged environment; free fall of 2 s stays below it."""

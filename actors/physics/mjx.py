@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from actors.physics.engine import Readout, World, where_worlds
-from actors.physics.readout import diverged, initial_qpos, readout
+from actors.physics.engine import PhysicsState, ResetState, where_environments
+from actors.physics.physics_state import has_diverged, initial_qpos, physics_state
 from actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, addresses
 from actors.physics.slots import Pool
 from common.config import TaskConfig
@@ -25,20 +25,20 @@ from common.task.types import CONTACTS_PER_LINK, Array
 
 
 class MjxState(NamedTuple):
-    """A batch of worlds and what they draw from."""
+    """A batch of environments and what they draw from."""
 
     data: Any
     """Batched `mjx.Data`."""
     leaves: dict[str, Array]
-    """Fields of the model of each world (B, ...)."""
+    """Fields of the model of each environment (B, ...)."""
     qpos_start: Array
-    """(B, nq), what a diverged world is put back to."""
+    """(B, nq), what a diverged environment is put back to."""
     pool: dict[str, Array]
     """Fields of the model for each object (N, ...); see `actors.physics.slots.LEAVES`."""
 
 
 class MjxPhysics:
-    """A batch of worlds in MJX."""
+    """A batch of environments in MJX."""
 
     name = "jax"
     compiled = True
@@ -49,7 +49,7 @@ class MjxPhysics:
         Args:
           hand: the hand.
           task: timing and collision settings.
-          objects: the pool that `World.object_index` points into.
+          objects: the pool that `ResetState.object_index` points into.
 
         Raises:
           CongraspError: collisions between the hand's links are to be simulated.
@@ -81,29 +81,29 @@ class MjxPhysics:
         self._axes = jax.tree.map(lambda _: None, self._model).replace(**axes)
         self._object_body = self._where.object_body
 
-    def start(self, world: World) -> MjxState:
-        """Fresh worlds; see `Physics.start`."""
-        batch = world.object_index.shape[0]
+    def start(self, reset_state: ResetState) -> MjxState:
+        """Fresh environments; see `Physics.start`."""
+        batch = reset_state.object_index.shape[0]
         data = mjx.make_data(self._host_model, device=self._device, impl="jax")
         data = jax.vmap(lambda q: data.replace(qpos=q))(jnp.zeros((batch, self._nq)))
-        return self._place(data, self._objects, world)
+        return self._place(data, self._objects, reset_state)
 
     def replace_objects(self, state: MjxState, objects: Sequence[GraspObject]) -> MjxState:
         """Other objects, as many as before and without meshes, for the episodes that start from now on."""
         return state._replace(pool=self._leaves(objects))
 
-    def reset(self, state: MjxState, mask: Array, world: World) -> MjxState:
-        """Starts the masked worlds anew; see `Physics.reset`."""
-        fresh = self._place(state.data, state.pool, world)
+    def reset(self, state: MjxState, mask: Array, reset_state: ResetState) -> MjxState:
+        """Starts the masked environments anew; see `Physics.reset`."""
+        fresh = self._place(state.data, state.pool, reset_state)
         names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "mocap_pos", "mocap_quat", "eq_active", "time")
         started, going = (
-            ({name: getattr(worlds.data, name) for name in names}, worlds.leaves, worlds.qpos_start)
-            for worlds in (fresh, state)
+            ({name: getattr(batch.data, name) for name in names}, batch.leaves, batch.qpos_start)
+            for batch in (fresh, state)
         )
-        merged, leaves, qpos_start = where_worlds(mask, started, going)
+        merged, leaves, qpos_start = where_environments(mask, started, going)
         return MjxState(state.data.replace(**merged), leaves, qpos_start, state.pool)
 
-    def step(self, state: MjxState, target: Array, table: Array) -> tuple[MjxState, Readout]:
+    def step(self, state: MjxState, target: Array, table: Array) -> tuple[MjxState, PhysicsState]:
         """One control step; see `Physics.step`."""
         where = self._where
         height = jnp.where(table, 0.0, TABLE_AWAY[2])
@@ -115,44 +115,46 @@ class MjxPhysics:
             return jax.vmap(mjx.step, in_axes=(self._axes, 0))(model, data), None
 
         data, _ = jax.lax.scan(substep, data, None, length=self._task.substeps)
-        bad = diverged(jnp, data.qpos, data.qvel)[:, None]
+        diverged = has_diverged(jnp, data.qpos, data.qvel)[:, None]
         data = data.replace(
-            qpos=jnp.where(bad, state.qpos_start, data.qpos),
-            qvel=jnp.where(bad, 0.0, data.qvel),
-            qacc_warmstart=jnp.where(bad, 0.0, data.qacc_warmstart),
+            qpos=jnp.where(diverged, state.qpos_start, data.qpos),
+            qvel=jnp.where(diverged, 0.0, data.qvel),
+            qacc_warmstart=jnp.where(diverged, 0.0, data.qacc_warmstart),
         )
-        sensors = jnp.where(bad, 0.0, self._contacts(data))
+        sensors = jnp.where(diverged, 0.0, self._contacts(data))
         state = state._replace(data=data)
-        return state, readout(jnp, where, data.qpos, data.qvel, sensors, bad[:, 0], jnp.zeros(2))
+        return state, physics_state(jnp, where, data.qpos, data.qvel, sensors, diverged[:, 0], jnp.zeros(2))
 
-    def read(self, state: MjxState) -> Readout:
-        """The worlds as they are, without contacts; see `Physics.read`."""
+    def read(self, state: MjxState) -> PhysicsState:
+        """The environments as they are, without contacts; see `Physics.read`."""
         data = state.data
         batch = data.qpos.shape[0]
         none = jnp.zeros((batch, len(self._links) * CONTACTS_PER_LINK * SENSOR_WIDTH))
-        return readout(jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
+        return physics_state(jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
 
     def close(self) -> None:
         """Nothing to release."""
 
     def _leaves(self, objects: Sequence[GraspObject]) -> dict[str, Array]:
+        """Fields (N, ...) of the model for each object, on the device."""
         return {
             name: jnp.asarray(value, jnp.float32).reshape(len(objects), *getattr(self._model, name).shape)
             for name, value in self._pool.leaves(objects).items()
         }
 
-    def _place(self, data: Any, pool: dict[str, Array], world: World) -> MjxState:
-        where, batch = self._where, world.object_index.shape[0]
+    def _place(self, data: Any, pool: dict[str, Array], reset_state: ResetState) -> MjxState:
+        """Environments at their start, with the fields of their objects from the rows `pool` (N, ...)."""
+        where, batch = self._where, reset_state.object_index.shape[0]
         body = self._object_body
-        leaves = {name: value[world.object_index] for name, value in pool.items()}
+        leaves = {name: value[reset_state.object_index] for name, value in pool.items()}
         for name in ("body_mass", "body_inertia"):
-            scale = world.mass_scale.reshape(-1, *([1] * (leaves[name].ndim - 2)))
+            scale = reset_state.mass_scale.reshape(-1, *([1] * (leaves[name].ndim - 2)))
             leaves[name] = leaves[name].at[:, body].multiply(scale)
         tiled = {name: jnp.tile(value, (batch, *([1] * value.ndim))) for name, value in self._shared.items()}
-        leaves["body_pos"] = tiled["body_pos"].at[:, where.base_body].set(world.base_position)
-        leaves["body_quat"] = tiled["body_quat"].at[:, where.base_body].set(world.base_quaternion)
-        leaves["geom_friction"] = tiled["geom_friction"].at[:, self._geoms, 0].set(world.friction[:, None])
-        qpos = initial_qpos(where, self._nq, world)
+        leaves["body_pos"] = tiled["body_pos"].at[:, where.base_body].set(reset_state.base_position)
+        leaves["body_quat"] = tiled["body_quat"].at[:, where.base_body].set(reset_state.base_quaternion)
+        leaves["geom_friction"] = tiled["geom_friction"].at[:, self._geoms, 0].set(reset_state.friction[:, None])
+        qpos = initial_qpos(where, self._nq, reset_state)
         data = data.replace(
             qpos=qpos,
             qvel=jnp.zeros((batch, self._nv)),
@@ -161,9 +163,9 @@ class MjxPhysics:
             mocap_pos=data.mocap_pos.at[:, where.table_mocap]
             .set(0.0)
             .at[:, where.anchor_mocap]
-            .set(world.object_position),
-            mocap_quat=data.mocap_quat.at[:, where.anchor_mocap].set(world.object_quaternion),
-            eq_active=data.eq_active.at[:, where.weld].set(world.stationary.astype(data.eq_active.dtype)),
+            .set(reset_state.object_position),
+            mocap_quat=data.mocap_quat.at[:, where.anchor_mocap].set(reset_state.object_quaternion),
+            eq_active=data.eq_active.at[:, where.weld].set(reset_state.stationary.astype(data.eq_active.dtype)),
         )
         return MjxState(data, leaves, qpos, pool)
 
@@ -174,7 +176,7 @@ class MjxPhysics:
 
 
 def _strongest_contacts(body_of_geom: np.ndarray, links: np.ndarray, object_body: int, data: Any) -> Array:
-    """The contact sensors' values from MJX-JAX's contact list, for one world."""
+    """The contact sensors' values from MJX-JAX's contact list, for one environment."""
     contact = data._impl.contact
     body = jnp.asarray(body_of_geom)[contact.geom]
     index = np.asarray(contact.efc_address)

@@ -1,4 +1,4 @@
-"""One model for a whole pool of objects: what differs between objects becomes arrays that are batched over worlds.
+"""One model for a whole pool of objects: what differs between objects becomes arrays batched over environments.
 
 Primitive pieces of every object share a fixed number of geom slots, whose sizes and poses are swapped; a slot that an
 object does not use shrinks to 0.4 mm inside it. Mesh pieces cannot be swapped in a `Pool`: each mesh object owns its
@@ -103,7 +103,7 @@ class Pool:
 
 
 def empty_slots() -> list[Piece]:
-    """The primitive slots of a world that has no object in them."""
+    """The primitive slots of an environment that has no object in them."""
     return [Piece(kind, _shrunk(kind)) for kind, count in PRIMITIVE_SLOTS.items() for _ in range(count)]  # type: ignore[arg-type]
 
 
@@ -152,10 +152,12 @@ def fill_body(model: mujoco.MjModel, data: mujoco.MjData, obj: GraspObject) -> N
 
 
 def _shrunk(kind: str) -> tuple[float, float, float]:
+    """Size of an unused slot."""
     return (_UNUSED, _UNUSED, 0.0) if kind in ("cylinder", "capsule") else (_UNUSED, _UNUSED, _UNUSED)
 
 
 def _half_extent(piece: Piece) -> tuple[float, float, float]:
+    """Half the edges of a primitive's bounding box in its own frame, m."""
     a, b, c = piece.size
     if piece.kind == "cylinder":
         return a, a, b
@@ -163,6 +165,7 @@ def _half_extent(piece: Piece) -> tuple[float, float, float]:
 
 
 def _bounding_radius(piece: Piece) -> float:
+    """Radius of the sphere around its centre that holds a primitive, m."""
     a, b, c = piece.size
     if piece.kind == "box":
         return float(np.linalg.norm(piece.size))

@@ -1,4 +1,4 @@
-"""MuJoCo Warp, called once a control step: NVIDIA kernels that give each world an object and meshes of its own.
+"""MuJoCo Warp, called once a control step: NVIDIA kernels that give each environment an object and meshes of its own.
 
 The kernels are those that mujoco-mjx carries (`mujoco.mjx.third_party.mujoco_warp`); they also run on a CPU, for tests.
 The state is a small pytree and every call can be traced, so that a whole rollout compiles into one program.
@@ -14,10 +14,10 @@ import numpy as np
 import warp as wp
 
 from actors.physics.catalogue import Catalogue
-from actors.physics.engine import Readout, World, where_worlds
-from actors.physics.readout import diverged, initial_qpos, readout
+from actors.physics.engine import PhysicsState, ResetState, where_environments
+from actors.physics.physics_state import has_diverged, initial_qpos, physics_state
 from actors.physics.scene import SENSOR_WIDTH, addresses
-from actors.physics.warp_worlds import WarpWorlds, control_step, meshes_on, objects_on, register
+from actors.physics.warp_buffers import WarpBuffers, control_step, meshes_on, objects_on, register
 from common.config import TaskConfig
 from common.hands.spec import Hand
 from common.objects.spec import MAX_MESH_PIECES, GraspObject
@@ -25,7 +25,7 @@ from common.task.types import CONTACTS_PER_LINK, Array
 
 
 class WarpState(NamedTuple):
-    """All that a control step of a batch of worlds depends on."""
+    """All that a control step of a batch of environments depends on."""
 
     qpos: Array
     """(B, nq)."""
@@ -33,12 +33,12 @@ class WarpState(NamedTuple):
     """(B, nv)."""
     qacc_warmstart: Array
     """(B, nv), where the solver begins."""
-    world: World
-    """What the worlds started from; `object_index` is a row of the engine's catalogue."""
+    reset_state: ResetState
+    """What the environments started from; `object_index` is a row of the engine's catalogue."""
 
 
 class WarpPhysics:
-    """A batch of worlds in MuJoCo Warp.
+    """A batch of environments in MuJoCo Warp.
 
     The compiled calls see objects only as row numbers. So any number of objects, primitives and meshes mixed, costs
     the same in a step, and `replace_objects` compiles nothing: neither the number of objects nor the size of their
@@ -55,7 +55,7 @@ class WarpPhysics:
         Args:
           hand: the hand.
           task: timing and collision settings.
-          objects: the pool that `World.object_index` points into.
+          objects: the pool that `ResetState.object_index` points into.
           mesh_slots: most mesh pieces of an object; 0 for primitives alone.
 
         Raises:
@@ -72,92 +72,94 @@ class WarpPhysics:
         self._sensors = len(hand.links) * CONTACTS_PER_LINK * SENSOR_WIDTH
         device = jax.local_devices()[0]
         self._device = wp.get_device("cpu" if device.platform == "cpu" else f"cuda:{device.local_hardware_id}")
-        self._worlds: dict[int, tuple[int, WarpWorlds]] = {}
+        self._buffers: dict[int, tuple[int, WarpBuffers]] = {}
         self._load(objects)
 
-    def start(self, world: World) -> WarpState:
-        """Fresh worlds; see `Physics.start`."""
-        batch = world.object_index.shape[0]
-        if batch not in self._worlds:
+    def start(self, reset_state: ResetState) -> WarpState:
+        """Fresh environments; see `Physics.start`."""
+        batch = reset_state.object_index.shape[0]
+        if batch not in self._buffers:
             model, geoms = self._catalogue.model, self._catalogue.geoms
-            worlds = WarpWorlds(model, self._where, geoms, self._task.substeps, batch, self._device)
-            worlds.fill(*self._loaded)
-            self._worlds[batch] = register(worlds), worlds
-        return self._fresh(world)
+            buffers = WarpBuffers(model, self._where, geoms, self._task.substeps, batch, self._device)
+            buffers.fill(*self._loaded)
+            self._buffers[batch] = register(buffers), buffers
+        return self._fresh(reset_state)
 
-    def reset(self, state: WarpState, mask: Array, world: World) -> WarpState:
-        """Starts the masked worlds anew; see `Physics.reset`."""
-        return where_worlds(mask, self._fresh(world), state)
+    def reset(self, state: WarpState, mask: Array, reset_state: ResetState) -> WarpState:
+        """Starts the masked environments anew; see `Physics.reset`."""
+        return where_environments(mask, self._fresh(reset_state), state)
 
-    def step(self, state: WarpState, target: Array, table: Array) -> tuple[WarpState, Readout]:
+    def step(self, state: WarpState, target: Array, table: Array) -> tuple[WarpState, PhysicsState]:
         """One control step; see `Physics.step`."""
-        world, batch = state.world, state.qpos.shape[0]
-        handle, worlds = self._worlds[batch]
-        qpos, qvel, warmstart, sensors, occupancy = control_step(
+        reset_state, batch = state.reset_state, state.qpos.shape[0]
+        handle, buffers = self._buffers[batch]
+        qpos, qvel, warmstart, sensors, counts = control_step(
             handle,
             state.qpos,
             state.qvel,
             state.qacc_warmstart,
             target.astype(jnp.float32),
             table,
-            world.object_index,
-            world.mass_scale,
-            world.friction,
-            world.base_position,
-            world.base_quaternion,
-            world.object_position,
-            world.object_quaternion,
-            world.stationary,
+            reset_state.object_index,
+            reset_state.mass_scale,
+            reset_state.friction,
+            reset_state.base_position,
+            reset_state.base_quaternion,
+            reset_state.object_position,
+            reset_state.object_quaternion,
+            reset_state.stationary,
             output_dims={"sensordata": (batch, self._sensors), "occupancy": (2,)},
         )
-        bad = diverged(jnp, qpos, qvel)
-        moved = WarpState(qpos, qvel, warmstart, world)
-        state = where_worlds(bad, self._fresh(world), moved)
-        sensors = jnp.where(bad[:, None], 0.0, sensors)
-        usage = occupancy / worlds.limits
-        return state, readout(jnp, self._where, state.qpos, state.qvel, sensors, bad, usage)
+        diverged = has_diverged(jnp, qpos, qvel)
+        moved = WarpState(qpos, qvel, warmstart, reset_state)
+        state = where_environments(diverged, self._fresh(reset_state), moved)
+        sensors = jnp.where(diverged[:, None], 0.0, sensors)
+        occupancy = counts / buffers.limits
+        return state, physics_state(jnp, self._where, state.qpos, state.qvel, sensors, diverged, occupancy)
 
     def replace_objects(self, state: WarpState, objects: Sequence[GraspObject]) -> WarpState:
-        """Other objects, primitives or meshes, for the worlds that start anew from now on; not to be traced.
+        """Other objects, primitives or meshes, for the environments that start anew from now on; not to be traced.
 
-        The objects of worlds that go on are kept behind the new ones until the next call. Waits for the step that
+        The objects of environments that go on are kept behind the new ones until the next call. Waits for the step that
         `state` comes from; no other may be under way, and no other state is valid afterwards.
 
         Args:
-          state: of the worlds that go on.
+          state: of the environments that go on.
           objects: the new pool, of any size.
 
         Raises:
           CongraspError: an object has more pieces than slots.
         """
-        index = np.asarray(jax.block_until_ready(state).world.object_index)
+        index = np.asarray(jax.block_until_ready(state).reset_state.object_index)
         used, index = np.unique(index, return_inverse=True)
         going = [self._objects[row] for row in used]
         self._load([*objects, *going])
         moved = jnp.asarray(len(objects) + index, jnp.int32)
-        return state._replace(world=state.world._replace(object_index=moved))
+        return state._replace(reset_state=state.reset_state._replace(object_index=moved))
 
-    def read(self, state: WarpState) -> Readout:
-        """The worlds as they are, without contacts; see `Physics.read`."""
+    def read(self, state: WarpState) -> PhysicsState:
+        """The environments as they are, without contacts; see `Physics.read`."""
         batch = state.qpos.shape[0]
         none = jnp.zeros((batch, self._sensors))
-        return readout(jnp, self._where, state.qpos, state.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
+        return physics_state(jnp, self._where, state.qpos, state.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
 
     def close(self) -> None:
-        """Releases the worlds' memory."""
-        self._worlds.clear()
+        """Releases the environments' memory."""
+        self._buffers.clear()
 
     def _load(self, objects: Sequence[GraspObject]) -> None:
+        """Puts objects on the device, and every batch's buffers on them."""
         rows, meshes = self._catalogue.rows(objects)
         self._objects = objects
         self._loaded = objects_on(self._device, rows), meshes_on(self._device, meshes)
         wp.synchronize_device(self._device)  # JAX's stream does not wait for Warp's
-        for _, worlds in self._worlds.values():
-            worlds.fill(*self._loaded)
+        for _, buffers in self._buffers.values():
+            buffers.fill(*self._loaded)
 
-    def _fresh(self, world: World) -> WarpState:
-        index, stationary = jnp.asarray(world.object_index, jnp.int32), jnp.asarray(world.stationary, bool)
-        world = World(*(jnp.asarray(leaf, jnp.float32) for leaf in world))
-        world = world._replace(object_index=index, stationary=stationary)
+    def _fresh(self, reset_state: ResetState) -> WarpState:
+        """The state of environments that start now; types as the compiled calls expect them."""
+        index, stationary = jnp.asarray(reset_state.object_index, jnp.int32), jnp.asarray(reset_state.stationary, bool)
+        reset_state = ResetState(*(jnp.asarray(leaf, jnp.float32) for leaf in reset_state))
+        reset_state = reset_state._replace(object_index=index, stationary=stationary)
         none = jnp.zeros((len(index), self._catalogue.model.nv))
-        return WarpState(initial_qpos(self._where, self._catalogue.model.nq, world), none, none, world)
+        return WarpState(initial_qpos(self._where, self._catalogue.model.nq, reset_state), none, none, reset_state)

@@ -1,4 +1,4 @@
-"""Kernels of our own beside MuJoCo Warp's: what fills the worlds, and what counts how full their buffers are."""
+"""Kernels of our own beside MuJoCo Warp's: what fills the environments, and what counts how full their buffers are."""
 
 # mypy: ignore-errors
 # (Kernels are a language of their own in Python's syntax, which Warp's compiler checks.)
@@ -26,7 +26,7 @@ class Objects:
 
 @wp.struct
 class Leaves:
-    """Fields of model and data that differ between worlds (B, ...), and where the object is in them."""
+    """Fields of model and data that differ between environments (B, ...), and where the object is in them."""
 
     geom_size: wp.array2d[wp.vec3]
     geom_pos: wp.array2d[wp.vec3]
@@ -77,45 +77,45 @@ def place(
     leaves: Leaves,
     occupancy: wp.array[int],
 ) -> None:
-    """Fills a world's leaves from its object's row; one thread for each world and slot."""
-    world, slot = wp.tid()
-    r = row[world]
+    """Fills an environment's leaves from its object's row; one thread for each environment and slot."""
+    env, slot = wp.tid()
+    r = row[env]
     geom = leaves.geoms[slot]
-    leaves.geom_size[world, geom] = objects.geom_size[r, slot]
-    leaves.geom_pos[world, geom] = objects.geom_pos[r, slot]
-    leaves.geom_quat[world, geom] = objects.geom_quat[r, slot]
-    leaves.geom_rbound[world, geom] = objects.geom_rbound[r, slot]
-    leaves.geom_aabb[world, geom, 0] = objects.geom_aabb[r, slot, 0]
-    leaves.geom_aabb[world, geom, 1] = objects.geom_aabb[r, slot, 1]
-    leaves.geom_dataid[world, geom] = objects.geom_dataid[r, slot]
-    shared = leaves.geom_friction[world, geom]
-    leaves.geom_friction[world, geom] = wp.vec3(friction[world], shared[1], shared[2])
+    leaves.geom_size[env, geom] = objects.geom_size[r, slot]
+    leaves.geom_pos[env, geom] = objects.geom_pos[r, slot]
+    leaves.geom_quat[env, geom] = objects.geom_quat[r, slot]
+    leaves.geom_rbound[env, geom] = objects.geom_rbound[r, slot]
+    leaves.geom_aabb[env, geom, 0] = objects.geom_aabb[r, slot, 0]
+    leaves.geom_aabb[env, geom, 1] = objects.geom_aabb[r, slot, 1]
+    leaves.geom_dataid[env, geom] = objects.geom_dataid[r, slot]
+    shared = leaves.geom_friction[env, geom]
+    leaves.geom_friction[env, geom] = wp.vec3(friction[env], shared[1], shared[2])
     if slot > 0:
         return
     body = leaves.object_body
-    leaves.body_mass[world, body] = mass_scale[world] * objects.body_mass[r]
-    leaves.body_inertia[world, body] = mass_scale[world] * objects.body_inertia[r]
-    leaves.body_iquat[world, body] = objects.body_iquat[r]
-    leaves.body_subtreemass[world, 0] = objects.body_subtreemass[r, 0]
-    leaves.body_subtreemass[world, body] = objects.body_subtreemass[r, 1]
-    leaves.body_invweight0[world, body] = objects.body_invweight0[r]
+    leaves.body_mass[env, body] = mass_scale[env] * objects.body_mass[r]
+    leaves.body_inertia[env, body] = mass_scale[env] * objects.body_inertia[r]
+    leaves.body_iquat[env, body] = objects.body_iquat[r]
+    leaves.body_subtreemass[env, 0] = objects.body_subtreemass[r, 0]
+    leaves.body_subtreemass[env, body] = objects.body_subtreemass[r, 1]
+    leaves.body_invweight0[env, body] = objects.body_invweight0[r]
     for i in range(6):
-        leaves.dof_invweight0[world, leaves.object_dof + i] = objects.dof_invweight0[r, i]
-    leaves.body_pos[world, leaves.base_body] = base_position[world]
-    leaves.body_quat[world, leaves.base_body] = base_quaternion[world]
-    leaves.mocap_pos[world, leaves.anchor] = anchor_position[world]
-    leaves.mocap_quat[world, leaves.anchor] = anchor_quaternion[world]
-    leaves.mocap_pos[world, leaves.table] = wp.vec3(0.0, 0.0, wp.where(table[world], 0.0, leaves.table_away))
-    leaves.eq_active[world, leaves.weld] = stationary[world]
-    if world == 0:
+        leaves.dof_invweight0[env, leaves.object_dof + i] = objects.dof_invweight0[r, i]
+    leaves.body_pos[env, leaves.base_body] = base_position[env]
+    leaves.body_quat[env, leaves.base_body] = base_quaternion[env]
+    leaves.mocap_pos[env, leaves.anchor] = anchor_position[env]
+    leaves.mocap_quat[env, leaves.anchor] = anchor_quaternion[env]
+    leaves.mocap_pos[env, leaves.table] = wp.vec3(0.0, 0.0, wp.where(table[env], 0.0, leaves.table_away))
+    leaves.eq_active[env, leaves.weld] = stationary[env]
+    if env == 0:
         occupancy[0] = 0
         occupancy[1] = 0
 
 
 @wp.kernel
 def count(ncollision: wp.array[int], nacon: wp.array[int], nefc: wp.array[int], occupancy: wp.array[int]) -> None:
-    """Keeps the most contacts of all worlds together, and the most constraint rows of any; also what had no room."""
-    world = wp.tid()
-    wp.atomic_max(occupancy, 1, nefc[world])
-    if world == 0:
+    """Keeps the most contacts of all environments, and the most constraint rows of any; also what had no room."""
+    env = wp.tid()
+    wp.atomic_max(occupancy, 1, nefc[env])
+    if env == 0:
         wp.atomic_max(occupancy, 0, wp.max(ncollision[0], nacon[0]))

@@ -36,10 +36,12 @@ _TIP_RADIUS = 0.0081
 
 
 def _joint(name: str, axis: np.ndarray, anchor: np.ndarray, limits: tuple[float, float], drive: _Drive) -> Joint:
+    """A hinge about an axis through an anchor, with the gains of its motor."""
     return Joint(name, vector(axis), vector(anchor), *limits, **drive._asdict(), damping=0.0)
 
 
 def _finger(name: str, mcp: Vector, radii: tuple[float, float], parent: str = "palm") -> tuple[Link, ...]:
+    """Joints, links and tip of one of the four fingers."""
     knuckle = np.array(mcp)
     pip, dip = knuckle + 0.047 * _Z, knuckle + 0.0785 * _Z
     tip = dip + (0.0260 - _TIP_RADIUS) * _Z
@@ -63,6 +65,7 @@ def _finger(name: str, mcp: Vector, radii: tuple[float, float], parent: str = "p
 
 
 def _thumb() -> tuple[Link, ...]:
+    """Joints, links and tip of the thumb."""
     along, aside = np.array([0.0, 1.0, 1.0]) / np.sqrt(2), np.array([0.0, 1.0, -1.0]) / np.sqrt(2)
     flexion, abduction = np.sqrt(0.75) * _X + 0.5 * aside, 0.5 * _X - np.sqrt(0.75) * aside
     cmc = np.array([0.0100, 0.0260, 0.0214])

@@ -23,7 +23,7 @@ class Draft(NamedTuple):
     part_names: tuple[str, ...] = ()
     """Empty: the object is labelled by its two halves."""
     graspable: tuple[bool, ...] = ()
-    """Which parts form O+."""
+    """Which parts form the graspable region."""
     weight: tuple[float, ...] = ()
     """Relative density of each part; empty means equal."""
 
@@ -32,6 +32,7 @@ BUILDERS: dict[str, Callable[[Rng], Draft]] = {}
 
 
 def _family(builder: Callable[[Rng], Draft]) -> Callable[[Rng], Draft]:
+    """Enters a family into the table."""
     BUILDERS[builder.__name__.strip("_")] = builder
     return builder
 
@@ -74,10 +75,12 @@ def _mesh(vertices: np.ndarray) -> Piece:
 
 
 def _polar(radius: float, turn: float, z: float) -> Vector:
+    """A point by cylindrical coordinates."""
     return radius * np.cos(turn), radius * np.sin(turn), z
 
 
 def _either(rng: Rng) -> tuple[bool, bool]:
+    """One of two parts, at random."""
     first = bool(rng.random() < 0.5)
     return first, not first
 
@@ -349,6 +352,7 @@ def cup(rng: Rng) -> Draft:
 
 
 def _vessel(bottom: float, top: float, height: float, wall: float) -> Draft:
+    """A floor and a wall of seven sides; radii at bottom and top, height and thickness in m."""
     turns = 2 * np.pi / 7 * np.arange(8)
     floor = np.array([_polar(bottom, turn, z) for turn in turns[:-1] for z in (0.0, wall)])
     pieces = [_mesh(floor)]

@@ -37,6 +37,7 @@ class TableScene:
     """An object above a table whose top is the plane z = 0, with the contact settings of the task (MuJoCo C)."""
 
     def __init__(self, obj: GraspObject):
+        """Compiles the scene."""
         spec = mujoco.MjSpec()
         spec.option.timestep = CONTACT.timestep
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST

@@ -11,7 +11,7 @@ import numpy as np
 PieceKind = Literal["box", "cylinder", "capsule", "ellipsoid", "mesh"]
 SURFACE_POINTS = 512
 PRIMITIVE_SLOTS = {"box": 3, "cylinder": 2, "capsule": 3, "ellipsoid": 2}
-"""Most pieces of each kind in a primitive object: the geoms that a batched physics world keeps for its object."""
+"""Most pieces of each kind in a primitive object: the geoms that a batched environment keeps for its object."""
 MAX_MESH_PIECES = 8
 """Most convex pieces of an object with mesh pieces."""
 MAX_MESH_VERTICES = 32
@@ -40,7 +40,7 @@ class GraspObject:
     """An entry of the catalogue.
 
     Shapes: `points`, `normals` (512, 3), outward unit normals; `labels` (512,) part index of each surface point;
-    `graspable` (parts,) bool, the default partition into O+ and O-; `inertia` (3, 3) about the centre of mass,
+    `graspable` (parts,) bool, which of them may be grasped by default; `inertia` (3, 3) about the centre of mass,
     kg.m^2; `rest_poses` (R, 7) position and quaternion in the world with the table's top at z = 0;
     `visual_vertices` (V, 3), `visual_faces` (F, 3) for pictures, in the object frame; `origin` (3,) where the origin of
     the file that it was imported from lies in the object frame.
@@ -67,7 +67,7 @@ class GraspObject:
 
     @property
     def non_graspable_points(self) -> np.ndarray:
-        """(512,) whether each surface point belongs to O-."""
+        """(512,) whether each surface point belongs to the avoid region."""
         return ~self.graspable[self.labels]
 
     def scaled(self, factor: float) -> "GraspObject":

@@ -14,7 +14,7 @@ _STRIDE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 def sample_union(
     pieces: tuple[Piece, ...], rng: np.random.Generator, count: int = SURFACE_POINTS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points that are evenly spread over the outer surface of the pieces' union.
+    """Points that are evenly distributed over the outer surface of the pieces' union.
 
     The points follow a low-discrepancy sequence with a random start, so that the first few of them cover the
     surface as well as all of them. Points of one piece inside another are left out.

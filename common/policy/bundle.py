@@ -1,6 +1,6 @@
 """The policy bundle: weights, critic and normalisers of one version, as one immutable unit.
 
-It is what the learner publishes, what actors and the policy server act with, and what is shipped as a file. Acting
+It is what the learner publishes, what actors and the policy server act with, and what comes with the package. Acting
 normalises with the bundle's own statistics, so that a log probability belongs to exactly one bundle.
 """
 
@@ -73,8 +73,8 @@ def policy_spec(task: TaskConfig, sizes: NetworkConfig) -> PolicySpec:
     return PolicySpec(hand.reference, task_observation.layout(hand, task), len(hand.joints) + 6, sizes)
 
 
-class Acting(NamedTuple):
-    """The part of a bundle that acting needs; the first argument of `mean_action` and `sample_action`."""
+class InferenceParameters(NamedTuple):
+    """The part of a bundle that inference needs; the first argument of `mean_action` and `sample_action`."""
 
     params: Params
     normalization: Affine
@@ -102,10 +102,10 @@ class PolicyBundle:
     """Environment steps that it was trained on."""
 
     @functools.cached_property
-    def acting(self) -> Acting:
+    def inference_parameters(self) -> InferenceParameters:
         """The actor and the frozen normalisation, on the default device."""
         affine = normalizer.observation_affine(self.observation, self.spec.layout)
-        return Acting(*jax.device_put(({"actor": self.params["actor"]}, affine)))
+        return InferenceParameters(*jax.device_put(({"actor": self.params["actor"]}, affine)))
 
     def to_message(self) -> Message:
         """The bundle as arrays and meta data; arrays are shared, not copied."""
@@ -183,21 +183,24 @@ def load(path: pathlib.Path) -> PolicyBundle:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def mean_action(layout: Layout, acting: Acting, observation: Array) -> Array:
+def mean_action(layout: Layout, parameters: InferenceParameters, observation: Array) -> Array:
     """The deterministic action (..., A) for raw observations (..., D)."""
-    mean, _ = network.policy(acting.params, layout, normalizer.apply(acting.normalization, observation))
+    mean, _ = network.policy(parameters.params, layout, normalizer.apply(parameters.normalization, observation))
     return mean
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def sample_action(layout: Layout, acting: Acting, observation: Array, key: Array) -> tuple[Array, Array]:
+def sample_action(
+    layout: Layout, parameters: InferenceParameters, observation: Array, key: Array
+) -> tuple[Array, Array]:
     """A drawn action (..., A) for raw observations (..., D), and its log probability (...,)."""
-    mean, log_std = network.policy(acting.params, layout, normalizer.apply(acting.normalization, observation))
+    mean, log_std = network.policy(parameters.params, layout, normalizer.apply(parameters.normalization, observation))
     action = network.sample(key, mean, log_std)
     return action, network.log_probability(mean, log_std, action)
 
 
 def _dataclass(cls: type, fields: Any) -> Any:
+    """A frozen dataclass from JSON's values; unknown keys and wrong types are errors."""
     return dacite.from_dict(cls, fields, dacite.Config(strict=True, cast=[tuple, float]))
 
 
@@ -212,6 +215,7 @@ def _shapes(spec: PolicySpec) -> dict[str, tuple[int, ...]]:
 
 
 def _check_arrays(arrays: Mapping[str, Array], expected: Mapping[str, tuple[int, ...]], source: str) -> None:
+    """Raises `CongraspError` unless the arrays have these names and shapes, and finite values."""
     if odd := sorted(expected.keys() ^ arrays.keys()):
         raise CongraspError(f"The policy {source} lacks or should not have '{odd[0]}'.", _REMEDY)
     for name, shape in expected.items():

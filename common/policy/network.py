@@ -86,14 +86,17 @@ class GatedNetwork(nn.Module):
         return self._dense(self.outputs, "output")(x)
 
     def _dense(self, units: int, name: str) -> nn.Dense:
+        """A layer in the network's precision."""
         return nn.Dense(units, precision=self.precision, name=name)
 
 
 def _exact(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
+    """The actor: the same numbers on every device."""
     return GatedNetwork(layout, hidden, encoder, outputs, jax.lax.Precision.HIGHEST)
 
 
 def _fast(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
+    """The critic, in the device's own precision."""
     return GatedNetwork(layout, hidden, encoder, outputs, None)
 
 
@@ -130,6 +133,7 @@ def init(seed: int, layout: Layout, action_size: int, config: NetworkConfig) -> 
     tree = shapes(layout, action_size, config)
 
     def fill(layers: Params, output_gain: float) -> Params:
+        """Layers of one network, the last with its own gain."""
         gains = {name: output_gain if name == "output" else _HIDDEN_GAIN for name in layers}
         return {
             name: {

@@ -23,7 +23,7 @@ _SMALLEST_STD = 1e-3
 
 
 class Statistics(NamedTuple):
-    """Moments of what was seen so far; float64 arrays on the host."""
+    """Count, mean and squared deviations of the samples so far; float64 arrays on the host."""
 
     count: Array
     """() number of samples."""
@@ -78,11 +78,12 @@ def merge(*parts: Statistics) -> Statistics:
 
 
 def _std(statistics: Statistics) -> np.ndarray:
+    """Standard deviations, none of them close to zero."""
     return np.maximum(np.sqrt(statistics.m2 / statistics.count), _SMALLEST_STD)
 
 
 def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
-    """Normalisation of observations (..., D); the identity while nothing was seen.
+    """Normalisation of observations (..., D); the identity while there are no samples.
 
     `state` and `heading` are centred and divided by their standard deviation. Optional blocks are divided by their root
     mean square and not centred: zero, which stands for "inactive", stays exactly zero, and a feature that hardly varies
@@ -111,7 +112,7 @@ def apply(affine: Affine, observation: Array) -> Array:
 
 
 def value_affine(statistics: Statistics) -> Affine:
-    """Normalisation of returns by mean and standard deviation; the identity while nothing was seen."""
+    """Normalisation of returns by mean and standard deviation; the identity while there are no samples."""
     if statistics.count == 0:
         return Affine(np.float32(0.0), np.float32(1.0))
     return Affine(np.float32(statistics.mean), np.float32(1.0 / _std(statistics)))

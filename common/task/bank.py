@@ -14,7 +14,7 @@ class ConstraintBank(NamedTuple):
 
     points: Array
     """(N, P, 3) surface points."""
-    minus: Array
+    avoid: Array
     """(N, P) bool, the avoid region."""
     rest: Array
     """(N, R, 7) resting poses in the world; unused rows repeat earlier ones."""

@@ -83,6 +83,11 @@ def squash(force: Array) -> Array:
     return force / (jnp.linalg.norm(force, axis=-1, keepdims=True) + FORCE_SCALE)
 
 
+def share(part: Array, whole: Array) -> tuple[Array, Array]:
+    """How many flags (B, N) of a part and of the whole are true, (B,) float each: an error that is a ratio."""
+    return jnp.sum(part, -1).astype(jnp.float32), jnp.sum(whole, -1).astype(jnp.float32)
+
+
 def flat(x: Array) -> Array:
     """(B, n) of an array (B, ...)."""
     return x.reshape(x.shape[0], -1)

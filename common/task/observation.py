@@ -74,11 +74,11 @@ def observe(scene: Scene) -> Array:
         jnp.stack([jnp.minimum(state.time / horizon, 1.0), state.table.astype(jnp.float32)], -1),
     ]
     for constraint in known(task):
-        seen = constraint.observe(scene)
+        observed = constraint.observe(scene)
         if not constraint.optional:
-            parts += seen[0]
+            parts += observed[0]
             continue
-        for block, values in zip(constraint.blocks, seen, strict=True):
+        for block, values in zip(constraint.blocks, observed, strict=True):
             parts.append(jnp.where(scene.goal.active[block][:, None], jnp.concatenate(values, -1), 0.0))
     mask = [scene.gate(block) for block in blocks(task)]
     return jnp.concatenate([*parts, *([jnp.stack(mask, -1)] if mask else [])], -1)

@@ -1,61 +1,152 @@
-"""The reward, term by term (paper, section Reward Function). Every term is already weighted and signed."""
+"""The reward, term by term (paper, section Reward Function): those of the grasp here, and those of the constraints."""
 
-import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from common import rotations
-from common.config import GraspWeights, RewardWeights, TaskConfig
 from common.task.constraints import known
 from common.task.constraints.base import Scene
 from common.task.geometry import FAR, square
 from common.task.types import Array, SceneState
 
-jax.tree_util.register_dataclass(
-    RewardWeights, data_fields=[field.name for field in dataclasses.fields(RewardWeights)], meta_fields=[]
+if TYPE_CHECKING:
+    from common.config import RewardWeights, TaskConfig
+
+
+class Earning(NamedTuple):
+    """What contacts may earn: what an active constraint forbids earns nothing."""
+
+    touching: Array
+    """(B, L) bool."""
+    force: Array
+    """(B, L, 3) net force on each link, N."""
+    force_max: Array
+    """() f_max, N per link."""
+
+
+class Term(NamedTuple):
+    """One term of the grasp reward."""
+
+    name: str
+    """Of the term, of its weight and of its option, `--task.reward.NAME`."""
+    default: float
+    """The weight, in units of reward per control step."""
+    meaning: str
+    """Symbol in the paper, and unit."""
+    value: Callable[[Scene, Earning], Array] | None
+    """(B,) before the weight, signed and bounded; None for a number that other terms share."""
+
+
+def _distance(scene: Scene, earning: Earning) -> Array:
+    """Weighted distance from the keypoints to the surface."""
+    distances = jnp.linalg.norm(scene.features.nearest, axis=-1)
+    return -jnp.sum(jnp.array(scene.hand.keypoint_weights) * jnp.minimum(distances, FAR), -1)
+
+
+def _contact(scene: Scene, earning: Earning) -> Array:
+    """Weighted links in contact."""
+    return jnp.sum(jnp.array(scene.hand.contact_weights) * earning.touching, -1)
+
+
+def _force(scene: Scene, earning: Earning) -> Array:
+    """Weighted forces of the links in contact, as shares of f_max."""
+    most, weights = earning.force_max, jnp.array(scene.hand.contact_weights)
+    pressed = jnp.minimum(jnp.linalg.norm(earning.force, axis=-1), most)
+    return jnp.sum(weights * earning.touching * pressed / most, -1)
+
+
+def _force_excess(scene: Scene, earning: Earning) -> Array:
+    """Newtons beyond f_max, wherever they press."""
+    total = jnp.linalg.norm(scene.features.force, axis=-1)
+    return -jnp.sum(jnp.clip(total - earning.force_max, 0.0, 50.0), -1)
+
+
+def _object_position(scene: Scene, earning: Earning) -> Array:
+    """Squared displacement of the object since the start."""
+    return -jnp.minimum(square(scene.state.object_position - scene.state.object_position_initial), 0.04)
+
+
+def _object_rotation(scene: Scene, earning: Earning) -> Array:
+    """Squared rotation of the object since the start."""
+    turned = rotations.angle(scene.state.object_quaternion, scene.state.object_quaternion_initial)
+    return -jnp.minimum(turned**2, 1.0)
+
+
+def _drop(scene: Scene, earning: Earning) -> Array:
+    """I_drop."""
+    return -fallen(scene.task, scene.state).astype(jnp.float32)
+
+
+GRASP: tuple[Term, ...] = (
+    Term(
+        "distance",
+        0.3,
+        "w_dis: per metre of the weighted distance from the hand's keypoints to the object's surface (0.3 m at most).",
+        _distance,
+    ),
+    Term(
+        "contact",
+        1.0,
+        "w_c: for all links in contact (shared out by the links' contact weights, which sum to one).",
+        _contact,
+    ),
+    Term("force", 0.5, "w_f: for all links pressing with `force_max` or more.", _force),
+    Term("force_max", 5.0, "f_max, N per link: force beyond it earns nothing.", None),
+    Term(
+        "force_excess",
+        0.01,
+        "Penalty per newton above `force_max`, per link (ours: the paper only clamps, and hands then squeeze hard).",
+        _force_excess,
+    ),
+    Term(
+        "object_position",
+        20.0,
+        "w_o: per square metre of the object's displacement (at most 0.04 m^2).",
+        _object_position,
+    ),
+    Term(
+        "object_rotation",
+        0.1,
+        "w_R: per square radian of the object's rotation (at most 1 rad^2).",
+        _object_rotation,
+    ),
+    Term(
+        "wrist_velocity",
+        0.01,
+        "w_u: per squared velocity of the six wrist joints (m/s and rad/s).",
+        lambda scene, earning: -jnp.minimum(square(scene.state.u_velocity), 100.0),
+    ),
+    Term(
+        "finger_deviation",
+        0.002,
+        "w_q of the regulariser: per squared radian from the initial finger pose.",
+        lambda scene, earning: -square(scene.state.q - scene.state.q_initial),
+    ),
+    Term("drop", 1.0, "w_drop: per step with the object fallen.", _drop),
 )
+"""The grasp's terms r^grasp; `RewardWeights` (`common.config`) and all names of terms are made of them."""
 
-_GRASP = tuple(field.name for field in dataclasses.fields(GraspWeights) if field.name != "force_max")
 
-
-def terms(task: TaskConfig) -> tuple[str, ...]:
+def terms(task: "TaskConfig") -> tuple[str, ...]:
     """Names of the terms, each of which has the name of its weight: the grasp's, then those of the constraints."""
-    return (*_GRASP, *(weight.name for constraint in known(task) for weight in constraint.weights))
+    grasp = (term.name for term in GRASP if term.value is not None)
+    return (*grasp, *(weight.name for constraint in known(task) for weight in constraint.weights))
 
 
-def fallen(task: TaskConfig, state: SceneState) -> Array:
+def fallen(task: "TaskConfig", state: SceneState) -> Array:
     """(B,) bool I_drop: the object is `drop_height` below where it started."""
     return state.object_position[..., 2] < state.object_position_initial[..., 2] - task.drop_height
 
 
-def reward_terms(scene: Scene, weights: RewardWeights) -> dict[str, Array]:
+def reward_terms(scene: Scene, weights: "RewardWeights") -> dict[str, Array]:
     """Weighted terms (B,) by the names in `terms`; the reward is their sum."""
-    found = _grasp_terms(scene, weights)
+    touching, force = scene.features.touching, scene.features.force
+    for constraint in known(scene.task):
+        touching, force = constraint.earning(scene, touching, force)
+    earning = Earning(touching, force, weights.force_max)
+    found = {term.name: term.value(scene, earning) for term in GRASP if term.value is not None}
     for constraint in known(scene.task):
         found |= constraint.reward(scene)
     return {name: getattr(weights, name) * value for name, value in found.items()}
-
-
-def _grasp_terms(scene: Scene, weights: RewardWeights) -> dict[str, Array]:
-    """r^grasp before the weights; contacts that an active constraint forbids earn nothing."""
-    hand, task, state, features = scene.hand, scene.task, scene.state, scene.features
-    touching, force = features.touching, features.force
-    for constraint in known(task):
-        touching, force = constraint.earning(scene, touching, force)
-    link_weights = jnp.array(hand.contact_weights)
-    earned = jnp.linalg.norm(force, axis=-1)
-    total = jnp.linalg.norm(features.force, axis=-1)
-    distances = jnp.linalg.norm(features.nearest, axis=-1)
-    turned = rotations.angle(state.object_quaternion, state.object_quaternion_initial)
-    return {
-        "distance": -jnp.sum(jnp.array(hand.keypoint_weights) * jnp.minimum(distances, FAR), -1),
-        "contact": jnp.sum(link_weights * touching, -1),
-        "force": jnp.sum(link_weights * touching * jnp.minimum(earned, weights.force_max) / weights.force_max, -1),
-        "force_excess": -jnp.sum(jnp.clip(total - weights.force_max, 0.0, 50.0), -1),
-        "object_position": -jnp.minimum(square(state.object_position - state.object_position_initial), 0.04),
-        "object_rotation": -jnp.minimum(turned**2, 1.0),
-        "wrist_velocity": -jnp.minimum(square(state.u_velocity), 100.0),
-        "finger_deviation": -square(state.q - state.q_initial),
-        "drop": -fallen(task, state).astype(jnp.float32),
-    }

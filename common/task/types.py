@@ -19,7 +19,7 @@ CONTACTS_PER_LINK = 3
 
 
 class SceneState(NamedTuple):
-    """Hand and object at one moment, with what the episode started from."""
+    """Hand and object in one control step, with what the episode started from."""
 
     q: Array
     """(B, F) finger joint angles, rad."""
@@ -68,8 +68,8 @@ class Surface(NamedTuple):
 
     points: Array
     """(B, N, 3) in the object frame, m."""
-    minus: Array
-    """(B, N) bool, true in the non-grasping region O-."""
+    avoid: Array
+    """(B, N) bool, true in the avoid region."""
 
 
 @jax.tree_util.register_dataclass

@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.table import Table
 
 from actors.bank import build_bank
-from actors.physics import make_physics
-from actors.physics.engine import Physics, Readout
+from actors.physics import make_physics, resolve_physics
+from actors.physics.engine import Physics, PhysicsState
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker
-from common.config import PhysicsName
+from common.engines import ENGINES, PhysicsName
 from common.hands import get_hand
 from common.objects.pool import load_pool, scale_objects
 from common.policy.bundle import PolicyBundle, sample_action
@@ -36,8 +36,8 @@ _DEFINITION = (
 
 
 def engines() -> list[PhysicsName]:
-    """Engines that this machine has; `jax` only where it is not a CPU's second choice."""
-    return ["native"] if jax.default_backend() == "cpu" else ["native", "warp", "jax"]
+    """Engines to compare on this machine: all of them, but on a CPU the one that it is best at."""
+    return [resolve_physics("auto")] if jax.default_backend() == "cpu" else list(ENGINES)
 
 
 class Recorder(NativePhysics):
@@ -49,7 +49,7 @@ class Recorder(NativePhysics):
         self.commands: list[tuple[np.ndarray, np.ndarray]] = []
         """Targets (B, 6 + F) and tables (B,) of every control step."""
 
-    def step(self, state: Any, target: Any, table: Any) -> tuple[NativePhysics, Readout]:
+    def step(self, state: Any, target: Any, table: Any) -> tuple[NativePhysics, PhysicsState]:
         """One control step, written down."""
         self.commands.append((np.array(target), np.array(table)))
         return super().step(state, target, table)
@@ -58,14 +58,14 @@ class Recorder(NativePhysics):
 def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> None:
     """Goes through recorded control steps with nothing but `mj_step`; threads share the worlds and never wait."""
 
-    def run(worlds: np.ndarray, targets: Sequence[np.ndarray]) -> None:
+    def run(environments: np.ndarray, targets: Sequence[np.ndarray]) -> None:
         for target in targets:
-            for i in worlds:
-                cell = physics.cells[i]
-                cell.ctrl[:] = target[i]
-                mujoco.mj_step(cell.model, cell.data, substeps)
+            for i in environments:
+                instance = physics.instances[i]
+                instance.ctrl[:] = target[i]
+                mujoco.mj_step(instance.model, instance.data, substeps)
 
-    shares = np.array_split(np.arange(len(physics.cells)), physics.threads)
+    shares = np.array_split(np.arange(len(physics.instances)), physics.threads)
     with concurrent.futures.ThreadPoolExecutor(physics.threads) as pool:
         for _, group in itertools.groupby(commands, key=lambda command: command[1].tobytes()):
             targets, tables = zip(*group, strict=True)
@@ -97,7 +97,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
             functools.partial(sample_action, policy.spec.layout),
             batch=environments,
             seed=0,
-            half=True,
+            half_precision=True,
         )
         _collect(worker, policy)
         twin = NativePhysics(hand, config.task, objects, threads) if isinstance(physics, Recorder) else None
@@ -106,7 +106,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
         for _ in range(repeats):
             if isinstance(physics, Recorder) and twin is not None:
                 assert worker.state is not None
-                twin.start(worker.state.world)
+                twin.start(worker.state.reset_state)
                 physics.commands.clear()
                 bare = functools.partial(replay, twin, physics.commands, config.task.substeps)
             else:
@@ -136,7 +136,7 @@ def _timed(run: Callable[[], object]) -> float:
 
 def _collect(worker: RolloutWorker, policy: PolicyBundle) -> None:
     """One episode of every environment."""
-    jax.block_until_ready(worker.collect(policy.acting, _STEPS).reward)
+    jax.block_until_ready(worker.collect(policy.inference_parameters, _STEPS).reward)
 
 
 @functools.lru_cache(maxsize=1)

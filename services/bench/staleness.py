@@ -50,7 +50,7 @@ def returns(setting: Setting, seed: int, count: int, worlds: int, config: PPOCon
         def act(observation: np.ndarray, actor: bundles.PolicyBundle = actor) -> tuple[jax.Array, jax.Array]:
             nonlocal key
             key, sample = jax.random.split(key)
-            return bundles.sample_action(toy.LAYOUT, actor.acting, observation, sample)
+            return bundles.sample_action(toy.LAYOUT, actor.inference_parameters, observation, sample)
 
         state, _ = algorithm.update(state, toy.episode(act, worlds, rng))
         past.append(toy.bundle_of(state))

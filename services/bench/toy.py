@@ -66,6 +66,6 @@ def mean_return(bundle: PolicyBundle, worlds: int = 200) -> float:
     """Mean return of the policy's mean actions over fixed goals."""
 
     def act(observation: np.ndarray) -> tuple[Array, Array]:
-        return bundles.mean_action(SPEC.layout, bundle.acting, observation), np.zeros(len(observation))
+        return bundles.mean_action(SPEC.layout, bundle.inference_parameters, observation), np.zeros(len(observation))
 
     return float(episode(act, worlds, np.random.default_rng(123))["reward"].sum(0).mean())

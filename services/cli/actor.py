@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from common.config import PhysicsName
+from actors.physics import PhysicsName
 from common.transport.ports import LEARNER_URL
 from services.cli.watch import Watch, Watched
 

@@ -2,7 +2,7 @@
 
 import pathlib
 
-from common.config import PhysicsName
+from actors.physics import PhysicsName
 
 
 def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines: tuple[str, ...] = ()) -> int:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-from common.config import PhysicsName
+from actors.physics import PhysicsName
 from common.errors import CongraspError
 
 if TYPE_CHECKING:

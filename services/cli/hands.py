@@ -11,7 +11,7 @@ def list_hands() -> int:
 
     from common.errors import CongraspError
     from common.hands import HANDS, get_hand, hands_folder, own_hands
-    from common.policy.pretrained import shipped
+    from common.policy.pretrained import pretrained_file
     from services.cli.console import show_table
 
     rows, missing = [], []
@@ -29,7 +29,7 @@ def list_hands() -> int:
             f"{sum(link.mass for link in hand.links):.2f} kg",
             f"{max(joint.torque_limit for joint in hand.joints):.1f} N.m",
             f"x {hand.object_scale:g}",
-            "pretrained" if shipped(name) else "none",
+            "pretrained" if pretrained_file(name) else "none",
         )
         rows.append(row)
     show_table(("hand", "joints", "fingers", "mass", "torque", "objects", "policy"), rows)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from common.config import PhysicsName
+from actors.physics import PhysicsName
 from common.errors import CongraspError
 
 if TYPE_CHECKING:

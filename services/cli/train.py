@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
+import actors.physics  # noqa: F401 - registers the engines that --physics offers
 from common.config import MetricWriter, RunConfig
 from learner.run_directory import CONFIG_FILE, open_run
 from services.train.presets import get_preset, with_hand

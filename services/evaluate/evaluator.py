@@ -14,7 +14,8 @@ from actors.bank import build_bank
 from actors.env import EnvState, metric_names
 from actors.episode import episode_message
 from actors.rollout import RolloutWorker, Trace, finished_episodes
-from common.config import PhysicsName, TaskConfig
+from common.config import TaskConfig
+from common.engines import ENGINES, PhysicsName
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects.pool import scale_objects
@@ -28,7 +29,6 @@ from services.evaluate.noise import LEVELS, Noise, with_noise
 from services.evaluate.scores import Row, Sample, active_mask, joined, matching, summarise
 from services.evaluate.worlds import NOMINAL_FRICTION, evaluation_worker, protocol, sampling_config, two_seconds
 
-_BATCH = {"native": 64, "warp": 4096, "jax": 256}
 _PATIENCE = 100
 _ATTEMPTS = 40
 _REFERENCES = 4
@@ -77,7 +77,7 @@ class Evaluator:
         self._hand = get_hand(bundle.spec.hand)
         self.objects = scale_objects(self._hand, self.task, objects)
         self._physics, self._threads, self._seed = physics, threads, seed
-        self._batch = batch or _BATCH[physics]
+        self._batch = batch or ENGINES[physics].batch
         self._bank = bank or build_bank(self._hand, self.task, self.objects, seed)
         self._harvested = bank is not None
         self._kept: dict[str, dict[bool, list[Message]]] = {}
@@ -186,7 +186,7 @@ class Evaluator:
             filled = idle = 0
             while filled < slots and idle < _ATTEMPTS * regions.sum():
                 worker.restart()
-                worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
+                worker.collect(self.bundle.inference_parameters, self.task.approach_steps + self.task.hold_steps)
                 worker.renew_references()
                 before, filled = filled, int(np.any(worker.bank.pose_valid, axis=2)[regions].sum())
                 idle = 0 if filled > before else idle + self._batch
@@ -231,7 +231,7 @@ class Evaluator:
         wanted = _REFERENCES * len(self.objects)
         for _ in range(0, 2 * wanted, self._batch):
             worker.restart()
-            worker.collect(self.bundle.acting, self.task.approach_steps + self.task.hold_steps)
+            worker.collect(self.bundle.inference_parameters, self.task.approach_steps + self.task.hold_steps)
             worker.renew_references()
         made = int(np.asarray(worker.bank.pose_valid).any(2).sum())
         if made < wanted // 4:  # a policy that hardly grasps: those that closing the hand gave are all there is
@@ -340,7 +340,7 @@ class Evaluator:
             trace,
             begun.goal.row(world),
             Surface(*(np.asarray(field)[world] for field in begun.surface)),
-            self.objects[int(np.asarray(begun.world.object_index)[world])],
+            self.objects[int(np.asarray(begun.reset_state.object_index)[world])],
             {
                 "version": self.bundle.version,
                 "actor": "evaluation",
@@ -385,7 +385,7 @@ class Evaluator:
         traces: list[Trace] = []
         begun = self._begin(worker)
         for step in range(0, length, piece):
-            rollout = worker.collect(self.bundle.acting, piece)
+            rollout = worker.collect(self.bundle.inference_parameters, piece)
             traces.append(rollout.trace)
             if step + piece > start and step < start + window:
                 rows = slice(max(0, start - step), start + window - step)

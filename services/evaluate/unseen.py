@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from common.config import PhysicsName
+from common.engines import PhysicsName
 from common.objects import procedural
 from common.objects.spec import GraspObject
 from common.parallel import parallel_map

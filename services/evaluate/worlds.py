@@ -11,7 +11,8 @@ import numpy as np
 
 from actors.physics import make_physics
 from actors.rollout import RolloutWorker
-from common.config import PhysicsName, TaskConfig
+from common.config import TaskConfig
+from common.engines import PhysicsName
 from common.hands import get_hand
 from common.objects.mjcf import CONTACT
 from common.objects.pool import object_scale
@@ -110,7 +111,7 @@ def evaluation_worker(
     engine = make_physics(physics, hand, task, objects, threads=threads)
     try:
         yield RolloutWorker(
-            hand, task, engine, bank, policy, batch=batch, seed=seed, half=False, probe=probe, traced=traced
+            hand, task, engine, bank, policy, batch=batch, seed=seed, half_precision=False, probe=probe, traced=traced
         )
     finally:
         engine.close()

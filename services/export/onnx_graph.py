@@ -49,7 +49,7 @@ def policy_model(bundle: PolicyBundle, meta: Mapping[str, Any]) -> onnx.ModelPro
       meta: what goes into the file, each value as JSON.
     """
     layout, layers = bundle.spec.layout, bundle.params["actor"]["network"]
-    shift, scale = bundle.acting.normalization
+    shift, scale = bundle.inference_parameters.normalization
     graph = _Graph()
     centred = graph.node("Sub", ["observation", graph.constant("shift", shift)], "centred")
     scaled = graph.node("Mul", [centred, graph.constant("scale", scale)], "scaled")

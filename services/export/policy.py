@@ -136,7 +136,7 @@ def export_policy(bundle: PolicyBundle, kind: str, path: pathlib.Path) -> float:
     """
     encoded = _onnx(bundle) if kind == "onnx" else _stablehlo(bundle)
     observations = sample_observations(bundle, _SAMPLES)
-    expected = np.asarray(mean_action(bundle.spec.layout, bundle.acting, jnp.asarray(observations)))
+    expected = np.asarray(mean_action(bundle.spec.layout, bundle.inference_parameters, jnp.asarray(observations)))
     answers = _run_onnx(encoded, observations) if kind == "onnx" else _run_stablehlo(encoded, observations)
     difference = float(np.abs(answers - expected).max())
     if not difference <= TOLERANCE:
@@ -165,7 +165,7 @@ def _run_onnx(encoded: bytes, observations: np.ndarray) -> np.ndarray:
 
 def _stablehlo(bundle: PolicyBundle) -> bytes:
     """A ZIP with `policy.jax` (for `jax.export.deserialize`), `policy.mlirbc` (portable StableHLO) and `meta.json`."""
-    layout, acting = bundle.spec.layout, jax.device_get(bundle.acting)
+    layout, acting = bundle.spec.layout, jax.device_get(bundle.inference_parameters)
     size = sum(width for _, width in layout)
     function = jax.jit(lambda observation: mean_action(layout, acting, observation))
     batch = jax.export.symbolic_shape("batch")[0]

@@ -93,12 +93,12 @@ def set_of(
     allowed = np.zeros((len(REGIONS), rests, row.heading_position.shape[1]), bool)
     back = np.zeros(allowed.shape, np.float32)
     for v, r in np.ndindex(allowed.shape[:2]):
-        if v == 0 or row.has_affordance[r] or not row.minus.any():
+        if v == 0 or row.has_affordance[r] or not row.avoid.any():
             allowed[v, r, row.heading_index[v, r]] = True
             back[v, r, row.heading_index[v, r]] = row.heading_back[v, r]
     arrays = {
         "surface/points": row.points,
-        "surface/minus": row.minus,
+        "surface/minus": row.avoid,
         "rest": row.rest[:rests],
         "heading/position": row.heading_position,
         "heading/direction": row.heading_direction,
@@ -194,7 +194,7 @@ def _row(made: Message, split: Split) -> ConstraintBank:
     index = np.array([[np.resize(np.flatnonzero(row) if row.any() else [0], count) for row in v] for v in heading])
     return ConstraintBank(
         points=arrays["surface/points"],
-        minus=arrays["surface/minus"],
+        avoid=arrays["surface/minus"],
         rest=arrays["rest"][usable],
         heading_position=arrays["heading/position"],
         heading_direction=arrays["heading/direction"],

@@ -228,7 +228,7 @@ class Grasper:
         active = explain(asked, bool(outcome.redirected[index]))
         written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
         avoid = labelled.non_graspable_points
-        active += [found.words for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
+        active += [found.message for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
         return Grasp(episode, motion_of_episode(episode), attempts, held, rest, tuple(active))
 
 

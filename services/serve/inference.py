@@ -11,7 +11,7 @@ import numpy as np
 from common.config import TaskConfig
 from common.errors import CongraspError, ContradictionError
 from common.hands.spec import Hand
-from common.policy.bundle import Acting, mean_action
+from common.policy.bundle import InferenceParameters, mean_action
 from common.task import control, observation
 from common.task.constraints.priority import explain, resolve
 from common.task.features import scene_of
@@ -45,12 +45,12 @@ class PolicyFunction:
         alone = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
         self._compiled = jax.jit(self._infer, compiler_options=alone)
 
-    def warm_up(self, weights: Acting, sizes: Sequence[int] = BATCH_SIZES) -> None:
+    def warm_up(self, weights: InferenceParameters, sizes: Sequence[int] = BATCH_SIZES) -> None:
         """Compiles batches of these sizes."""
         for size in sizes:
             jax.block_until_ready(self._compiled(weights, np.zeros((size, self.layout.size), np.float32)))
 
-    def __call__(self, weights: Acting, queries: Sequence[Query]) -> list[Inference | Exception]:
+    def __call__(self, weights: InferenceParameters, queries: Sequence[Query]) -> list[Inference | Exception]:
         """Answers queries of at most `BATCH_SIZES[-1]` states; one that cannot be answered gets its own error."""
         ends = list(itertools.accumulate(len(query.vectors) for query in queries))
         batch = np.zeros((next(size for size in BATCH_SIZES if size >= ends[-1]), self.layout.size), np.float32)
@@ -76,7 +76,7 @@ class PolicyFunction:
         parts = np.split(answer.vectors[0], [fingers + 6, 2 * fingers + 6])
         return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
 
-    def _infer(self, weights: Acting, vectors: jax.Array) -> jax.Array:
+    def _infer(self, weights: InferenceParameters, vectors: jax.Array) -> jax.Array:
         """For states (B, S): answers (A + F + 6), the flags redirected and aligned, and checks (C), in one (B, ...)."""
         hand, task = self.layout.hand, self.layout.task
         fields, checks = self.layout.complete(vectors)

@@ -101,7 +101,7 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     found = get_hand(hand)
     (obj,) = scale_objects(found, task, [procedural.generate(seed)])
     initial_conditions = initial.sample(found, task, build_bank(found, task, [obj], seed), jax.random.key(seed), 1)
-    world = {name: np.asarray(value)[0] for name, value in initial_conditions.world._asdict().items()}
+    world = {name: np.asarray(value)[0] for name, value in initial_conditions.reset_state._asdict().items()}
     pose = world["object_position"], world["object_quaternion"]
     request = GraspRequest(
         {"heading": initial_conditions.goal.row(0)["heading"]._asdict()},

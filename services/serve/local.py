@@ -27,14 +27,14 @@ class LocalPolicy(EpisodePolicy):
         super().__init__()
         self._bundle = bundle
         self._function = PolicyFunction(get_hand(bundle.spec.hand), bundle.task)
-        self._function.warm_up(bundle.acting, BATCH_SIZES[:1])
+        self._function.warm_up(bundle.inference_parameters, BATCH_SIZES[:1])
 
     def _query(self, query: Message) -> Message:
         """The reply of a server with this bundle."""
         began = time.perf_counter()
         try:
             parsed = self._function.layout.parse(query)
-            (answer,) = self._function(self._bundle.acting, [parsed])
+            (answer,) = self._function(self._bundle.inference_parameters, [parsed])
             if isinstance(answer, Exception):
                 raise answer
         except CongraspError as error:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from common.errors import CongraspError, LateError, OverloadedError, TransportError
 from common.hands import get_hand
 from common.policy import bundle as bundles
-from common.policy.bundle import Acting, PolicyBundle, content_hash
+from common.policy.bundle import InferenceParameters, PolicyBundle, content_hash
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode
@@ -35,7 +35,7 @@ class _Held(NamedTuple):
 
     bundle: PolicyBundle
     hash: str
-    acting: Acting
+    inference_parameters: InferenceParameters
 
 
 _Answered = tuple[Inference, _Held, float, float]
@@ -75,7 +75,7 @@ class PolicyServer:
         self._on_answer, self._on_batch = on_answer, on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
-        self._function.warm_up(self._held.acting)
+        self._function.warm_up(self._held.inference_parameters)
         self._answered = 0
         self._trouble = ""
         self._closed = threading.Event()
@@ -158,7 +158,7 @@ class PolicyServer:
         """Answers a batch."""
         held, began = self._held, time.monotonic()
         self._on_batch(sum(len(query.vectors) for query in queries))
-        answers = self._function(held.acting, queries)
+        answers = self._function(held.inference_parameters, queries)
         spent = time.monotonic() - began
         return [
             answer if isinstance(answer, Exception) else (answer, held, waited, spent)
@@ -191,7 +191,7 @@ class PolicyServer:
 
 def _hold(bundle: PolicyBundle) -> _Held:
     """A policy ready for use."""
-    return _Held(bundle, content_hash(encode(bundle.to_message())), bundle.acting)
+    return _Held(bundle, content_hash(encode(bundle.to_message())), bundle.inference_parameters)
 
 
 def follow_file(path: pathlib.Path) -> Source:

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from rich.console import Console
 
-from common.config import MetricWriter, ObjectsConfig, PhysicsName, RunConfig
+from common.config import MetricWriter, ObjectsConfig, RunConfig
+from common.engines import ENGINES, PhysicsName
 from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, policy_spec
-from common.policy.pretrained import shipped
+from common.policy.pretrained import pretrained_file
 from common.transport import urls
 from common.transport.ports import LEARNER_URL
 from common.transport.security import CERTIFICATE_FILE, check_exposure
@@ -152,7 +153,7 @@ def _plan(config: RunConfig, actors: int | None, ranks: int, *, listens: bool) -
     gpus = ranks > 1 and leave_gpus_to(ranks)
     physics = engine_of(config.physics, gpus)
     if actors is None:
-        actors = 0 if physics == "warp" and not listens else 2
+        actors = 0 if ENGINES[physics].on_device and not listens else 2
     return _Plan(ranks, actors, physics, gpus)
 
 
@@ -193,7 +194,7 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int, before: list[
     _compare(before, _evaluate(policy, config, episodes, "after training"))
     _live_query(run_dir, config.task.hand)
     _picture(policy, config, run_dir)
-    if pretrained and (best := shipped(config.task.hand)):
+    if pretrained and (best := pretrained_file(config.task.hand)):
         _pretrained_picture(best, run_dir)
 
 

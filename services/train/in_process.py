@@ -9,7 +9,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from actors.process import run_actor
-from common.config import MetricWriter, PhysicsName, RunConfig
+from common.config import MetricWriter, RunConfig
+from common.engines import PhysicsName
 from common.transport import urls
 from common.transport.base import Transport
 from common.transport.pair import PairTransport

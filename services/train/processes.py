@@ -14,7 +14,8 @@ from typing import Any
 import jax
 
 from actors.physics import resolve_physics
-from common.config import MetricWriter, PhysicsName, RunConfig
+from common.config import MetricWriter, RunConfig
+from common.engines import PhysicsName
 from common.errors import CongraspError, TransportError
 from common.journal import AUDIT
 from common.transport import urls
@@ -188,9 +189,7 @@ def leave_gpus_to(ranks: int) -> bool:
 
 def engine_of(name: PhysicsName, gpus: bool) -> PhysicsName:
     """What `auto` is for the ranks, where this process may see no GPU although they do."""
-    if gpus:
-        return "warp" if name == "auto" else name
-    return resolve_physics(name)
+    return resolve_physics(name, "cuda" if gpus else "")
 
 
 def _gpu(rank: int) -> str:

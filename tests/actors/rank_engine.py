@@ -1,11 +1,11 @@
-"""One of two ranks that steps a world of the engine warp; says on whose devices it lies. Arguments: rank, port."""
+"""One of two ranks that steps an environment in warp; says on whose devices it lies. Arguments: rank, port."""
 
 import sys
 
 import jax
 import jax.numpy as jnp
 
-from actors.physics.engine import World
+from actors.physics.engine import ResetState
 from actors.physics.warp import WarpPhysics
 from common.config import TaskConfig
 from common.hands import get_hand
@@ -21,9 +21,9 @@ def main() -> None:
     one, zero, level = jnp.ones(1), jnp.zeros((1, 3)), jnp.array([[1.0, 0.0, 0.0, 0.0]])
     fingers = jnp.zeros((1, len(hand.joints)))
     index = jnp.zeros(1, int)
-    state = physics.start(World(index, one, one, zero, level, fingers, zero, level, index > 0))
-    state, seen = physics.step(state, jnp.zeros((1, 6 + len(hand.joints))), index == 0)
-    leaves = [leaf for leaf in jax.tree.leaves((state, seen)) if isinstance(leaf, jax.Array)]
+    state = physics.start(ResetState(index, one, one, zero, level, fingers, zero, level, index > 0))
+    state, after = physics.step(state, jnp.zeros((1, 6 + len(hand.joints))), index == 0)
+    leaves = [leaf for leaf in jax.tree.leaves((state, after)) if isinstance(leaf, jax.Array)]
     print(sorted({device.process_index for leaf in leaves for device in leaf.devices()}), len(leaves) > 20)
     ranks.exchange({})
     ranks.close()

@@ -9,7 +9,7 @@ import pytest
 
 from actors.bank import POSES, build_bank, make_references
 from actors.harvest import Grasps, renew
-from actors.physics.engine import where_worlds
+from actors.physics.engine import where_environments
 from common import rotations
 from common.config import TaskConfig
 from common.errors import CongraspError
@@ -100,9 +100,9 @@ def test_a_grasp_replaces_one_reference_of_its_object_and_region(bank):
     jax.tree.map(np.testing.assert_array_equal, nothing, flat)
 
 
-def test_only_masked_worlds_are_exchanged():
+def test_only_masked_environments_are_exchanged():
     mask = jnp.array([True, False])
     new, old = {"a": jnp.ones((2, 3)), "b": jnp.array([True, True])}, {"a": jnp.zeros((2, 3)), "b": jnp.zeros(2, bool)}
-    merged = where_worlds(mask, new, old)
+    merged = where_environments(mask, new, old)
     np.testing.assert_array_equal(merged["a"], [[1, 1, 1], [0, 0, 0]])
     np.testing.assert_array_equal(merged["b"], [True, False])

@@ -12,7 +12,7 @@ from actors import initial
 from actors.bank import build_bank
 from actors.initial import InitialConditions
 from actors.physics import resolve_physics
-from actors.physics.engine import World
+from actors.physics.engine import ResetState
 from actors.physics.mjx import MjxPhysics
 from actors.physics.native import NativePhysics
 from actors.physics.slots import LEAVES, Pool
@@ -26,7 +26,7 @@ from common.objects.spec import GraspObject
 HAND = get_hand("human")
 TASK = TaskConfig(p_pose=0.0, p_trajectory=0.0, p_affordance=0.0)
 OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "cylinder", "mug"])]
-WORLDS = 3
+ENVIRONMENTS = 3
 
 
 def one_each(objects: Sequence[GraspObject]) -> InitialConditions:
@@ -35,9 +35,8 @@ def one_each(objects: Sequence[GraspObject]) -> InitialConditions:
     fresh = initial.sample(HAND, TASK, bank, jax.random.key(1), len(objects))
     index = jnp.arange(len(objects))
     rest = bank.rest[index, 0]
-    return fresh._replace(
-        world=fresh.world._replace(object_index=index, object_position=rest[:, :3], object_quaternion=rest[:, 3:])
-    )
+    start = fresh.reset_state._replace(object_index=index, object_position=rest[:, :3], object_quaternion=rest[:, 3:])
+    return fresh._replace(reset_state=start)
 
 
 @pytest.fixture(scope="module")
@@ -45,16 +44,16 @@ def env():
     return one_each(OBJECTS)
 
 
-def above(world: World, height: float) -> World:
+def above(start: ResetState, height: float) -> ResetState:
     """The hand far above its object, palm down."""
-    down = np.tile([1.0, 0.0, 0.0, 0.0], (len(world.q), 1)).astype(np.float32)
-    position = np.asarray(world.object_position) + np.array([0.0, 0.09, height], np.float32)
-    return world._replace(base_position=position, base_quaternion=down)
+    down = np.tile([1.0, 0.0, 0.0, 0.0], (len(start.q), 1)).astype(np.float32)
+    position = np.asarray(start.object_position) + np.array([0.0, 0.09, height], np.float32)
+    return start._replace(base_position=position, base_quaternion=down)
 
 
-def grasp(world: World, step: int) -> np.ndarray:
+def grasp(start: ResetState, step: int) -> np.ndarray:
     """A scripted approach: down on the object within 15 steps, then closing."""
-    target = np.zeros((len(world.q), 6 + len(HAND.joints)))
+    target = np.zeros((len(start.q), 6 + len(HAND.joints)))
     target[:, 2] = -0.13 * min(1.0, step / 15)
     closing = np.clip((step - 15) / 20, 0.0, 1.0)
     target[:, 6:] = HAND.q_open + closing * (HAND.q_closed - HAND.q_open)
@@ -63,24 +62,24 @@ def grasp(world: World, step: int) -> np.ndarray:
 
 def test_objects_rest_and_the_hand_stays_without_commands(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(above(env.world, 0.3))
-    still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(env.world.q)], 1)
+    state = physics.start(above(env.reset_state, 0.3))
+    still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.reset_state.q)], 1)
     for _ in range(50):
-        state, seen = physics.step(state, still, np.ones(WORLDS, bool))
-    np.testing.assert_allclose(seen.object_position, env.world.object_position, atol=2e-3)
-    np.testing.assert_allclose(seen.q, env.world.q, atol=1e-3)  # gravity on the hand is compensated
-    assert not seen.contact_found.any() and not seen.bad.any()
+        state, after = physics.step(state, still, np.ones(ENVIRONMENTS, bool))
+    np.testing.assert_allclose(after.object_position, env.reset_state.object_position, atol=2e-3)
+    np.testing.assert_allclose(after.q, env.reset_state.q, atol=1e-3)  # gravity on the hand is compensated
+    assert not after.contact_found.any() and not after.diverged.any()
     physics.close()
 
 
 def test_a_removed_table_lets_objects_fall_freely(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(above(env.world, 0.3))
-    still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(env.world.q)], 1)
+    state = physics.start(above(env.reset_state, 0.3))
+    still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.reset_state.q)], 1)
     table = np.array([True, False, False])
     for _ in range(20):
-        state, seen = physics.step(state, still, table)
-    drop = np.asarray(env.world.object_position)[:, 2] - seen.object_position[:, 2]
+        state, after = physics.step(state, still, table)
+    drop = np.asarray(env.reset_state.object_position)[:, 2] - after.object_position[:, 2]
     assert abs(drop[0]) < 2e-3
     np.testing.assert_allclose(drop[1:], 0.5 * 9.81 * 0.2**2, rtol=0.05)
     physics.close()
@@ -88,14 +87,14 @@ def test_a_removed_table_lets_objects_fall_freely(env):
 
 def test_a_stationary_object_stays_when_pushed(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    world = above(env.world, 0.19)._replace(stationary=np.ones(WORLDS, bool))
-    state = physics.start(world)
-    touched = np.zeros(WORLDS, bool)
+    start = above(env.reset_state, 0.19)._replace(stationary=np.ones(ENVIRONMENTS, bool))
+    state = physics.start(start)
+    touched = np.zeros(ENVIRONMENTS, bool)
     for step in range(40):
-        state, seen = physics.step(state, grasp(world, step), np.ones(WORLDS, bool))
-        touched |= seen.contact_found.any((1, 2))
+        state, after = physics.step(state, grasp(start, step), np.ones(ENVIRONMENTS, bool))
+        touched |= after.contact_found.any((1, 2))
     assert touched.any()
-    np.testing.assert_allclose(seen.object_position, env.world.object_position, atol=4e-3)
+    np.testing.assert_allclose(after.object_position, env.reset_state.object_position, atol=4e-3)
     physics.close()
 
 
@@ -105,7 +104,7 @@ def test_contact_force_is_that_of_the_object_on_the_link(env):
     physics = NativePhysics(HAND, TASK, [box], 1)
     upturned = np.array([[0.0, 1.0, 0.0, 0.0]], np.float32)  # palm up
     height = float(np.abs(box.points[:, 2]).max())
-    world = World(
+    start = ResetState(
         object_index=np.zeros(1, int),
         mass_scale=np.ones(1),
         friction=np.ones(1),
@@ -116,11 +115,11 @@ def test_contact_force_is_that_of_the_object_on_the_link(env):
         object_quaternion=np.array([[1.0, 0.0, 0.0, 0.0]]),
         stationary=np.zeros(1, bool),
     )
-    state = physics.start(world)
+    state = physics.start(start)
     forces = []
     for _ in range(150):
-        state, seen = physics.step(state, np.zeros((1, 6 + len(HAND.joints))), np.ones(1, bool))
-        forces.append(seen.contact_force.sum((1, 2))[0])
+        state, after = physics.step(state, np.zeros((1, 6 + len(HAND.joints))), np.ones(1, bool))
+        forces.append(after.contact_force.sum((1, 2))[0])
     np.testing.assert_allclose(np.mean(forces[-40:], 0)[2], -box.mass * 9.81, rtol=0.1)
     physics.close()
 
@@ -134,7 +133,7 @@ def test_gains_hold_half_a_kilogram_without_shaking():
     # The axis across the palm, welded until the fingers have closed firmly around it.
     center = np.array([0.005, -0.09, -0.035])
     sideways = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
-    world = World(
+    start = ResetState(
         object_index=np.zeros(1, int),
         mass_scale=np.full(1, scale),
         friction=np.ones(1),
@@ -145,19 +144,19 @@ def test_gains_hold_half_a_kilogram_without_shaking():
         object_quaternion=sideways[None],
         stationary=np.ones(1, bool),
     )
-    state = physics.start(world)
-    cell = physics.cells[0]
+    state = physics.start(start)
+    instance = physics.instances[0]
     target = np.zeros((1, 6 + len(HAND.joints)))
     speeds, positions = [], []
     for step in range(250):
         firm = HAND.q_open + min(1.3, step / 30) * (HAND.q_closed - HAND.q_open)
         target[:, 6:] = np.clip(firm, HAND.lower, HAND.upper)
         if step == 60:
-            cell.data.eq_active[physics._where.weld] = False
-        state, seen = physics.step(state, target, np.zeros(1, bool))
+            instance.data.eq_active[physics._where.weld] = False
+        state, after = physics.step(state, target, np.zeros(1, bool))
         if step >= 200:
-            speeds.append(np.linalg.norm(seen.object_velocity))
-            positions.append(seen.object_position[0])
+            speeds.append(np.linalg.norm(after.object_velocity))
+            positions.append(after.object_position[0])
     assert positions[-1][2] > 0.85, "the object fell"
     assert max(speeds) < 0.05, "the object shakes"
     assert np.ptp(np.array(positions), 0).max() < 0.01
@@ -167,17 +166,17 @@ def test_gains_hold_half_a_kilogram_without_shaking():
 def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     physics = NativePhysics(HAND, TASK, OBJECTS, 2)
-    world = above(env.world, 0.3)
-    state = physics.start(world)
-    still = np.concatenate([np.zeros((WORLDS, 6)), np.asarray(env.world.q)], 1)
-    state, _ = physics.step(state, still, np.ones(WORLDS, bool))
-    physics.cells[1].data.qvel[:] = np.nan
-    state, seen = physics.step(state, still, np.ones(WORLDS, bool))
-    np.testing.assert_array_equal(seen.bad, [False, True, False])
-    assert all(np.isfinite(field).all() for field in seen)
-    np.testing.assert_allclose(seen.q[1], np.asarray(world.q)[1], atol=1e-6)
-    state, seen = physics.step(state, still, np.ones(WORLDS, bool))
-    assert not seen.bad.any()
+    start = above(env.reset_state, 0.3)
+    state = physics.start(start)
+    still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.reset_state.q)], 1)
+    state, _ = physics.step(state, still, np.ones(ENVIRONMENTS, bool))
+    physics.instances[1].data.qvel[:] = np.nan
+    state, after = physics.step(state, still, np.ones(ENVIRONMENTS, bool))
+    np.testing.assert_array_equal(after.diverged, [False, True, False])
+    assert all(np.isfinite(field).all() for field in after)
+    np.testing.assert_allclose(after.q[1], np.asarray(start.q)[1], atol=1e-6)
+    state, after = physics.step(state, still, np.ones(ENVIRONMENTS, bool))
+    assert not after.diverged.any()
     assert not list(tmp_path.iterdir()), "MuJoCo wrote its own log"
     physics.close()
 
@@ -185,32 +184,32 @@ def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp
 def test_a_world_that_was_used_before_is_as_good_as_new(env):
     """Worlds are recycled: neither state nor mass of an earlier episode may be left in them."""
     physics, fresh = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, OBJECTS, 1)
-    world = above(env.world, 0.19)
-    everywhere = np.ones(WORLDS, bool)
-    state = physics.start(world._replace(mass_scale=np.full(WORLDS, 3.0), stationary=everywhere))
+    start = above(env.reset_state, 0.19)
+    everywhere = np.ones(ENVIRONMENTS, bool)
+    state = physics.start(start._replace(mass_scale=np.full(ENVIRONMENTS, 3.0), stationary=everywhere))
     for step in range(30):
-        physics.step(state, grasp(world, step), ~everywhere)
-    swapped = world._replace(object_index=np.array([2, 0, 0]))
+        physics.step(state, grasp(start, step), ~everywhere)
+    swapped = start._replace(object_index=np.array([2, 0, 0]))
     state, new = physics.reset(state, everywhere, swapped), fresh.start(swapped)
     for step in range(30):
-        state, seen = physics.step(state, grasp(world, step), everywhere)
-        new, expected = fresh.step(new, grasp(world, step), everywhere)
-    assert seen.contact_found.any()
-    for a, b in zip(seen, expected, strict=True):
+        state, after = physics.step(state, grasp(start, step), everywhere)
+        new, expected = fresh.step(new, grasp(start, step), everywhere)
+    assert after.contact_found.any()
+    for a, b in zip(after, expected, strict=True):
         np.testing.assert_array_equal(a, b)
     physics.close()
     fresh.close()
 
 
-def test_reset_changes_only_the_masked_worlds(env):
+def test_reset_changes_only_the_masked_environments(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    world = above(env.world, 0.3)
-    state = physics.start(world)
-    moving = np.concatenate([np.full((WORLDS, 6), 0.05), np.asarray(world.q)], 1)
+    start = above(env.reset_state, 0.3)
+    state = physics.start(start)
+    moving = np.concatenate([np.full((ENVIRONMENTS, 6), 0.05), np.asarray(start.q)], 1)
     for _ in range(10):
-        state, before = physics.step(state, moving, np.ones(WORLDS, bool))
+        state, before = physics.step(state, moving, np.ones(ENVIRONMENTS, bool))
     mask = np.array([False, True, False])
-    state = physics.reset(state, mask, world._replace(object_index=np.array([0, 2, 2])))
+    state = physics.reset(state, mask, start._replace(object_index=np.array([0, 2, 2])))
     after = physics.read(state)
     np.testing.assert_allclose(after.u[1], 0.0)
     np.testing.assert_allclose(after.u[~mask], before.u[~mask], atol=1e-7)
@@ -237,30 +236,30 @@ def test_a_pool_may_begin_with_an_object_whose_inertia_is_diagonal():
 @pytest.mark.timeout(400)
 def test_jax_agrees_with_native(env):
     """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
-    world = above(env.world, 0.19)
+    start = above(env.reset_state, 0.19)
     native = NativePhysics(HAND, TASK, OBJECTS, 1)
     other = MjxPhysics(HAND, TASK, OBJECTS)
     step = jax.jit(other.step)
-    a, b = native.start(world), other.start(jax.tree.map(jnp.asarray, world))
-    table = np.ones(WORLDS, bool)
-    force = np.zeros((2, WORLDS))
+    a, b = native.start(start), other.start(jax.tree.map(jnp.asarray, start))
+    table = np.ones(ENVIRONMENTS, bool)
+    force = np.zeros((2, ENVIRONMENTS))
     for i in range(40):
-        target = grasp(world, i)
+        target = grasp(start, i)
         a, x = native.step(a, target, table)
         b, y = step(b, jnp.asarray(target, jnp.float32), jnp.asarray(table))
         if not x.contact_found.any() and i < 10:
             for name in ("q", "u", "object_position", "q_velocity", "u_velocity"):
                 np.testing.assert_allclose(getattr(x, name), getattr(y, name), atol=2e-4, err_msg=f"{name} at {i}")
-        assert not x.usage.any() and not y.usage.any()
-        force += [np.linalg.norm(seen.contact_force, axis=-1).sum((1, 2)) for seen in (x, y)]
+        assert not x.occupancy.any() and not y.occupancy.any()
+        force += [np.linalg.norm(after.contact_force, axis=-1).sum((1, 2)) for after in (x, y)]
     assert force[0].max() > 0, "the script must make contact"
-    assert not np.asarray(y.bad).any()
+    assert not np.asarray(y.diverged).any()
     np.testing.assert_allclose(x.q, y.q, atol=0.25)
     np.testing.assert_allclose(x.object_position, y.object_position, atol=0.03)
     np.testing.assert_allclose(force[0], force[1], rtol=0.35, atol=20.0)
-    # A reset puts the masked worlds back and leaves the rest.
+    # A reset puts the masked environments back and leaves the rest.
     mask = jnp.array([True, False, False])
-    again = other.read(other.reset(b, mask, jax.tree.map(jnp.asarray, world)))
+    again = other.read(other.reset(b, mask, jax.tree.map(jnp.asarray, start)))
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(again.u[1:], y.u[1:], atol=1e-6)
     native.close()
@@ -280,12 +279,12 @@ def test_a_demanded_gpu_that_is_missing_is_one_clear_line():
 
 def test_object_velocity_is_in_the_world_frame(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(above(env.world, 0.3))
-    cell = physics.cells[0]
+    state = physics.start(above(env.reset_state, 0.3))
+    instance = physics.instances[0]
     spin = np.array([0.0, 0.0, 3.0])  # about the world's vertical
-    quaternion = jnp.asarray(cell.data.qpos[physics._where.object_qpos[3:]], jnp.float32)
+    quaternion = jnp.asarray(instance.data.qpos[physics._where.object_qpos[3:]], jnp.float32)
     local = np.asarray(rotations.rotate(rotations.conjugate(quaternion), jnp.asarray(spin, jnp.float32)))
-    cell.data.qvel[physics._where.object_qvel[3:]] = local
-    physics._qpos[0], physics._qvel[0] = cell.data.qpos, cell.data.qvel
+    instance.data.qvel[physics._where.object_qvel[3:]] = local
+    physics._qpos[0], physics._qvel[0] = instance.data.qpos, instance.data.qvel
     np.testing.assert_allclose(physics.read(state).object_angular_velocity[0], spin, atol=1e-5)
     physics.close()

@@ -1,4 +1,4 @@
-"""The engine warp on a CPU: a mesh for each world, resets, other objects, compiled loops, agreement with native."""
+"""Warp on a CPU: a mesh for each environment, resets, other objects, compiled loops, agreement with native."""
 
 import dataclasses
 import os
@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from actors.physics import warp_worlds
+from actors.physics import warp_buffers
 from actors.physics.catalogue import Catalogue
-from actors.physics.engine import World
+from actors.physics.engine import ResetState
 from actors.physics.native import NativePhysics
 from actors.physics.scene import compile_scene
 from actors.physics.warp import WarpPhysics
@@ -31,18 +31,18 @@ OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "bo
 OTHERS = [procedural.generate(i, family) for i, family in enumerate(["ring", "cylinder", "bowl", "bowl", "box"], 7)]
 
 
-def _worlds(objects: Sequence[GraspObject]) -> World:
-    return jax.tree.map(jnp.asarray, above(one_each(objects).world, 0.19))
+def _starts(objects: Sequence[GraspObject]) -> ResetState:
+    return jax.tree.map(jnp.asarray, above(one_each(objects).reset_state, 0.19))
 
 
 @pytest.fixture(scope="module")
-def world():
-    return _worlds(OBJECTS)
+def start():
+    return _starts(OBJECTS)
 
 
 @pytest.fixture(scope="module")
 def others():
-    return _worlds(OTHERS)
+    return _starts(OTHERS)
 
 
 def _same(a, b):
@@ -50,19 +50,19 @@ def _same(a, b):
         np.testing.assert_array_equal(x, y)
 
 
-def _picked(world: World, index: list[int]) -> World:
-    return World(*(leaf[np.array(index)] for leaf in world))
+def _picked(start: ResetState, index: list[int]) -> ResetState:
+    return ResetState(*(leaf[np.array(index)] for leaf in start))
 
 
-def _agrees_with_native(objects: Sequence[GraspObject], world: World) -> None:
+def _agrees_with_native(objects: Sequence[GraspObject], start: ResetState) -> None:
     """A scripted grasp: tightly until something is touched and squeezed, statistically after that."""
     native, warp = NativePhysics(HAND, TASK, objects, 1), WarpPhysics(HAND, TASK, objects)
     step, batch = jax.jit(warp.step), len(objects)
-    a, b = native.start(world), warp.start(world)
+    a, b = native.start(start), warp.start(start)
     table = np.ones(batch, bool)
     force = np.zeros((2, batch))
     for i in range(40):
-        target = grasp(world, i)
+        target = grasp(start, i)
         a, x = native.step(a, target, table)
         b, y = step(b, jnp.asarray(target), jnp.asarray(table))
         if i < 10:
@@ -72,9 +72,9 @@ def _agrees_with_native(objects: Sequence[GraspObject], world: World) -> None:
         if i == 20:
             np.testing.assert_allclose(x.contact_force, y.contact_force, atol=0.5)
             np.testing.assert_allclose(x.object_position, y.object_position, atol=1e-3)
-        force += [np.linalg.norm(seen.contact_force, axis=-1).sum((1, 2)) for seen in (x, y)]
+        force += [np.linalg.norm(after.contact_force, axis=-1).sum((1, 2)) for after in (x, y)]
     assert (force[0] > 0).all(), "the script must touch every object"
-    assert not np.asarray(y.bad).any()
+    assert not np.asarray(y.diverged).any()
     np.testing.assert_allclose(x.q, y.q, atol=0.25)
     np.testing.assert_allclose(x.object_position, y.object_position, atol=0.03)
     np.testing.assert_allclose(force[0], force[1], rtol=0.35, atol=20.0)
@@ -83,8 +83,8 @@ def _agrees_with_native(objects: Sequence[GraspObject], world: World) -> None:
 
 
 @pytest.mark.timeout(400)
-def test_primitives_and_meshes_of_one_pool_agree_with_native(world):
-    _agrees_with_native(OBJECTS, world)
+def test_primitives_and_meshes_of_one_pool_agree_with_native(start):
+    _agrees_with_native(OBJECTS, start)
 
 
 def _scanned(folder: pathlib.Path) -> GraspObject:
@@ -104,7 +104,7 @@ def _scanned(folder: pathlib.Path) -> GraspObject:
 def test_scanned_objects_agree_with_native(shared_objects):
     objects = [_scanned(shared_objects / name) for name in ("camera", "flashlight", "hammer")]
     assert max(len(obj.pieces) for obj in objects) > 1
-    _agrees_with_native(objects, _worlds(objects))
+    _agrees_with_native(objects, _starts(objects))
 
 
 def test_rows_are_what_mujoco_compiles():
@@ -135,25 +135,25 @@ def test_rows_are_what_mujoco_compiles():
     assert set(rows["geom_dataid"][rows["geom_dataid"] >= 0]) == set(range(meshes.nmesh))
 
 
-def test_a_reset_picks_each_worlds_object_and_leaves_the_others(world):
+def test_a_reset_picks_each_environments_object_and_leaves_the_others(start):
     warp, native = WarpPhysics(HAND, TASK, OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
     step, table = jax.jit(warp.step), jnp.ones(4, bool)
-    state = warp.start(world)
+    state = warp.start(start)
     for i in range(5):
-        state, _ = step(state, jnp.asarray(grasp(world, i)), table)
-    swapped = _picked(world, [3, 2, 1, 0])
+        state, _ = step(state, jnp.asarray(grasp(start, i)), table)
+    swapped = _picked(start, [3, 2, 1, 0])
     mask = jnp.array([True, True, False, True])
-    mixed = World(
-        *(jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(swapped, world, strict=True))
+    mixed = ResetState(
+        *(jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(swapped, start, strict=True))
     )
     started = jax.jit(warp.reset)(state, mask, swapped)
     _same(jax.tree.map(lambda leaf: leaf[2], started), jax.tree.map(lambda leaf: leaf[2], state))
-    _same(started.world, mixed)
+    _same(started.reset_state, mixed)
     np.testing.assert_array_equal(warp.read(started).u[mask], 0.0)
     a = native.start(mixed)
     for i in range(20):
-        a, x = native.step(a, grasp(world, i), np.ones(4, bool))
-        started, y = step(started, jnp.asarray(grasp(world, i)), table)
+        a, x = native.step(a, grasp(start, i), np.ones(4, bool))
+        started, y = step(started, jnp.asarray(grasp(start, i)), table)
     assert x.contact_found[np.asarray(mask)].any((1, 2)).all()
     for name in ("contact_force", "object_position", "q"):
         given, expected = getattr(y, name)[mask], getattr(x, name)[mask]
@@ -162,18 +162,18 @@ def test_a_reset_picks_each_worlds_object_and_leaves_the_others(world):
     native.close()
 
 
-def test_other_objects_need_no_compiling_and_worlds_under_way_keep_theirs(world, others):
+def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(start, others):
     warp, untouched = WarpPhysics(HAND, TASK, OBJECTS), WarpPhysics(HAND, TASK, OBJECTS)
     step, step_untouched, table = jax.jit(warp.step), jax.jit(untouched.step), jnp.ones(4, bool)
-    state, expected = warp.start(world), untouched.start(world)
+    state, expected = warp.start(start), untouched.start(start)
     for i in range(30):
-        target = jnp.asarray(grasp(world, i))
+        target = jnp.asarray(grasp(start, i))
         if i in (10, 20):
             state = warp.replace_objects(state, OTHERS if i == 10 else OTHERS[::-1])
-        state, seen = step(state, target, table)
-        expected, seen_untouched = step_untouched(expected, target, table)
-        _same(seen, seen_untouched)
-    assert seen.contact_found.any()
+        state, after = step(state, target, table)
+        expected, after_untouched = step_untouched(expected, target, table)
+        _same(after, after_untouched)
+    assert after.contact_found.any()
     native = NativePhysics(HAND, TASK, OTHERS[::-1], 1)
     new = _picked(others, [4, 3, 2, 0])._replace(object_index=jnp.array([0, 1, 2, 4]))
     state, a = warp.reset(state, table, new), native.start(new)
@@ -187,92 +187,95 @@ def test_other_objects_need_no_compiling_and_worlds_under_way_keep_theirs(world,
     native.close()
 
 
-def test_a_compiled_loop_is_the_same_as_single_steps(world):
+def test_a_compiled_loop_is_the_same_as_single_steps(start):
     """Resets in a branch, two loops after one another, and states that are used twice."""
     warp = WarpPhysics(HAND, TASK, OBJECTS)
-    targets = jnp.stack([jnp.asarray(grasp(world, i)) for i in range(8, 20)])
-    table, swapped = jnp.ones(4, bool), _picked(world, [2, 3, 0, 1])
+    targets = jnp.stack([jnp.asarray(grasp(start, i)) for i in range(8, 20)])
+    table, swapped = jnp.ones(4, bool), _picked(start, [2, 3, 0, 1])
 
     def advance(state, row):
         i, target = row
-        state, seen = warp.step(state, target, table)
+        state, after = warp.step(state, target, table)
         mask = jnp.array([True, False, False, True])
         state = jax.lax.cond(i == 3, lambda s: warp.reset(s, mask, swapped), lambda s: s, state)
-        return state, (seen, warp.read(state))
+        return state, (after, warp.read(state))
 
     loop = jax.jit(lambda state: jax.lax.scan(advance, state, (jnp.arange(len(targets)), targets)))
-    first = state = warp.start(world)
+    first = state = warp.start(start)
     rows = []
     for i, target in enumerate(targets):
         state, row = jax.jit(advance)(state, (jnp.asarray(i), target))
         rows.append(row)
     for _ in range(2):  # the first state is still what it was
-        scanned, seen = loop(first)
+        scanned, after = loop(first)
         _same(scanned, state)
-        _same(seen, jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
+        _same(after, jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
 
 
-def test_meshes_are_absent_from_a_world_alone_too(world):
+def test_meshes_are_absent_from_a_world_alone_too(start):
     """An unused mesh slot in the middle of a sheet would touch the table."""
     sheet = dataclasses.replace(OBJECTS[0], pieces=(Piece("box", (0.04, 0.04, 0.0003)),))
     warp = WarpPhysics(HAND, TASK, [sheet])
-    usage = []
+    occupancy = []
     for batch in (1, 2):
-        flat = _picked(world, [0] * batch)._replace(
+        flat = _picked(start, [0] * batch)._replace(
             object_position=jnp.tile(jnp.array([0.0, 0.0, 0.0003]), (batch, 1)),
             object_quaternion=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (batch, 1)),
         )
-        _, seen = warp.step(warp.start(flat), jnp.asarray(grasp(flat, 0)), jnp.ones(batch, bool))
-        usage.append(seen.usage)
-    np.testing.assert_array_equal(*usage)
+        _, after = warp.step(warp.start(flat), jnp.asarray(grasp(flat, 0)), jnp.ones(batch, bool))
+        occupancy.append(after.occupancy)
+    np.testing.assert_array_equal(*occupancy)
 
 
-def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(world):
+def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(start):
     warp = WarpPhysics(HAND, TASK, OBJECTS)
-    start = warp.start(world)
-    target, table = jnp.asarray(grasp(world, 0)), jnp.ones(4, bool)
+    start = warp.start(start)
+    target, table = jnp.asarray(grasp(start, 0)), jnp.ones(4, bool)
     state, _ = warp.step(start, target, table)
     _, expected = warp.step(state, target, table)
-    state, seen = warp.step(state._replace(qvel=state.qvel.at[1].set(jnp.nan)), target, table)
-    np.testing.assert_array_equal(seen.bad, [False, True, False, False])
-    assert all(np.isfinite(field).all() for field in seen)
+    state, after = warp.step(state._replace(qvel=state.qvel.at[1].set(jnp.nan)), target, table)
+    np.testing.assert_array_equal(after.diverged, [False, True, False, False])
+    assert all(np.isfinite(field).all() for field in after)
     _same(jax.tree.map(lambda leaf: leaf[1], state), jax.tree.map(lambda leaf: leaf[1], start))
-    np.testing.assert_allclose(seen.q[2:], expected.q[2:], atol=1e-6)
-    _, seen = warp.step(state, target, table)
-    assert not seen.bad.any()
+    np.testing.assert_allclose(after.q[2:], expected.q[2:], atol=1e-6)
+    _, after = warp.step(state, target, table)
+    assert not after.diverged.any()
 
 
-def test_buffers_are_as_full_as_what_mujoco_finds(world):
+def test_buffers_are_as_full_as_what_mujoco_finds(start):
     warp, native = WarpPhysics(HAND, TASK, OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
-    state, a = warp.start(world), native.start(world)
+    state, a = warp.start(start), native.start(start)
     for i in range(5):
-        target, table = grasp(world, i), np.ones(4, bool)
-        (state, seen), _ = warp.step(state, jnp.asarray(target), jnp.asarray(table)), native.step(a, target, table)
-        found = [sum(cell.data.ncon for cell in native.cells), max(cell.data.nefc for cell in native.cells)]
-        room = [4 * warp_worlds.CONTACTS_PER_WORLD, warp_worlds.CONSTRAINTS_PER_WORLD]
-        np.testing.assert_allclose(seen.usage, np.divide(found, room), rtol=1e-5)
+        target, table = grasp(start, i), np.ones(4, bool)
+        (state, after), _ = warp.step(state, jnp.asarray(target), jnp.asarray(table)), native.step(a, target, table)
+        found = [
+            sum(instance.data.ncon for instance in native.instances),
+            max(instance.data.nefc for instance in native.instances),
+        ]
+        room = [4 * warp_buffers.CONTACTS_PER_ENVIRONMENT, warp_buffers.CONSTRAINTS_PER_ENVIRONMENT]
+        np.testing.assert_allclose(after.occupancy, np.divide(found, room), rtol=1e-5)
     native.close()
 
 
-def test_what_had_no_room_is_counted(world, monkeypatch):
-    monkeypatch.setattr(warp_worlds, "CONTACTS_PER_WORLD", 2)
+def test_what_had_no_room_is_counted(start, monkeypatch):
+    monkeypatch.setattr(warp_buffers, "CONTACTS_PER_WORLD", 2)
     warp = WarpPhysics(HAND, TASK, OBJECTS)
-    _, crowded = warp.step(warp.start(world), jnp.asarray(grasp(world, 0)), jnp.ones(4, bool))
-    assert crowded.usage[0] > 1 > crowded.usage[1]
+    _, crowded = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
+    assert crowded.occupancy[0] > 1 > crowded.occupancy[1]
 
 
-def test_more_pieces_than_slots_are_one_clear_line(world):
-    with pytest.raises(CongraspError, match=r"'bowl.*' has 8 mesh pieces, and the worlds have room for 3"):
+def test_more_pieces_than_slots_are_one_clear_line(start):
+    with pytest.raises(CongraspError, match=r"'bowl.*' has 8 mesh pieces, and the environments have room for 3"):
         WarpPhysics(HAND, TASK, OBJECTS, mesh_slots=3)
     warp = WarpPhysics(HAND, TASK, [OBJECTS[0]], mesh_slots=0)
-    state = warp.start(_picked(world, [0]))
+    state = warp.start(_picked(start, [0]))
     with pytest.raises(CongraspError, match="room for 0"):
         warp.replace_objects(state, [OBJECTS[1]])
     boxes = dataclasses.replace(OBJECTS[0], pieces=OBJECTS[0].pieces * 4)
     with pytest.raises(CongraspError, match="more than 3 box pieces"):
         warp.replace_objects(state, [boxes])
-    _, seen = warp.step(state, jnp.asarray(grasp(state.world, 0)), jnp.ones(1, bool))
-    assert not seen.bad.any()
+    _, after = warp.step(state, jnp.asarray(grasp(state.reset_state, 0)), jnp.ones(1, bool))
+    assert not after.diverged.any()
 
 
 def test_an_engine_uses_its_own_ranks_device():

@@ -46,7 +46,7 @@ FIELDS = episode_fields(CONFIG.task)
 
 
 def invented(episodes: np.ndarray) -> Rollout:
-    """A rollout of zeros in which every world ended an episode with these metrics (B, fields)."""
+    """A rollout of zeros in which every environment ended an episode with these metrics (B, fields)."""
     zeros = {
         **dict.fromkeys(("q", "q_target"), (T, len(HAND.joints))),
         **dict.fromkeys(("u", "u_target"), (T, 6)),
@@ -61,7 +61,7 @@ def invented(episodes: np.ndarray) -> Rollout:
     given = {
         **FORM.zeros(),
         "episodes": episodes,
-        "usage": np.zeros((T, 2), np.float32),
+        "occupancy": np.zeros((T, 2), np.float32),
         "has_episode": np.ones(B, bool),
         "trace": Trace(**{name: np.zeros(shape, np.float32) for name, shape in zeros.items()}, **flags),
     }
@@ -70,7 +70,7 @@ def invented(episodes: np.ndarray) -> Rollout:
 
 
 class InventedWorker:
-    """Stands in for worlds: gives the same rollout again and again."""
+    """Stands in for environments: gives the same rollout again and again."""
 
     rollout: Rollout
 
@@ -78,8 +78,8 @@ class InventedWorker:
         neutral = goal_of(HAND, CONFIG.task, GraspRequest())
         goal = jax.tree.map(lambda array: array[None], neutral)
         surface = Surface(np.zeros((1, 8, 3), np.float32), np.zeros((1, 8), bool))
-        world = types.SimpleNamespace(object_index=np.zeros(1, int))
-        self.state = types.SimpleNamespace(time=np.zeros(1), goal=goal, surface=surface, world=world)
+        reset_state = types.SimpleNamespace(object_index=np.zeros(1, int))
+        self.state = types.SimpleNamespace(time=np.zeros(1), goal=goal, surface=surface, reset_state=reset_state)
 
     def configure(self, *args, **options):
         pass
@@ -134,8 +134,8 @@ def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
 
 
 def test_steps_in_which_the_physics_left_contacts_out_are_counted():
-    usage = np.array([[0.5, 0.1], [1.0, 0.2], [1.25, 0.2], [0.3, 1.5]], np.float32)
-    assert process.physics_usage(usage) == {"overflow": 2.0, "contacts_peak": 1.25, "rows_peak": 1.5}
+    occupancy = np.array([[0.5, 0.1], [1.0, 0.2], [1.25, 0.2], [0.3, 1.5]], np.float32)
+    assert process.buffer_occupancy(occupancy) == {"overflow": 2.0, "contacts_peak": 1.25, "rows_peak": 1.5}
 
 
 @pytest.mark.timeout(60)
@@ -146,7 +146,7 @@ def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(he
     batch, logs = heard(invented(episodes))
     assert batch is not None, "the learner refused the rollout"
     arrays = batch[0].arrays
-    for i, name in enumerate(FIELDS):  # world 1's
+    for i, name in enumerate(FIELDS):  # environment 1's
         np.testing.assert_array_equal(arrays[name], [i], err_msg=name)
     assert logs["metrics"].meta["values"]["episodes_left_out"] == 2
     episode = logs["episode"].meta["metrics"]

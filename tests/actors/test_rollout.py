@@ -10,7 +10,7 @@ import pytest
 from actors import initial
 from actors.bank import build_bank
 from actors.env import GraspEnv, episode_fields, metric_names
-from actors.physics.engine import Readout, where_worlds
+from actors.physics.engine import PhysicsState, where_environments
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker, finished_episodes
 from common import rotations
@@ -40,7 +40,7 @@ def _noise(parameters, observation, key):
 
 def _worker(bank, task=TASK, seed=0, batch=BATCH):
     physics = NativePhysics(HAND, task, OBJECTS, 2)
-    return RolloutWorker(HAND, task, physics, bank, _noise, batch=batch, seed=seed, half=True)
+    return RolloutWorker(HAND, task, physics, bank, _noise, batch=batch, seed=seed, half_precision=True)
 
 
 def test_masks_are_drawn_as_in_the_paper(bank):
@@ -55,26 +55,26 @@ def test_masks_are_drawn_as_in_the_paper(bank):
 
 
 def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(bank):
-    world, goal, *_ = initial.sample(HAND, TASK, bank, jax.random.key(1), 256)
+    start, goal, *_ = initial.sample(HAND, TASK, bank, jax.random.key(1), 256)
     trajectory = np.asarray(goal.active["trajectory"])
     first = rotations.compose_pose(
-        world.object_position,
-        world.object_quaternion,
+        start.object_position,
+        start.object_quaternion,
         goal["trajectory"].position[:, 0],
         goal["trajectory"].quaternion[:, 0],
     )
-    np.testing.assert_allclose(np.asarray(world.base_position)[trajectory], np.asarray(first[0])[trajectory], atol=1e-5)
+    np.testing.assert_allclose(np.asarray(start.base_position)[trajectory], np.asarray(first[0])[trajectory], atol=1e-5)
     # Otherwise v points along v-bar, and the hand centre lies 15 cm before p-bar.
-    direction = np.asarray(rotations.rotate(world.object_quaternion, goal["heading"].direction))
-    v = np.asarray(rotations.rotate(world.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, (256, 3))))
+    direction = np.asarray(rotations.rotate(start.object_quaternion, goal["heading"].direction))
+    v = np.asarray(rotations.rotate(start.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, (256, 3))))
     np.testing.assert_allclose(v[~trajectory], direction[~trajectory], atol=1e-4)
-    center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, world.q)))
-    center = np.asarray(rotations.rotate(world.base_quaternion, center) + world.base_position)
-    target = np.asarray(rotations.rotate(world.object_quaternion, goal["heading"].position) + world.object_position)
+    center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, start.q)))
+    center = np.asarray(rotations.rotate(start.base_quaternion, center) + start.base_position)
+    target = np.asarray(rotations.rotate(start.object_quaternion, goal["heading"].position) + start.object_position)
     np.testing.assert_allclose((center + TASK.back_off * direction)[~trajectory], target[~trajectory], atol=1e-4)
     pose = np.asarray(goal.active["pose_finger"])
-    np.testing.assert_allclose(np.asarray(world.q)[pose], np.asarray(goal["pose"].q)[pose], atol=1e-6)
-    np.testing.assert_allclose(np.asarray(world.q)[~pose], np.tile(HAND.q_open, (256 - pose.sum(), 1)), atol=1e-6)
+    np.testing.assert_allclose(np.asarray(start.q)[pose], np.asarray(goal["pose"].q)[pose], atol=1e-6)
+    np.testing.assert_allclose(np.asarray(start.q)[~pose], np.tile(HAND.q_open, (256 - pose.sum(), 1)), atol=1e-6)
 
 
 def test_rollouts_go_through_whole_episodes_and_on(bank):
@@ -100,7 +100,7 @@ def test_rollouts_go_through_whole_episodes_and_on(bank):
     worker.restart()
     assert not np.asarray(worker.state.time).any()
     third = worker.collect(None, 1)
-    np.testing.assert_allclose(third.trace.object_position[0], worker.state.world.object_position[0], atol=0.01)
+    np.testing.assert_allclose(third.trace.object_position[0], worker.state.reset_state.object_position[0], atol=0.01)
     worker.physics.close()
 
 
@@ -110,7 +110,7 @@ def test_success_needs_the_object_to_stay_up(bank):
     away = build_bank(HAND, task, OBJECTS, 0)
     physics = NativePhysics(HAND, task, OBJECTS, 2)
     still = lambda p, o, k: (jnp.zeros((o.shape[0], 26)).at[:, 20:23].set(-20.0), jnp.zeros(o.shape[0]))  # noqa: E731
-    worker = RolloutWorker(HAND, task, physics, away, still, batch=BATCH, seed=0, half=False)
+    worker = RolloutWorker(HAND, task, physics, away, still, batch=BATCH, seed=0, half_precision=False)
     episodes = finished_episodes(worker.collect(None, 75), task)
     untouched = episodes["episode/links_at_removal"] == 0
     assert untouched.any()
@@ -127,23 +127,23 @@ def _begun(physics, task, conditions):
 
 def _advance(env, targets):
     """A control step of which the engine's part is given."""
-    step = jax.jit(lambda state, readout: env.advance(state, targets, readout, env.settings))
-    return lambda state, readout: step(state._replace(scene=()), readout)
+    step = jax.jit(lambda state, after: env.advance(state, targets, after, env.settings))
+    return lambda state, after: step(state._replace(scene=()), after)
 
 
 def test_a_lifted_object_that_stays_is_a_success(bank):
     """The protocol's bookkeeping on invented readouts: held up, against dropped by more than 5 cm."""
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    env, state, readout = _begun(physics, TASK, initial.sample(HAND, TASK, bank, jax.random.key(2), 2))
-    found = np.zeros(readout.contact_found.shape, bool)
+    env, state, after = _begun(physics, TASK, initial.sample(HAND, TASK, bank, jax.random.key(2), 2))
+    found = np.zeros(after.contact_found.shape, bool)
     found[:, 0, 0] = True
-    readout = readout._replace(contact_found=found)
+    after = after._replace(contact_found=found)
     advance = _advance(env, Action(state.q_target, state.u_target))
     for step in range(75):
-        position = np.array(readout.object_position)
+        position = np.array(after.object_position)
         if step >= 55:
-            position[1, 2] = state.world.object_position[1, 2] - 0.06
-        state, _ = advance(state, readout._replace(object_position=position))
+            position[1, 2] = state.reset_state.object_position[1, 2] - 0.06
+        state, _ = advance(state, after._replace(object_position=position))
     finished = dict(zip(episode_fields(TASK), np.asarray(state.finished).T, strict=True))
     np.testing.assert_array_equal(finished["episode/success"], [1.0, 0.0])
     assert set(metric_names(TASK)) <= {name.removeprefix("episode/") for name in finished}
@@ -156,17 +156,20 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(bank, end_when_fal
     task = dataclasses.replace(TASK, hold_steps_max=40, end_when_fallen=end_when_fallen)
     physics = NativePhysics(HAND, task, OBJECTS, 1)
     drawn = initial.sample(HAND, task, bank, jax.random.key(2), 2)
-    env, state, readout = _begun(physics, task, drawn._replace(hold=jnp.full(2, 40)))
-    found, force = np.zeros(readout.contact_found.shape, bool), np.zeros(readout.contact_force.shape, np.float32)
+    env, state, after = _begun(physics, task, drawn._replace(hold=jnp.full(2, 40)))
+    found, force = (
+        np.zeros(after.contact_found.shape, bool),
+        np.zeros(after.contact_force.shape, np.float32),
+    )
     found[:, 0, 0] = True
     advance = _advance(env, Action(state.q_target, state.u_target))
     terminal = []
     for step in range(1, 91):
-        position = np.array(readout.object_position)
+        position = np.array(after.object_position)
         position[1, 2] -= 0.06 if step > 80 else 0.0
         pressed = force.copy()
         pressed[:, 0, 0, 0] = 3.0 if step <= 75 else 30.0
-        shown = readout._replace(object_position=position, contact_found=found, contact_force=pressed)
+        shown = after._replace(object_position=position, contact_found=found, contact_force=pressed)
         state, transition = advance(state, shown)
         terminal.append(np.asarray(transition.terminal))
     finished = dict(zip(episode_fields(task), np.asarray(state.finished).T, strict=True))
@@ -188,43 +191,43 @@ class _Touching:
 
     name, compiled = "touching", True
 
-    def start(self, world):
-        return world
+    def start(self, start):
+        return start
 
-    def reset(self, state, mask, world):
-        return where_worlds(mask, world, state)
+    def reset(self, state, mask, start):
+        return where_environments(mask, start, state)
 
     def step(self, state, target, table):
-        return state, self._readout(state, True)
+        return state, self._physics_state(state, True)
 
     def read(self, state):
-        return self._readout(state, False)
+        return self._physics_state(state, False)
 
     def close(self):
         pass
 
-    def _readout(self, world, touching):
-        batch, links = world.q.shape[0], len(HAND.links)
+    def _physics_state(self, start, touching):
+        batch, links = start.q.shape[0], len(HAND.links)
         none = jnp.zeros((batch, 6))
-        return Readout(
-            q=world.q,
+        return PhysicsState(
+            q=start.q,
             u=none,
-            q_velocity=jnp.zeros_like(world.q),
+            q_velocity=jnp.zeros_like(start.q),
             u_velocity=none,
-            object_position=world.object_position,
-            object_quaternion=world.object_quaternion,
+            object_position=start.object_position,
+            object_quaternion=start.object_quaternion,
             object_velocity=none[:, :3],
             object_angular_velocity=none[:, :3],
             contact_force=jnp.ones((batch, links, CONTACTS_PER_LINK, 3)),
             contact_position=jnp.zeros((batch, links, CONTACTS_PER_LINK, 3)),
             contact_found=jnp.full((batch, links, CONTACTS_PER_LINK), touching),
-            bad=jnp.zeros(batch, bool),
-            usage=jnp.zeros(2),
+            diverged=jnp.zeros(batch, bool),
+            occupancy=jnp.zeros(2),
         )
 
 
 def test_a_world_that_goes_on_keeps_its_contacts_when_another_restarts(bank):
-    worker = RolloutWorker(HAND, TASK, _Touching(), bank, _noise, batch=2, seed=0, half=False)
+    worker = RolloutWorker(HAND, TASK, _Touching(), bank, _noise, batch=2, seed=0, half_precision=False)
     state = worker.state
     worker.state = state._replace(
         time=jnp.array([70, 70]),

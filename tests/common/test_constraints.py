@@ -11,7 +11,7 @@ import pytest
 
 from actors.bank import build_bank
 from actors.initial import InitialConditions, sample
-from common.config import GraspWeights, RewardWeights, TaskConfig
+from common.config import RewardWeights, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
@@ -20,7 +20,7 @@ from common.task.constraints import CONSTRAINTS, PAPER, blocks, get_constraint, 
 from common.task.constraints.priority import active_blocks
 from common.task.features import scene_of
 from common.task.observation import fields, layout, observe
-from common.task.reward import reward_terms, terms
+from common.task.reward import GRASP, reward_terms, terms
 from tests.scenes import HAND, active, scene
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
@@ -53,9 +53,9 @@ def _without(whole, constraint):
 def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
     described, sizes = fields(HAND, TASK), dict(layout(HAND, TASK))
     names = constraint.blocks or (constraint.name,)
-    seen = constraint.observe(whole)
-    assert len(seen) == len(names) == len(constraint.fields(HAND, TASK))
-    for name, parts in zip(names, seen, strict=True):
+    observed = constraint.observe(whole)
+    assert len(observed) == len(names) == len(constraint.fields(HAND, TASK))
+    for name, parts in zip(names, observed, strict=True):
         assert [part.shape[-1] for part in parts] == [field.size for field in described[name]], name
         assert sum(part.shape[-1] for part in parts) == sizes[name]
         assert all(field.name and field.meaning for field in described[name])
@@ -76,7 +76,7 @@ def test_names_are_unique_over_all_constraints():
         "columns": [error.column or error.name for error in errors],
         "weights": [
             *(weight.name for constraint in CONSTRAINTS for weight in constraint.weights),
-            *(field.name for field in dataclasses.fields(GraspWeights)),
+            *(term.name for term in GRASP),
         ],
         "blocks": ["state", *(block for c in CONSTRAINTS for block in c.blocks or (c.name,)), "mask"],
         "options": [option.name for constraint in CONSTRAINTS for option in constraint.options],
@@ -226,7 +226,7 @@ def _same(some: InitialConditions, more: InitialConditions, but: str) -> None:
     for one, other in (goals, actives):
         for name in one:
             np.testing.assert_array_equal(one[name], other[name], err_msg=name)
-    for name in ("world", "surface", "region", "hold"):
+    for name in ("reset_state", "surface", "region", "hold"):
         jax.tree.map(np.testing.assert_array_equal, getattr(some, name), getattr(more, name))
 
 

@@ -28,7 +28,7 @@ THUMB_TIP, MIDDLE_TIP, RING_TIP = 16, 18, 19
 
 
 def pinch(on: bool = True):
-    """One world: the object is 2 cm from the middle finger's skin, 4 mm from the ring finger's, and far from the rest.
+    """The object is 2 cm from the middle finger's skin, 4 mm from the ring finger's, and far from the rest.
 
     Palm, thumb, index, middle and ring finger touch it; index and middle with 3 and 5 N.
     """
@@ -135,9 +135,9 @@ def test_words():
 def test_features_of_a_whole_step_reach_it():
     """Against NumPy, on a random scene: the finger's room is that of its nearest keypoint's skin."""
     state, surface, goal = scene(4)
-    seen = features(HAND, TASK, state, surface, goal)
+    geometry = features(HAND, TASK, state, surface, goal)
     ((_, room, _),) = FINGERS.observe(scene_of(HAND, TASK, state, surface, goal))
-    skin = np.linalg.norm(seen.nearest, axis=-1) - HAND.keypoint_radii
+    skin = np.linalg.norm(geometry.nearest, axis=-1) - HAND.keypoint_radii
     for finger in range(5):
         own = [i for i, link in enumerate(HAND.keypoint_links) if (link - 1) // 3 == finger and link > 0]
         assert len(own) == 4  # three joints and a tip

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from actors.physics.engine import World
+from actors.physics.engine import ResetState
 from actors.physics.native import NativePhysics
 from common.config import TaskConfig
 from common.errors import CongraspError
@@ -167,7 +167,7 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
     axes = np.stack([frame.heading, frame.cross, along], -1)
     down = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]) @ axes.T)
     quaternion = (down * Rotation.from_matrix(axes)).as_quat(scalar_first=True)
-    world = World(
+    reset_state = ResetState(
         object_index=np.zeros(1, int),
         mass_scale=np.full(1, 0.4 / cylinder.mass),
         friction=np.ones(1),
@@ -179,7 +179,7 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
         stationary=np.ones(1, bool),
     )
     physics = NativePhysics(hand, task, [cylinder], 1)
-    state = physics.start(world)
+    state = physics.start(reset_state)
     target = np.zeros((1, 6 + len(hand.joints)))
     touched = np.zeros(len(hand.links), bool)
     speeds = []
@@ -187,15 +187,15 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
         firm = hand.q_open + min(1.2, step / 30) * (hand.q_closed - hand.q_open)
         target[:, 6:] = np.clip(firm, hand.lower, hand.upper)
         if step == 60:
-            physics.cells[0].data.eq_active[physics._where.weld] = False
-        state, seen = physics.step(state, target, np.zeros(1, bool))
-        touched |= seen.contact_found[0].any(-1)
+            physics.instances[0].data.eq_active[physics._where.weld] = False
+        state, after = physics.step(state, target, np.zeros(1, bool))
+        touched |= after.contact_found[0].any(-1)
         if step >= 180:
-            speeds.append(np.linalg.norm(seen.object_velocity))
+            speeds.append(np.linalg.norm(after.object_velocity))
     physics.close()
     fingers = {hand.links[i].name.partition("_")[0] for i in np.flatnonzero(touched)}
     assert "thumb" in fingers and len(fingers - {"palm"}) >= 3, fingers
-    moved = np.asarray(seen.object_position[0]) - world.object_position[0]
+    moved = np.asarray(after.object_position[0]) - reset_state.object_position[0]
     assert moved[2] > -0.02 and np.linalg.norm(moved) < 0.10, "the object fell"  # fingers may pull it into the palm
     assert max(speeds) < 0.05, "the object shakes"
 

@@ -57,25 +57,25 @@ def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
     assert -(direction * obj.normals[source]).sum(-1).min() > np.cos(np.radians(30)) - 1e-5
     widths = [local_width(obj.points[:256], *heading) for heading in zip(position, direction, cross, strict=True)]
     assert max(widths) <= MAX_WIDTH + 1e-5
-    minus = obj.non_graspable_points
+    avoid = obj.non_graspable_points
     if affordance:
-        assert not minus[source].any()
-        # No point of O- within 1 cm of the approach, and the end nearer to O+.
+        assert not avoid[source].any()
+        # No point of the avoid region within 1 cm of the approach, and the end nearer to the graspable one.
         along = np.linspace(0, 0.15, 60)
         for p, v in zip(position[::16], direction[::16], strict=True):
             way = p - along[:, None] * v
-            assert np.linalg.norm(way[:, None] - obj.points[minus], axis=-1).min() > 0.0099
+            assert np.linalg.norm(way[:, None] - obj.points[avoid], axis=-1).min() > 0.0099
             to = np.linalg.norm(obj.points - p, axis=-1)
-            assert to[~minus].min() <= to[minus].min() + 1e-6
-        # Seen along the cross-finger axis, O+ reaches further than O- to both sides.
+            assert to[~avoid].min() <= to[avoid].min() + 1e-6
+        # Seen along the cross-finger axis, the graspable region reaches further to both sides.
         for p, v, w in zip(position, direction, cross, strict=True):
             offset = (obj.points - p)[:256]
             breadth, depth = np.abs(offset @ np.cross(v, w)), offset @ v
-            sides = (offset @ w)[(breadth < 0.0301) & (depth < 0.0101) & ~minus[:256]]
-            opposed = (offset @ w)[(breadth < 0.0299) & (depth < 0.0199) & minus[:256]]
+            sides = (offset @ w)[(breadth < 0.0301) & (depth < 0.0101) & ~avoid[:256]]
+            opposed = (offset @ w)[(breadth < 0.0299) & (depth < 0.0199) & avoid[:256]]
             assert (opposed < sides.max() - 0.0049).all() and (opposed > sides.min() + 0.0049).all()
     else:
-        assert 0.5 * minus.mean() < minus[source].mean() or minus.mean() < 0.2
+        assert 0.5 * avoid.mean() < avoid[source].mean() or avoid.mean() < 0.2
 
 
 def test_headings_repeat_with_the_random_state_and_differ_without():
@@ -126,7 +126,7 @@ def test_few_headings_are_repeated_and_none_falls_back_to_the_narrowest():
 
 
 def test_the_smaller_part_of_a_ball_cannot_be_held_alone():
-    """Below its equator a ball slips out of any hand, and O- is wider there."""
+    """Below its equator a ball slips out of any hand, and the avoid region is wider there."""
     ball = generate(0, "ball")
     height = ball.points[:, 2]
     for cut, held in ((0.3, False), (0.9, True)):

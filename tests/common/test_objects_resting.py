@@ -108,11 +108,11 @@ def test_settling_reports_what_moved():
 def test_the_mujoco_body_is_the_object(family):
     obj = generate(4, family)
     spec = mujoco.MjSpec()
-    add_object(spec, obj, "thing", contype=2, conaffinity=4)
+    add_object(spec, obj, "body", contype=2, conaffinity=4)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    body = model.body("thing")
+    body = model.body("body")
     np.testing.assert_allclose(body.mass, obj.mass)
     turn = shapes.matrix(body.iquat)
     np.testing.assert_allclose(turn @ np.diag(body.inertia) @ turn.T, obj.inertia, rtol=1e-5, atol=1e-12)

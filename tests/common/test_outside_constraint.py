@@ -89,7 +89,7 @@ def episodes(task):
 
     worker = RolloutWorker(
         hand, task, physics, build_bank(hand, task, objects, 0), policy,
-        batch=batch, seed=0, half=False, traced=slice(None),
+        batch=batch, seed=0, half_precision=False, traced=slice(None),
     )  # fmt: skip
     goal = jax.device_get(worker.state.goal)
     rollout = worker.collect(None, task.approach_steps + task.hold_steps)
@@ -196,9 +196,9 @@ if __name__ == "__main__":
     TASK = dataclasses.replace(
         TaskConfig(constraints=(*constraints.PAPER, "level")), approach_steps=2, hold_steps=1, hold_steps_max=1
     )
-    seen = episodes(TASK)
+    metrics = episodes(TASK)
     print("episodes")
-    tables(TASK, seen)
+    tables(TASK, metrics)
     print("tables")
     server(TASK)
     print("server")

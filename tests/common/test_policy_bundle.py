@@ -129,25 +129,26 @@ def test_files_that_are_none_are_refused(bundle, tmp_path):
         bundles.load(path)
 
 
-def test_acting_normalises_and_knows_its_log_probability(bundle):
+def test_inference_normalises_and_knows_its_log_probability(bundle):
     raw = np.random.default_rng(1).normal(size=(5, 17)).astype(np.float16)
     raw[:, -4:] = 1.0
     affine = normalizer.observation_affine(bundle.observation, LAYOUT)
     mean, log_std = network.policy(bundle.params, LAYOUT, normalizer.apply(affine, raw))
-    np.testing.assert_allclose(bundles.mean_action(LAYOUT, bundle.acting, raw), mean, rtol=1e-5, atol=1e-6)
-    action, log_probability = bundles.sample_action(LAYOUT, bundle.acting, raw, jax.random.PRNGKey(0))
+    parameters = bundle.inference_parameters
+    np.testing.assert_allclose(bundles.mean_action(LAYOUT, parameters, raw), mean, rtol=1e-5, atol=1e-6)
+    action, log_probability = bundles.sample_action(LAYOUT, parameters, raw, jax.random.PRNGKey(0))
     np.testing.assert_allclose(log_probability, network.log_probability(mean, log_std, action), rtol=1e-4)
-    other, _ = bundles.sample_action(LAYOUT, bundle.acting, raw, jax.random.PRNGKey(1))
+    other, _ = bundles.sample_action(LAYOUT, parameters, raw, jax.random.PRNGKey(1))
     assert not np.allclose(action, other)
 
 
 def test_new_weights_do_not_compile_again(bundle):
     raw = np.zeros((3, 17), np.float32)
-    bundles.mean_action(LAYOUT, bundle.acting, raw)
+    bundles.mean_action(LAYOUT, bundle.inference_parameters, raw)
     compiled = bundles.mean_action._cache_size()
     moved = dataclasses.replace(bundle, params=jax.tree.map(lambda x: x + 1, bundle.params))
     wire = PolicyBundle.from_message(decode(encode(moved.to_message())))
-    bundles.mean_action(LAYOUT, wire.acting, raw)
+    bundles.mean_action(LAYOUT, wire.inference_parameters, raw)
     assert bundles.mean_action._cache_size() == compiled
 
 

@@ -84,7 +84,7 @@ def test_identity_before_anything_was_seen():
 
 
 @pytest.fixture
-def seen() -> np.ndarray:
+def observations() -> np.ndarray:
     rng = np.random.default_rng(4)
     x = rng.normal(3.0, 2.0, size=(2000, SIZE))
     x[:, -4:] = rng.integers(0, 2, size=(2000, 4))
@@ -96,18 +96,18 @@ def seen() -> np.ndarray:
     return x.astype(np.float32)
 
 
-def test_each_group_is_normalised_in_its_own_way(seen):
-    affine = normalizer.observation_affine(exact(seen), LAYOUT)
-    y = np.asarray(normalizer.apply(affine, seen))
+def test_each_group_is_normalised_in_its_own_way(observations):
+    affine = normalizer.observation_affine(exact(observations), LAYOUT)
+    y = np.asarray(normalizer.apply(affine, observations))
     np.testing.assert_allclose(y[:, :3].mean(0), 0.0, atol=1e-4)
     np.testing.assert_allclose(y[:, :3].std(0), 1.0, rtol=1e-4)
     np.testing.assert_allclose(np.sqrt((y[:, 3:-4] ** 2).mean(0)), 1.0, rtol=1e-4)
-    np.testing.assert_array_equal(y[:, 3:-4] == 0.0, seen[:, 3:-4] == 0.0)
-    np.testing.assert_array_equal(y[:, -4:], seen[:, -4:])
+    np.testing.assert_array_equal(y[:, 3:-4] == 0.0, observations[:, 3:-4] == 0.0)
+    np.testing.assert_array_equal(y[:, -4:], observations[:, -4:])
 
 
-def test_outliers_are_clipped(seen):
-    affine = normalizer.observation_affine(exact(seen), LAYOUT)
+def test_outliers_are_clipped(observations):
+    affine = normalizer.observation_affine(exact(observations), LAYOUT)
     y = np.asarray(normalizer.apply(affine, np.full((1, SIZE), 1e6, np.float32)))
     assert y.max() == 10.0
 
@@ -117,9 +117,9 @@ def test_a_block_that_was_never_active_stays_finite():
     assert np.isfinite(normalizer.apply(affine, np.full((1, SIZE), 0.3, np.float32))).all()
 
 
-def test_half_precision_observations_become_float32(seen):
-    affine = normalizer.observation_affine(exact(seen), LAYOUT)
-    assert normalizer.apply(affine, seen.astype(np.float16)).dtype == np.float32
+def test_half_precision_observations_become_float32(observations):
+    affine = normalizer.observation_affine(exact(observations), LAYOUT)
+    assert normalizer.apply(affine, observations.astype(np.float16)).dtype == np.float32
 
 
 def test_values_by_hand():

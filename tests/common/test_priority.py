@@ -56,29 +56,29 @@ def test_under_a_trajectory_the_poses_fingers_are_carried_by_its_last_waypoint()
     np.testing.assert_allclose(done.goal["pose"].q, asked["pose"].q)
 
 
-def _two_regions(plus_x: float, minus_x: float):
+def _two_regions(graspable_x: float, avoid_x: float):
     _, surface, asked = scene(1)
-    x = np.where(surface.minus, minus_x, plus_x)
+    x = np.where(surface.avoid, avoid_x, graspable_x)
     points = np.stack([x, 0.001 * surface.points[..., 1], 0.001 * surface.points[..., 2]], -1).astype(np.float32)
     return surface._replace(points=points), asked
 
 
-@pytest.mark.parametrize("at_minus", [True, False])
-def test_affordance_turns_a_heading_that_comes_nearer_to_o_minus(at_minus):
-    surface, asked = _two_regions(plus_x=0.1, minus_x=-0.1)
-    where = np.tile(np.array([-0.1 if at_minus else 0.1, 0.0, 0.0], np.float32), (4, 1))
+@pytest.mark.parametrize("at_avoided", [True, False])
+def test_affordance_turns_a_heading_that_comes_nearer_to_the_avoid_region(at_avoided):
+    surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)
+    where = np.tile(np.array([-0.1 if at_avoided else 0.1, 0.0, 0.0], np.float32), (4, 1))
     down = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (4, 1))
     cross = np.tile(np.array([0.0, 1.0, 0.0], np.float32), (4, 1))
     asked = asked.replace("heading", position=where, direction=down, cross=cross)
     done = resolve(HAND, surface, asked, _flags(affordance=True))
-    assert np.all(np.asarray(done.redirected) == at_minus)
+    assert np.all(np.asarray(done.redirected) == at_avoided)
     np.testing.assert_allclose(done.goal["heading"].position[:, 0], 0.1, atol=1e-3)
     assert not np.any(resolve(HAND, surface, asked, _flags()).redirected)
 
 
 @pytest.mark.parametrize(("end_x", "aligned"), [(0.1, True), (-0.1, False)])
 def test_trajectory_and_affordance_must_agree(end_x, aligned):
-    surface, asked = _two_regions(plus_x=0.1, minus_x=-0.1)
+    surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)
     path = asked["trajectory"].position.copy()
     path[:, -1] = [end_x, 0.0, 0.05]
     asked = asked.replace("trajectory", position=path)

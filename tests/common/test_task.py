@@ -62,9 +62,9 @@ def test_moving_and_turning_the_whole_scene_changes_nothing(seed, motion):
     # observations do not know the vertical and stand any motion.
     level = moved(state, np.append(rng.normal(size=2), 0.0), Rotation.from_euler("z", rng.uniform(-3, 3)))
     free = moved(state, rng.normal(size=3), Rotation.random(rng=rng))
-    seen = OBSERVE(state, surface, goal)
-    np.testing.assert_allclose(seen, OBSERVE(level, surface, goal), atol=2e-3)
-    np.testing.assert_allclose(seen, OBSERVE(free, surface, goal), atol=2e-3)
+    observed = OBSERVE(state, surface, goal)
+    np.testing.assert_allclose(observed, OBSERVE(level, surface, goal), atol=2e-3)
+    np.testing.assert_allclose(observed, OBSERVE(free, surface, goal), atol=2e-3)
     a, b = REWARD(state, surface, goal, UNIT), REWARD(level, surface, goal, UNIT)
     for name in TERMS:
         np.testing.assert_allclose(a[name], b[name], rtol=2e-3, atol=5e-3, err_msg=name)
@@ -80,39 +80,39 @@ def test_moving_and_turning_the_whole_scene_changes_nothing(seed, motion):
 
 def test_features_against_numpy():
     state, surface, goal = scene(7)
-    seen = FEATURES(state, surface, goal)
-    avoided = seen.of["affordance"]
+    geometry = FEATURES(state, surface, goal)
+    avoided = geometry.of["affordance"]
     b = 2
     wrist = _rotation(state.base_quaternion[b]) * Rotation.from_euler("XYZ", state.u[b, 3:])
     origin = state.base_position[b] + _rotation(state.base_quaternion[b]).apply(state.u[b, :3])
-    np.testing.assert_allclose(seen.wrist_position[b], origin, atol=1e-5)
+    np.testing.assert_allclose(geometry.wrist_position[b], origin, atol=1e-5)
     body = _rotation(state.object_quaternion[b])
     cloud = wrist.inv().apply(body.apply(surface.points[b]) + state.object_position[b] - origin)  # in the wrist frame
     points = np.asarray(keypoints(HAND, link_transforms(HAND, state.q[b])))
     offsets = cloud[None] - points[:, None]
     distance = np.linalg.norm(offsets, axis=-1)
     nearest = offsets[np.arange(len(points)), distance.argmin(1)]
-    np.testing.assert_allclose(seen.nearest[b], nearest, atol=1e-4)
-    minus = np.where(surface.minus[b], distance, np.inf)
+    np.testing.assert_allclose(geometry.nearest[b], nearest, atol=1e-4)
+    avoid = np.where(surface.avoid[b], distance, np.inf)
     np.testing.assert_allclose(
-        avoided.distance[b], (minus.min(1) - HAND.keypoint_radii)[1:].min(), atol=1e-4
+        avoided.distance[b], (avoid.min(1) - HAND.keypoint_radii)[1:].min(), atol=1e-4
     )  # the palm does not count as a finger
     forces = wrist.inv().apply(state.contact_force[b].reshape(-1, 3)).reshape(L, -1, 3)
     forces *= state.contact_found[b][..., None]
-    np.testing.assert_allclose(seen.force[b], forces.sum(1), atol=1e-4)
+    np.testing.assert_allclose(geometry.force[b], forces.sum(1), atol=1e-4)
     where = body.inv().apply(state.contact_position[b].reshape(-1, 3) - state.object_position[b])
-    label = surface.minus[b][np.linalg.norm(where[:, None] - surface.points[b][None], axis=-1).argmin(1)].reshape(L, -1)
+    label = surface.avoid[b][np.linalg.norm(where[:, None] - surface.points[b][None], axis=-1).argmin(1)].reshape(L, -1)
     np.testing.assert_array_equal(avoided.touching[b], (state.contact_found[b] & label).any(1))
     np.testing.assert_array_equal(avoided.touching_graspable[b], (state.contact_found[b] & ~label).any(1))
     np.testing.assert_allclose(avoided.force[b], (forces * label[..., None]).sum(1), atol=1e-4)
-    np.testing.assert_allclose(seen.force[b] - avoided.force[b], (forces * ~label[..., None]).sum(1), atol=1e-4)
+    np.testing.assert_allclose(geometry.force[b] - avoided.force[b], (forces * ~label[..., None]).sum(1), atol=1e-4)
 
 
-def test_without_o_minus_there_is_nothing_to_avoid():
+def test_without_an_avoid_region_there_is_nothing_to_avoid():
     state, surface, goal = scene(8)
-    seen = FEATURES(state, surface._replace(minus=np.zeros_like(surface.minus)), goal).of["affordance"]
-    assert np.all(np.asarray(seen.distance) == np.float32(FAR))
-    assert not np.any(seen.nearest) and not np.any(seen.touching)
+    geometry = FEATURES(state, surface._replace(avoid=np.zeros_like(surface.avoid)), goal).of["affordance"]
+    assert np.all(np.asarray(geometry.distance) == np.float32(FAR))
+    assert not np.any(geometry.nearest) and not np.any(geometry.touching)
 
 
 @pytest.mark.parametrize("inactive", MASKS)
@@ -120,10 +120,10 @@ def test_inactive_constraints_are_zero_in_observation_and_reward(inactive):
     state, surface, goal = scene(9)
     assert blocks(TASK) == MASKS
     off = dataclasses.replace(goal, active=active(*(name for name in MASKS if name != inactive)))
-    seen = _blocks(OBSERVE(state, surface, off))
+    observed = _blocks(OBSERVE(state, surface, off))
     for name in MASKS:
-        assert np.any(seen[name]) == (name != inactive)
-    np.testing.assert_array_equal(seen["mask"], np.tile([float(name != inactive) for name in MASKS], (4, 1)))
+        assert np.any(observed[name]) == (name != inactive)
+    np.testing.assert_array_equal(observed["mask"], np.tile([float(name != inactive) for name in MASKS], (4, 1)))
     found = REWARD(state, surface, off, UNIT)
     prefix = {"pose_finger": ("pose_finger", "pose_link"), "pose_wrist": ("pose_wrist",)}
     for name in TERMS:
@@ -133,11 +133,11 @@ def test_inactive_constraints_are_zero_in_observation_and_reward(inactive):
 
 def test_observation_blocks_by_hand():
     state, surface, goal = scene(10)
-    seen = FEATURES(state, surface, goal)
+    geometry = FEATURES(state, surface, goal)
     parts = _blocks(OBSERVE(state, surface, goal))
     np.testing.assert_allclose(parts["state"][:, :F], state.q)
     np.testing.assert_allclose(parts["pose_finger"][:, :F], goal["pose"].q - state.q, atol=1e-6)
-    center = np.asarray(seen.center)
+    center = np.asarray(geometry.center)
     np.testing.assert_allclose(parts["heading"][:, :3], center)
     np.testing.assert_allclose(parts["heading"][:, 6:9], parts["heading"][:, 3:6] - center, atol=1e-6)
     # u-bar of a pose: the virtual joints that would put the wrist there.
@@ -158,18 +158,18 @@ def test_reward_terms_against_numpy(near):
     """Far from its targets a hand pays the most that tracking can cost: 15 cm and half a radian."""
     state, surface, goal = scene(11)
     goal = near_targets(state, goal, 12) if near else goal
-    seen = FEATURES(state, surface, goal)
-    avoided = seen.of["affordance"]
+    geometry = FEATURES(state, surface, goal)
+    avoided = geometry.of["affordance"]
     paid = {name: np.asarray(value) for name, value in REWARD(state, surface, goal, UNIT).items()}
     b = 3
-    d = np.linalg.norm(np.asarray(seen.nearest)[b], axis=-1)
+    d = np.linalg.norm(np.asarray(geometry.nearest)[b], axis=-1)
     weights = HAND.contact_weights
     np.testing.assert_allclose(paid["distance"][b], -(HAND.keypoint_weights * d).sum(), rtol=1e-4)
-    plus = np.asarray(avoided.touching_graspable)[b]
-    np.testing.assert_allclose(paid["contact"][b], (weights * plus).sum(), rtol=1e-5)
-    plus_force = np.linalg.norm(np.asarray(seen.force - avoided.force)[b], axis=-1)
-    np.testing.assert_allclose(paid["force"][b], (weights * plus * np.minimum(plus_force, 5) / 5).sum(), rtol=1e-4)
-    force = np.linalg.norm(np.asarray(seen.force)[b], axis=-1)
+    graspable = np.asarray(avoided.touching_graspable)[b]
+    np.testing.assert_allclose(paid["contact"][b], (weights * graspable).sum(), rtol=1e-5)
+    pressed = np.linalg.norm(np.asarray(geometry.force - avoided.force)[b], axis=-1)
+    np.testing.assert_allclose(paid["force"][b], (weights * graspable * np.minimum(pressed, 5) / 5).sum(), rtol=1e-4)
+    force = np.linalg.norm(np.asarray(geometry.force)[b], axis=-1)
     np.testing.assert_allclose(paid["force_excess"][b], -np.clip(force - 5, 0, 50).sum(), rtol=1e-4)
     shift = state.object_position[b] - state.object_position_initial[b]
     np.testing.assert_allclose(paid["object_position"][b], -min(shift @ shift, 0.04), rtol=1e-4)
@@ -213,16 +213,17 @@ def test_reward_terms_against_numpy(near):
     )
     barrier = np.logaddexp(0.0, (0.01 - float(avoided.distance[b])) / 0.002)
     np.testing.assert_allclose(paid["affordance_distance"][b], -barrier, rtol=1e-3)
-    minus_force = np.linalg.norm(np.asarray(avoided.force)[b], axis=-1)
-    np.testing.assert_allclose(paid["affordance_force"][b], -np.minimum(minus_force, 10).sum(), rtol=1e-4)
+    avoided_force = np.linalg.norm(np.asarray(avoided.force)[b], axis=-1)
+    np.testing.assert_allclose(paid["affordance_force"][b], -np.minimum(avoided_force, 10).sum(), rtol=1e-4)
 
 
 def test_without_affordance_every_contact_is_rewarded():
     state, surface, goal = scene(12)
     off = dataclasses.replace(goal, active=active())
-    seen = FEATURES(state, surface, off)
+    geometry = FEATURES(state, surface, off)
     paid = REWARD(state, surface, off, UNIT)
-    np.testing.assert_allclose(paid["contact"], (HAND.contact_weights * np.asarray(seen.touching)).sum(-1), rtol=1e-5)
+    earned = (HAND.contact_weights * np.asarray(geometry.touching)).sum(-1)
+    np.testing.assert_allclose(paid["contact"], earned, rtol=1e-5)
 
 
 def test_pose_gate_by_hand():
@@ -278,12 +279,12 @@ def test_heading_pose_aligns_axis_cross_and_center():
 def test_guidance_follows_the_strongest_constraint_on_the_initial_object(on, source):
     state, surface, goal = scene(16)
     goal = dataclasses.replace(goal, active=active(*on))
-    seen = FEATURES(state, surface, goal)
+    geometry = FEATURES(state, surface, goal)
     position, _ = GUIDANCE(state, surface, goal, TASK.control)
     body = _rotation(state.object_quaternion_initial[0])
-    here = np.asarray(seen.wrist_position)[0]
+    here = np.asarray(geometry.wrist_position)[0]
     if source == "heading":
-        local = np.asarray(heading_wrist_pose(HAND, goal["heading"], seen.center)[0])[0]
+        local = np.asarray(heading_wrist_pose(HAND, goal["heading"], geometry.center)[0])[0]
     elif source == "pose":
         local = goal["pose"].position[0]
     else:
@@ -309,7 +310,7 @@ def test_wrist_target_is_guidance_plus_residual_within_the_limits():
 
 def test_metrics_against_numpy():
     state, surface, goal = scene(18)
-    seen = FEATURES(state, surface, goal)
+    geometry = FEATURES(state, surface, goal)
     found, weights = {}, {}
     for name, (numerator, denominator) in ERRORS(state, surface, goal).items():
         found[name], weights[name] = np.asarray(numerator), np.asarray(denominator)
@@ -329,13 +330,13 @@ def test_metrics_against_numpy():
     hinges = (hinges + np.pi) % (2 * np.pi) - np.pi
     expected = np.abs(np.concatenate([state.q[b] - goal["pose"].q[b], hinges])).mean()
     np.testing.assert_allclose(found["pose_rad"][b], expected, atol=1e-3)
-    links = np.sum(np.asarray(seen.of["affordance"].touching)[b])
+    links = np.sum(np.asarray(geometry.of["affordance"].touching)[b])
     np.testing.assert_allclose(found["affordance_ratio"][b], links)
-    np.testing.assert_allclose(weights.pop("affordance_ratio")[b], np.sum(np.asarray(seen.touching)[b]))
+    np.testing.assert_allclose(weights.pop("affordance_ratio")[b], np.sum(np.asarray(geometry.touching)[b]))
     assert all((weight == 1.0).all() for weight in weights.values())
 
 
 def test_fixed_center_is_the_open_hands_whatever_the_fingers_do():
     state, surface, goal = scene(19)
-    seen = features(HAND, dataclasses.replace(TASK, dynamic_center=False), state, surface, goal)
-    np.testing.assert_allclose(seen.center, np.tile(grasp_frame(HAND).center, (4, 1)))
+    geometry = features(HAND, dataclasses.replace(TASK, dynamic_center=False), state, surface, goal)
+    np.testing.assert_allclose(geometry.center, np.tile(grasp_frame(HAND).center, (4, 1)))

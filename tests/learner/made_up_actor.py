@@ -45,7 +45,10 @@ class MadeUpActor(threading.Thread):
                 continue
             observation = rng.normal(size=(5, 2, sum(size for _, size in bundle.spec.layout))).astype(np.float16)
             action, log_probability = bundles.sample_action(
-                bundle.spec.layout, bundle.acting, observation[:-1], jax.random.PRNGKey(len(self.versions))
+                bundle.spec.layout,
+                bundle.inference_parameters,
+                observation[:-1],
+                jax.random.PRNGKey(len(self.versions)),
             )
             recorded = {
                 "observation": observation[:-1],

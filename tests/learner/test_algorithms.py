@@ -66,7 +66,7 @@ class ToyActor(threading.Thread):
             def act(observation, bundle=bundle):
                 nonlocal keys
                 keys, key = jax.random.split(keys)
-                return bundles.sample_action(toy.LAYOUT, bundle.acting, observation, key)
+                return bundles.sample_action(toy.LAYOUT, bundle.inference_parameters, observation, key)
 
             recorded = toy.episode(act, WORLDS, rng)
             arrays = recorded if not self.outcomes else {name: recorded[name] for name in self.names}

@@ -29,7 +29,7 @@ def rollout(bundle: bundles.PolicyBundle, seed: int, worlds: int = 64, reach: fl
     keys = iter(jax.random.split(jax.random.PRNGKey(seed), toy.STEPS))
 
     def act(observation):
-        return bundles.sample_action(toy.LAYOUT, bundle.acting, observation, next(keys))
+        return bundles.sample_action(toy.LAYOUT, bundle.inference_parameters, observation, next(keys))
 
     return toy.episode(act, worlds, np.random.default_rng(seed), reach)
 
@@ -161,4 +161,4 @@ def test_published_weights_outlive_the_next_update():
     bundle = toy.bundle_of(state)
     step(state, rollout(bundle, 0))
     assert np.isfinite(np.asarray(bundle.params["actor"]["log_std"])).all()
-    assert np.isfinite(np.asarray(bundle.acting.normalization.scale)).all()
+    assert np.isfinite(np.asarray(bundle.inference_parameters.normalization.scale)).all()

@@ -135,7 +135,9 @@ def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: di
     assert layout.shapes["fingers_allowed"] == (5,) and layout.shapes["asked"] == (5,)
 
     def ask(constraints: list[str], **more: np.ndarray) -> Inference | Exception:
-        (answer,) = function(policy.acting, [layout.parse(Message({**query, **more}, {"constraints": constraints}))])
+        (answer,) = function(
+            policy.inference_parameters, [layout.parse(Message({**query, **more}, {"constraints": constraints}))]
+        )
         return answer
 
     pinch = ask(["heading", "fingers"], fingers_allowed=PINCH)

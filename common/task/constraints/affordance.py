@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from common import rotations
 from common.hands.spec import Hand
 from common.task.constraints.base import Constraint, ErrorSpec, ObservationField, Option, Relation, Scene, Weight
-from common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, squash
+from common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, squash
 from common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class Affordance(Constraint):
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
         """Redirects a heading that comes nearer to the avoid region than to the graspable one."""
         heading = goal["heading"]
-        weights = (~surface.minus)[..., None].astype(jnp.float32)
+        weights = (~surface.avoid)[..., None].astype(jnp.float32)
         middle = jnp.sum(surface.points * weights, 1) / jnp.maximum(jnp.sum(weights, 1), 1.0)
         towards = middle - (heading.position - REACH * heading.direction)
         towards = towards / jnp.linalg.norm(towards, axis=-1, keepdims=True)
@@ -106,9 +106,9 @@ class Affordance(Constraint):
     def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> AffordanceFeatures:
         """Distances, contacts and forces by region: each contact has the label of the nearest surface point."""
         surface = contacts.surface
-        index = nearest_index(jnp.where(surface.minus[..., None], contacts.squared, jnp.inf))
-        avoided = jnp.take_along_axis(surface.minus, flat(contacts.nearest), -1).reshape(contacts.nearest.shape)
-        has_any = jnp.any(surface.minus, -1)
+        index = nearest_index(jnp.where(surface.avoid[..., None], contacts.squared, jnp.inf))
+        avoided = jnp.take_along_axis(surface.avoid, flat(contacts.nearest), -1).reshape(contacts.nearest.shape)
+        has_any = jnp.any(surface.avoid, -1)
         nearest = jnp.take_along_axis(surface.points, index[..., None], -2) - contacts.keypoints
         nearest = jnp.where(has_any[..., None, None], nearest, 0.0)
         skin = jnp.linalg.norm(nearest, axis=-1) - jnp.array(hand.keypoint_radii)
@@ -144,23 +144,18 @@ class Affordance(Constraint):
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
         """Links that touch the avoid region, among all that touch (a link on both counts once)."""
-        touching = scene.features.of["affordance"].touching
-        return {"affordance_ratio": (_count(touching), _count(scene.features.touching))}
+        return {"affordance_ratio": share(scene.features.of["affordance"].touching, scene.features.touching)}
 
     def valid(self, surface: Surface, own: AffordanceGoal) -> Array:
         """Both regions have points."""
-        return jnp.any(surface.minus, -1) & ~jnp.all(surface.minus, -1)
+        return jnp.any(surface.avoid, -1) & ~jnp.all(surface.avoid, -1)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
         """It keeps the fingers off its region unless a reference pose names its own contacts."""
         if overridden:
             return ["The affordance is overridden by the reference pose, which names its own contacts."]
-        turned = "The heading came nearer to O- than to O+ and was turned towards O+."
-        return ["The affordance keeps the fingers off O-.", *([turned] if redirected else [])]
-
-
-def _count(flags: Array) -> Array:
-    return jnp.sum(flags, -1).astype(jnp.float32)
+        turned = "The heading came nearer to the avoid region and was turned towards the graspable region."
+        return ["The affordance keeps the fingers off the avoid region.", *([turned] if redirected else [])]
 
 
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
@@ -168,12 +163,13 @@ def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, A
     heading = goal["heading"]
     start = heading.position - REACH * heading.direction
     return {
-        "avoid": least_distance_to_segment(surface.points, surface.minus, start, heading.position),
-        "graspable": least_distance_to_segment(surface.points, ~surface.minus, start, heading.position),
+        "avoid": least_distance_to_segment(surface.points, surface.avoid, start, heading.position),
+        "graspable": least_distance_to_segment(surface.points, ~surface.avoid, start, heading.position),
     }
 
 
 def _contradicts_heading(apart: Mapping[str, Array]) -> Array:
+    """(B,) bool: the approach comes nearer to the avoid region."""
     return apart["avoid"] < apart["graspable"]
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_type_h
 import jax.numpy as jnp
 import numpy as np
 
-from common.errors import UnknownConstraintError
+from common.errors import CongraspError, UnknownConstraintError
 from common.hands.spec import Hand
 from common.task.types import Array, Goal, SceneState, Surface
 
@@ -155,8 +155,10 @@ class Constraint:
         return ()
 
     def labels(self, hand: Hand) -> dict[str, tuple[str, ...]]:
-        """Names of the elements of flag arrays, by field, for pages and command lines."""
-        return {}
+        """Names of the elements of flag arrays, by field, for pages and command lines: those of fingers, by default."""
+        return {
+            name: hand.fingers for name, array in self.arrays.items() if array.kind == "flag" and array.shape == ("G",)
+        }
 
     # Sampling and the start of an episode.
 
@@ -209,9 +211,19 @@ class Constraint:
         """For each block the parts (B, ...) that are laid side by side; they are gated afterwards."""
         return ()
 
+    def forbidden(self, scene: Scene) -> Array | None:
+        """(B, L) bool: links that must not touch the object, whether or not it is active; None if it names none."""
+        return None
+
     def earning(self, scene: Scene, touching: Array, force: Array) -> tuple[Array, Array]:
-        """Contacts that earn the grasp reward: what it leaves of flags (B, L) and forces (B, L, 3) of the links."""
-        return touching, force
+        """Contacts that earn the grasp reward: what it leaves of flags (B, L) and forces (B, L, 3) of the links.
+
+        By default those of all links that it does not forbid.
+        """
+        if (forbidden := self.forbidden(scene)) is None:
+            return touching, force
+        lost = forbidden & self.active(scene.goal)[:, None]
+        return touching & ~lost, jnp.where(lost[..., None], 0.0, force)
 
     def reward(self, scene: Scene) -> dict[str, Array]:
         """Terms (B,) by the names of `weights`, signed, before the weight, zero where it is inactive."""
@@ -243,6 +255,24 @@ class Constraint:
           CongraspError: an option cannot be read.
         """
         return None
+
+    @staticmethod
+    def named_flags(option: str, words: Sequence[str], names: Sequence[str], lacks: str) -> np.ndarray:
+        """(len(names),) bool: which of the names are among the words of an option.
+
+        Args:
+          option: its name.
+          words: what a person wrote.
+          names: all that may be written.
+          lacks: what is said of another word, such as "the hand has no finger".
+
+        Raises:
+          CongraspError: a word is none of the names.
+        """
+        for word in words:
+            if word not in names:
+                raise CongraspError(f"--{option}: {lacks} '{word}'.", f"Known: {', '.join(names)}.")
+        return np.isin(names, words)
 
     # What follows from the above.
 

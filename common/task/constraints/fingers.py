@@ -10,7 +10,7 @@ import numpy as np
 from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Scene, Weight
-from common.task.geometry import flat, squash
+from common.task.geometry import flat, share, squash
 from common.task.types import Array, Surface
 
 if TYPE_CHECKING:
@@ -42,7 +42,6 @@ class Fingers(Constraint):
     options = (
         Option("fingers", "Which fingers may touch the object, such as: thumb index. All by default.", many=True),
     )
-
     invalid = ("The constraint 'fingers' allows fewer than two fingers.", "Allow two or more.")
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
@@ -55,10 +54,6 @@ class Fingers(Constraint):
         )
         return (block,)
 
-    def labels(self, hand: Hand) -> dict[str, tuple[str, ...]]:
-        """Names of the fingers."""
-        return {"allowed": hand.fingers}
-
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> FingersGoal:
         """The thumb with the first one, two, … of the others, or all of them, with equal probability."""
         count = jax.random.randint(key, draw.objects.shape, 2, len(hand.fingers) + 1)
@@ -70,14 +65,14 @@ class Fingers(Constraint):
 
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
         """The set, the clipped distance of each finger that is not in it, and squashed forces on their links."""
-        allowed, other = scene.goal["fingers"].allowed, other_links(scene)
+        allowed, other = scene.goal["fingers"].allowed, self.forbidden(scene)
         room = jnp.where(allowed, 0.0, jnp.minimum(_room(scene), 0.1))
         return ([allowed.astype(jnp.float32), room, flat(squash(scene.features.force * other[..., None]))],)
 
-    def earning(self, scene: Scene, touching: Array, force: Array) -> tuple[Array, Array]:
-        """Contacts of the other fingers earn nothing."""
-        other = other_links(scene) & scene.goal.active["fingers"][:, None]
-        return touching & ~other, jnp.where(other[..., None], 0.0, force)
+    def forbidden(self, scene: Scene) -> Array:
+        """Links of fingers that are not in the set; their contacts earn nothing."""
+        owner = scene.hand.link_fingers
+        return ~scene.goal["fingers"].allowed[:, owner] & (owner >= 0)
 
     def reward(self, scene: Scene) -> dict[str, Array]:
         """A barrier around the object for the other fingers, and a price for their contacts."""
@@ -85,14 +80,13 @@ class Fingers(Constraint):
         near = jnp.where(scene.goal["fingers"].allowed, 0.0, jax.nn.softplus((MARGIN - _room(scene)) / SHARPNESS))
         return {
             "fingers_distance": -active * jnp.sum(near, -1),
-            "fingers_contact": -active * jnp.sum(scene.features.touching & other_links(scene), -1),
+            "fingers_contact": -active * jnp.sum(scene.features.touching & self.forbidden(scene), -1),
         }
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
         """Touching links that belong to other fingers, among all that touch."""
         touching = scene.features.touching
-        wrong = jnp.sum(touching & other_links(scene), -1)
-        return {"fingers_ratio": (wrong.astype(jnp.float32), jnp.sum(touching, -1).astype(jnp.float32))}
+        return {"fingers_ratio": share(touching & self.forbidden(scene), touching)}
 
     def valid(self, surface: Surface, own: FingersGoal) -> Array:
         """Two fingers or more."""
@@ -108,19 +102,10 @@ class Fingers(Constraint):
         """Names of fingers."""
         if not given["fingers"]:
             return None
-        if unknown := [name for name in given["fingers"] if name not in hand.fingers]:
-            raise CongraspError(
-                f"--fingers: the hand '{hand.name}' has no finger '{unknown[0]}'.", f"Known: {', '.join(hand.fingers)}."
-            )
-        if len(set(given["fingers"])) < 2:
+        allowed = self.named_flags("fingers", given["fingers"], hand.fingers, f"the hand '{hand.name}' has no finger")
+        if allowed.sum() < 2:
             raise CongraspError("--fingers names one finger, which cannot hold an object.", "Name two or more.")
-        return {"allowed": np.isin(hand.fingers, given["fingers"])}
-
-
-def other_links(scene: Scene) -> Array:
-    """(B, L) bool: links of fingers that may not touch the object."""
-    owner = scene.hand.link_fingers
-    return ~scene.goal["fingers"].allowed[:, owner] & (owner >= 0)
+        return {"allowed": allowed}
 
 
 def _room(scene: Scene) -> Array:
@@ -128,6 +113,5 @@ def _room(scene: Scene) -> Array:
     hand = scene.hand
     skin = jnp.linalg.norm(scene.features.nearest, axis=-1) - jnp.array(hand.keypoint_radii)
     owner = hand.link_fingers[hand.keypoint_links]
-    return jnp.stack(
-        [jnp.min(jnp.where(owner == finger, skin, jnp.inf), -1) for finger in range(len(hand.fingers))], -1
-    )
+    nearest = [jnp.min(jnp.where(owner == finger, skin, jnp.inf), -1) for finger in range(len(hand.fingers))]
+    return jnp.stack(nearest, -1)

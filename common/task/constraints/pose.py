@@ -172,6 +172,7 @@ def pose_gate(distance: Array) -> Array:
 
 
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
+    """(B,) rad between the heading and that of the reference."""
     return {"turn": heading_turn(hand, goal["heading"], goal["pose"].quaternion)}
 
 
@@ -193,8 +194,8 @@ def _touches(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
     points = kinematics.keypoints(hand, kinematics.link_transforms(hand, own.q))
     points = rotations.transform(own.position, own.quaternion, points)
     away = squared_distances(surface.points, points)
-    avoid = jnp.min(jnp.where(surface.minus[..., None], away, jnp.inf), -2)
-    graspable = jnp.min(jnp.where(surface.minus[..., None], jnp.inf, away), -2)
+    avoid = jnp.min(jnp.where(surface.avoid[..., None], away, jnp.inf), -2)
+    graspable = jnp.min(jnp.where(surface.avoid[..., None], jnp.inf, away), -2)
     return {"touching": (avoid < TOUCHING**2) & (avoid < graspable)}
 
 

@@ -36,7 +36,7 @@ class Contradiction(NamedTuple):
 
     weaker: str
     stronger: str
-    words: str
+    message: str
     """What contradicts, by how much, and what becomes of it."""
     refused: bool
     """Neither overrides the other: the request is an error."""

@@ -174,8 +174,8 @@ def _apart_from_regions(hand: Hand, surface: Surface, goal: Goal) -> dict[str, A
     """Metres from the trajectory's end to either region."""
     position, _ = last_waypoint(goal)
     return {
-        "avoid": least_distance(surface.points, surface.minus, position),
-        "graspable": least_distance(surface.points, ~surface.minus, position),
+        "avoid": least_distance(surface.points, surface.avoid, position),
+        "graspable": least_distance(surface.points, ~surface.avoid, position),
     }
 
 

@@ -86,6 +86,7 @@ def _replay(hand: Hand, target: Array) -> Array:
     weight = jnp.array([mass] * 3 + [inertia] * 3)
 
     def step(state: tuple[Array, Array], goal: Array) -> tuple[tuple[Array, Array], Array]:
+        """One step of the wrist's servos."""
         x, v = state
         force = jnp.clip(kp * (goal - x), -limit, limit)
         v = (v + _REPLAY_DT * force / weight) / (1 + _REPLAY_DT * kv / weight)

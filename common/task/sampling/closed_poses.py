@@ -63,6 +63,7 @@ def closed_poses(
     goal = HeadingGoal(heading_position, direction, cross)
 
     def close(center: Array) -> Array:
+        """(M, F) angles of fingers that close until they touch, with the hand centre (M, 3) at the heading."""
         position, quaternion = heading_wrist_pose(hand, goal, center)
 
         def clear(fraction: Array) -> Array:

@@ -18,7 +18,9 @@ BACK_OFF = 0.15
 _BREADTH = 0.03  # half the breadth of the slab in which the local width is measured: a hand is some 6 cm broad
 _BEYOND = 0.01  # the slab ends this far beyond the heading position, where the fingertips close
 _TUBE = 0.01  # radius around the approach in which nothing may stand before the surface point
-_MARGIN = 0.01  # an approach stays this far from O-, and closing fingers, which are this thick, meet none of it
+_MARGIN = (
+    0.01  # an approach stays this far from the avoid region, and closing fingers, which are this thick, meet none of it
+)
 _FACING = 0.5  # least cosine between a surface's inward normal and a direction that is given
 _ROLLS = 4
 _BATCH = 320
@@ -54,16 +56,16 @@ def sample_headings(
 ) -> Headings | None:
     """Samples an object's heading set by the paper's rules.
 
-    A surface point of O+ (or of the whole surface) and a direction in the cone around its inward normal give the
-    heading position, `inward` along the direction. The cross-finger axis is the best of a few random rolls, narrow
-    ones being preferred. A candidate is rejected if
+    A surface point of the graspable region (or of the whole surface) and a direction in the cone around its inward
+    normal give the heading position, `inward` along the direction. The cross-finger axis is the best of a few random
+    rolls, narrow ones being preferred. A candidate is rejected if
 
     * the object's local width along the cross-finger axis exceeds `max_width`; it is measured on the surface points
       that the closing fingers sweep (3 cm to both sides of the hand's middle plane, down to 1 cm beyond the position);
     * another part of the object stands before the surface point (the point would not be the first one hit);
-    * with affordance, the approach comes within 1 cm of O-, or the position lies nearer to O- than to O+, or O- is as
-      wide as O+ where the fingers close, so that they would meet it first (ours: the paper's regions are those that
-      people held, and can be held).
+    * with affordance, the approach comes within 1 cm of the avoid region, or the position lies nearer to it than to
+      the graspable one, or it is as wide as that where the fingers close, so that they would meet it first (ours: the
+      paper's regions are those that people held, and can be held).
 
     If fewer than `count` remain after `attempts` batches, those found are repeated. If none remains on the whole
     surface, the candidates that break the fewest of the rules but the first are taken, among them the narrowest.
@@ -71,9 +73,9 @@ def sample_headings(
     Args:
       obj: the object.
       rng: random generator.
-      use_affordance: restricts the headings to O+.
-      lenient: where no candidate is left because fingers that close on O+ meet O-, such as on a small handle, takes
-        those whose approach keeps away from O-.
+      use_affordance: restricts the headings to the graspable region.
+      lenient: where no candidate is left because fingers that close on the graspable region meet the other, such as
+        on a small handle, takes those whose approach keeps away from the avoid region.
       count: number of headings H.
       cone: half angle of the cone around the inward normal, rad.
       inward: metres from the surface point to the heading position.
@@ -84,15 +86,10 @@ def sample_headings(
       at: (3,) the position of all of them, m, if it is not to be drawn.
 
     Returns:
-      H headings, float32; None if O+ cannot be approached.
+      H headings, float32; None if the graspable region cannot be approached.
     """
-    minus = obj.non_graspable_points & use_affordance
-    sources = np.flatnonzero(~minus)
-    if len(sources) == 0:
-        sources = np.arange(len(minus))
-    if along is not None:
-        facing = -obj.normals[sources] @ along
-        sources = sources[facing >= min(_FACING, facing.max())]
+    avoid = obj.non_graspable_points & use_affordance
+    sources = _sources(obj, avoid, along)
     points = obj.points.astype(np.float32)
     found: list[Headings] = []
     total = 0
@@ -104,30 +101,58 @@ def sample_headings(
         position = points[surface] + np.float32(inward) * direction
         if at is not None:
             position = np.broadcast_to(np.float32(at), position.shape)
-        faults = _faults(points, minus, position, direction, inward, back_off)
+        faults = _faults(points, avoid, position, direction, inward, back_off)
         position, direction, faults = (part[faults.argsort(kind="stable")] for part in (position, direction, faults))
         clean = int((faults == 0).sum())
-        cross, width = _roll(points, minus, position[:clean], direction[:clean], rng)
+        cross, width = _roll(points, avoid, position[:clean], direction[:clean], rng)
         good = np.flatnonzero(width <= max_width)
         found.append(Headings(position[good], direction[good], cross[good]))
         total += len(good)
         if total >= count:
             break
-    if total == 0 and minus.any():
-        if not (lenient and clean):
+    if total == 0:
+        last = _last_resort(points, avoid, position, direction, faults, rng, lenient=lenient)
+        if last is None:
             return None
-        bare = points[~minus]
-        position, direction = position[:clean], direction[:clean]
-        cross, _ = _roll(bare, np.zeros(len(bare), bool), position, direction, rng)
-        found.append(Headings(position, direction, cross))
-    elif total == 0:
-        cross, width = _roll(points, minus, position, direction, rng)
-        # Faults count whole numbers and a width in metres less than one: together they sort in the right order.
-        best = (faults + width).argsort(kind="stable")[: _BATCH // 16]
-        found.append(Headings(position[best], direction[best], cross[best]))
+        found.append(last)
     pool = Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     chosen = np.resize(np.arange(len(pool.position)), count)
     return Headings(*(part[chosen].astype(np.float32) for part in pool))
+
+
+def _sources(obj: GraspObject, avoid: np.ndarray, along: np.ndarray | None) -> np.ndarray:
+    """Indices of the surface points that headings come to: outside of the avoid region, and facing what is given."""
+    sources = np.flatnonzero(~avoid)
+    if len(sources) == 0:
+        sources = np.arange(len(avoid))
+    if along is not None:
+        facing = -obj.normals[sources] @ along
+        sources = sources[facing >= min(_FACING, facing.max())]
+    return sources
+
+
+def _last_resort(
+    points: np.ndarray,
+    avoid: np.ndarray,
+    position: np.ndarray,
+    direction: np.ndarray,
+    faults: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    lenient: bool,
+) -> Headings | None:
+    """Headings among candidates (N, 3) of which none keeps all rules, see `sample_headings`; `faults` (N,) ascend."""
+    if avoid.any():
+        clean = int((faults == 0).sum())
+        if not (lenient and clean):
+            return None
+        bare = points[~avoid]
+        cross, _ = _roll(bare, np.zeros(len(bare), bool), position[:clean], direction[:clean], rng)
+        return Headings(position[:clean], direction[:clean], cross)
+    cross, width = _roll(points, avoid, position, direction, rng)
+    # Faults count whole numbers and a width in metres less than one: together they sort in the right order.
+    best = (faults + width).argsort(kind="stable")[: _BATCH // 16]
+    return Headings(position[best], direction[best], cross[best])
 
 
 def clear_table(
@@ -208,19 +233,20 @@ def _frame(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _spin(side: np.ndarray, other: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Unit vectors at an angle (rad) from the first towards the second of two orthogonal ones."""
     return np.cos(turn)[..., None] * side + np.sin(turn)[..., None] * other
 
 
 def _roll(
-    points: np.ndarray, minus: np.ndarray, position: np.ndarray, direction: np.ndarray, rng: np.random.Generator
+    points: np.ndarray, avoid: np.ndarray, position: np.ndarray, direction: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cross-finger axes (N, 3), one of a few evenly spaced rolls each, and the object's local widths (N,) along them.
 
-    The width is infinite where the fingers would meet O- first.
+    The width is infinite where the fingers would meet the avoid region first.
 
     Args:
       points: (P, 3) surface points, the first of which cover the surface.
-      minus: (P,) bool, O-.
+      avoid: (P,) bool, the avoid region.
       position: (N, 3) heading positions.
       direction: (N, 3).
       rng: draws the rolls.
@@ -228,7 +254,7 @@ def _roll(
     side, other = _frame(direction)
     turn = rng.uniform(0, np.pi, len(direction))[:, None] + np.pi / _ROLLS * np.arange(_ROLLS)
     axes = _spin(side[:, None], other[:, None], turn).astype(np.float32)
-    points, minus = points[:_WIDTH_POINTS], minus[:_WIDTH_POINTS]
+    points, avoid = points[:_WIDTH_POINTS], avoid[:_WIDTH_POINTS]
     along = (axes.reshape(-1, 3) @ points.T).reshape(*turn.shape, len(points))
     along -= (axes * position[:, None]).sum(-1, keepdims=True)
     depth = (direction @ points.T - (direction * position).sum(-1, keepdims=True))[:, None]
@@ -237,10 +263,10 @@ def _roll(
     slab = np.abs(np.roll(along, -_ROLLS // 2, 1)) < _BREADTH
     low, high = _extent(along, slab & (depth < _BEYOND))
     width = high - low
-    if minus.any():
-        low, high = _extent(along, slab & (depth < _BEYOND) & ~minus)
-        low_minus, high_minus = _extent(along, slab & (depth < _BEYOND + _MARGIN) & minus)
-        width[(low_minus < low + _MARGIN / 2) | (high_minus > high - _MARGIN / 2)] = np.inf
+    if avoid.any():
+        low, high = _extent(along, slab & (depth < _BEYOND) & ~avoid)
+        low_avoid, high_avoid = _extent(along, slab & (depth < _BEYOND + _MARGIN) & avoid)
+        width[(low_avoid < low + _MARGIN / 2) | (high_avoid > high - _MARGIN / 2)] = np.inf
     # Gumbel's trick draws a roll with probability exp(-width / preference).
     pick = (rng.gumbel(size=width.shape) - width / _PREFERENCE).argmax(-1)
     rows = np.arange(len(width))
@@ -254,17 +280,17 @@ def _extent(along: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _faults(
-    points: np.ndarray, minus: np.ndarray, position: np.ndarray, direction: np.ndarray, inward: float, back_off: float
+    points: np.ndarray, avoid: np.ndarray, position: np.ndarray, direction: np.ndarray, inward: float, back_off: float
 ) -> np.ndarray:
-    """(N,) how many of the rules on occlusion and on O- each approach breaks."""
+    """(N,) how many of the rules on occlusion and on the avoid region each approach breaks."""
     depth = direction @ points.T - (direction * position).sum(-1, keepdims=True)
     squared = (points**2).sum(-1) + (position**2).sum(-1, keepdims=True) - 2 * (position @ points.T)
     aside = squared - depth**2
     before = (depth < -inward - 1.5 * _TUBE) & (depth > -back_off - inward)
     faults = ((aside < _TUBE**2) & before).any(-1).astype(int)
-    if minus.any():
+    if avoid.any():
         past = depth - depth.clip(-back_off, 0.0)
-        near = (aside + past**2)[:, minus].min(-1) < _MARGIN**2
-        ends_near = squared[:, minus].min(-1) < squared[:, ~minus].min(-1, initial=np.inf)
+        near = (aside + past**2)[:, avoid].min(-1) < _MARGIN**2
+        ends_near = squared[:, avoid].min(-1) < squared[:, ~avoid].min(-1, initial=np.inf)
         faults += near | ends_near
     return faults

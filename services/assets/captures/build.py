@@ -220,7 +220,7 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
         posed = transferred(hand, demonstrations, fitting, scale)
     q, position, quaternion = (values.astype(np.float32) for values in posed)
     clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, np.stack([fields["rest"]] * len(position))))
-    nearer = _ends_nearer_to_graspable(position[:, -1], fields["points"], fields["minus"])
+    nearer = _ends_nearer_to_graspable(position[:, -1], fields["points"], fields["avoid"])
     row = ConstraintBank(
         **{name: value for name, value in fields.items() if not name.startswith("chosen")},
         pose_q=_twice(q),

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from actors.physics.engine import World
+from actors.physics.engine import ResetState
 from actors.physics.native import NativePhysics
 from common.config import TaskConfig
 from common.hands import get_hand
@@ -18,7 +18,7 @@ def test_a_replay_ends_in_the_very_states_of_the_recording():
     box = procedural.generate(0, "box")
     height = float(np.abs(box.points[:, 2]).max())
     one = np.ones((WORLDS, 1))
-    world = World(
+    reset_state = ResetState(
         object_index=np.zeros(WORLDS, int),
         mass_scale=np.linspace(0.5, 1.5, WORLDS),
         friction=np.ones(WORLDS),
@@ -31,15 +31,15 @@ def test_a_replay_ends_in_the_very_states_of_the_recording():
     )
     recorder, twin = (make(HAND, TASK, [box], 2) for make in (Recorder, NativePhysics))
     rng = np.random.default_rng(0)
-    state, touched = recorder.start(world), False
+    state, touched = recorder.start(reset_state), False
     for step in range(20):
         targets = 0.03 * rng.normal(size=(WORLDS, 6 + len(HAND.joints)))
         state, seen = recorder.step(state, targets, np.full(WORLDS, step < 10))
         touched |= bool(seen.contact_found.any())
     assert touched
-    twin.start(world)
+    twin.start(reset_state)
     replay(twin, recorder.commands, TASK.substeps)
-    for a, b in zip(recorder.cells, twin.cells, strict=True):
+    for a, b in zip(recorder.instances, twin.instances, strict=True):
         np.testing.assert_array_equal(a.data.qpos, b.data.qpos)
         np.testing.assert_array_equal(a.data.mocap_pos, b.data.mocap_pos)
     recorder.close()

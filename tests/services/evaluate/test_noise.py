@@ -117,7 +117,7 @@ def test_curves_show_every_kind_of_noise(tmp_path):
 def test_a_constraint_bank_comes_back_from_its_files(bank):
     sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 3)
     back = constraint_sets.bank_of(sets)
-    for name in ("points", "minus", "heading_position", "pose_q", "trajectory_position", "pose_quaternion"):
+    for name in ("points", "avoid", "heading_position", "pose_q", "trajectory_position", "pose_quaternion"):
         np.testing.assert_array_equal(getattr(back, name), getattr(bank, name))
     for n in range(len(OBJECTS)):
         rests = len(sets[n].arrays["rest"])

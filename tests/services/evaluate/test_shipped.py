@@ -5,7 +5,7 @@ import pytest
 from common.objects.pool import HELD_OUT_SEED
 from common.objects.procedural import generate_many
 from common.policy import bundle as bundles
-from common.policy.pretrained import policy_file, shipped
+from common.policy.pretrained import policy_file, pretrained_file
 from services.evaluate.evaluator import Evaluator
 
 EPISODES = 24
@@ -15,7 +15,7 @@ FAMILIES = ("bottle", "cylinder", "dumbbell", "hammer", "ellipsoid", "flashlight
 @pytest.mark.timeout(300)
 def test_the_shipped_policy_grasps_under_every_constraint():
     """A broken bundle, or physics that it does not know, falls far below these floors."""
-    path = shipped("human")
+    path = pretrained_file("human")
     assert path is not None
     objects = generate_many(8, HELD_OUT_SEED, FAMILIES)
     evaluator = Evaluator(bundles.load(path), objects, batch=48)

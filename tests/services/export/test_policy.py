@@ -54,7 +54,7 @@ def test_exported_policies_answer_as_the_flax_policy(bundle: PolicyBundle, kind:
     assert exports.export_policy(bundle, kind, path) <= 1e-5
     # Other observations than those of the exporter, far outside the clip, and another batch size.
     observations = 50 * exports.sample_observations(bundle, 33, seed=9)
-    expected = np.asarray(bundles.mean_action(bundle.spec.layout, bundle.acting, observations))
+    expected = np.asarray(bundles.mean_action(bundle.spec.layout, bundle.inference_parameters, observations))
     assert np.abs(expected).max() > 0.1
     if kind == "onnx":
         (got,) = onnxruntime.InferenceSession(path.read_bytes()).run(None, {"observation": observations})

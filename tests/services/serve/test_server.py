@@ -137,7 +137,7 @@ def test_constraints_that_contradict_each_other_are_refused_alone(served):
         ):
             client.act(episode.state)
         client.reset(ending_at(points[points[:, 0].argmin()]))
-        assert "The affordance keeps the fingers off O-." in client.act(episode.state).active
+        assert "The affordance keeps the fingers off the avoid region." in client.act(episode.state).active
 
 
 def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(served, monkeypatch):

@@ -82,7 +82,9 @@ def test_the_rules_are_explained_and_set_the_masks(studio: Studio) -> None:
 def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studio) -> None:
     studio.paint([studio.arrow.position - INWARD * studio.arrow.direction], 0.03, avoid=True)
     view = studio.view()
-    assert view["active"]["overruled"] and any("turned towards O+" in line for line in view["explanation"])
+    assert view["active"]["overruled"] and any(
+        "turned towards the graspable region" in line for line in view["explanation"]
+    )
     assert np.linalg.norm(np.subtract(view["active"]["direction"], studio.arrow.direction)) > 0.02
 
 

@@ -1,32 +1,34 @@
-"""From a `World` to raw `qpos`, and from `qpos`, `qvel` and contact sensors to a `Readout`; NumPy or JAX arrays."""
+"""From a `ResetState` to raw `qpos`, and from raw arrays to a `PhysicsState`; NumPy or JAX."""
 
 import types
 from typing import Any
 
 import jax.numpy as jnp
 
-from actors.physics.engine import MAX_DISTANCE, MAX_SPEED, Readout, World
+from actors.physics.engine import MAX_DISTANCE, MAX_SPEED, PhysicsState, ResetState
 from actors.physics.scene import SENSOR_WIDTH, Addresses
 from common.task.types import CONTACTS_PER_LINK, Array
 
 
-def initial_qpos(where: Addresses, nq: int, world: World) -> Array:
-    """(B, nq) of worlds that start, as a JAX array: the wrist's joints are zero there."""
-    qpos = jnp.zeros((len(world.q), nq))
-    qpos = qpos.at[:, where.finger_qpos].set(world.q)
-    return qpos.at[:, where.object_qpos].set(jnp.concatenate([world.object_position, world.object_quaternion], -1))
+def initial_qpos(where: Addresses, nq: int, reset_state: ResetState) -> Array:
+    """(B, nq) of environments that start, as a JAX array: the wrist's joints are zero there."""
+    qpos = jnp.zeros((len(reset_state.q), nq))
+    qpos = qpos.at[:, where.finger_qpos].set(reset_state.q)
+    return qpos.at[:, where.object_qpos].set(
+        jnp.concatenate([reset_state.object_position, reset_state.object_quaternion], -1)
+    )
 
 
-def diverged(xp: types.ModuleType, qpos: Array, qvel: Array) -> Array:
-    """(B,) bool: worlds with values that are not finite, too fast or too far away."""
+def has_diverged(xp: types.ModuleType, qpos: Array, qvel: Array) -> Array:
+    """(B,) bool: environments with values that are not finite, too fast or too far away."""
     # Comparisons with NaN are false, so that NaN also fails them.
     return ~(xp.all(xp.abs(qvel) < MAX_SPEED, -1) & xp.all(xp.abs(qpos) < MAX_DISTANCE, -1))
 
 
-def readout(
-    xp: Any, where: Addresses, qpos: Array, qvel: Array, sensordata: Array, bad: Array, usage: Array
-) -> Readout:
-    """Readout of raw arrays (B, nq), (B, nv), (B, L * C * 13).
+def physics_state(
+    xp: Any, where: Addresses, qpos: Array, qvel: Array, sensordata: Array, diverged: Array, occupancy: Array
+) -> PhysicsState:
+    """Physics state of raw arrays (B, nq), (B, nv), (B, L * C * 13).
 
     Args:
       xp: numpy or jax.numpy.
@@ -34,8 +36,8 @@ def readout(
       qpos: generalised positions.
       qvel: generalised velocities; the free joint's angular part is in the object frame and is turned to the world.
       sensordata: contact sensors of all links, strongest contacts first.
-      bad: (B,) bool, passed through.
-      usage: (2,), passed through.
+      diverged: (B,) bool, passed through.
+      occupancy: (2,), passed through.
     """
     batch = qpos.shape[0]
     contacts = sensordata.reshape(batch, -1, CONTACTS_PER_LINK, SENSOR_WIDTH)
@@ -48,7 +50,7 @@ def readout(
     angular = object_qvel[:, 3:]
     axis = quaternion[:, 1:]
     twice = 2.0 * xp.cross(axis, angular)
-    return Readout(
+    return PhysicsState(
         q=qpos[:, where.finger_qpos],
         u=qpos[:, where.wrist_qpos],
         q_velocity=qvel[:, where.finger_qvel],
@@ -60,6 +62,6 @@ def readout(
         contact_force=xp.where(found[..., None], -on_object, 0.0),
         contact_position=contacts[..., 4:7],
         contact_found=found,
-        bad=bad,
-        usage=usage,
+        diverged=diverged,
+        occupancy=occupancy,
     )

@@ -1,4 +1,4 @@
-"""Worlds in memory of Warp: what every world shares, what its object fills, and one control step of all of them.
+"""Environments in memory of Warp: what they share, what their objects fill, and one control step of all of them.
 
 `control_step` is what JAX sees: a pure function of small arrays. Model and data stay in buffers that are allocated once
 for a batch, so that their addresses never change and one CUDA graph of a control step serves every program that calls
@@ -20,14 +20,14 @@ from warp import JaxCallableGraphMode, jax_callable
 from actors.physics.scene import TABLE_AWAY, Addresses
 from actors.physics.warp_kernels import DATA_LEAVES, MODEL_LEAVES, OBJECT_FIELDS, Leaves, Objects, count, place
 
-CONTACTS_PER_WORLD = 40
-"""Contacts that the shared list holds for each world on average."""
-CONSTRAINTS_PER_WORLD = 320
-"""Constraint rows of each world."""
+CONTACTS_PER_ENVIRONMENT = 40
+"""Contacts that the shared list holds for each environment on average."""
+CONSTRAINTS_PER_ENVIRONMENT = 320
+"""Constraint rows of each environment."""
 
 
-class WarpWorlds:
-    """The buffers of a batch of worlds on one device."""
+class WarpBuffers:
+    """The buffers of a batch of environments on one device."""
 
     def __init__(
         self,
@@ -41,22 +41,22 @@ class WarpWorlds:
         """Allocates them.
 
         Args:
-          model: what the worlds share.
+          model: what the environments share.
           where: indices of the model.
           geoms: (S,) geoms of the object's slots.
           substeps: physics steps of a control step.
-          batch: B, number of worlds.
+          batch: B, number of environments.
           device: where the buffers are.
         """
         self._substeps, self._device = substeps, device
         self._graph: wp.Graph | None = None
-        self.limits = np.array([CONTACTS_PER_WORLD * batch, CONSTRAINTS_PER_WORLD], np.float32)
+        self.limits = np.array([CONTACTS_PER_ENVIRONMENT * batch, CONSTRAINTS_PER_ENVIRONMENT], np.float32)
         """(2,) contacts and constraint rows that there is room for."""
         with wp.ScopedDevice(device):
             # A single row would mean that the field is shared, and meshes are then never absent.
             self._model = mujoco_warp.put_model(model, dict.fromkeys(MODEL_LEAVES, max(batch, 2)))
             self._data = mujoco_warp.make_data(
-                model, batch, naconmax=CONTACTS_PER_WORLD * batch, njmax=CONSTRAINTS_PER_WORLD
+                model, batch, naconmax=CONTACTS_PER_ENVIRONMENT * batch, njmax=CONSTRAINTS_PER_ENVIRONMENT
             )
             self._occupancy = wp.zeros(2, dtype=int)
             self._leaves = leaves = Leaves()
@@ -69,13 +69,13 @@ class WarpWorlds:
         leaves.object_body, leaves.object_dof = where.object_body, where.object_qvel[0]
         leaves.base_body, leaves.table, leaves.anchor = where.base_body, where.table_mocap, where.anchor_mocap
         leaves.weld, leaves.table_away = where.weld, TABLE_AWAY[2]
-        # The kernels print every overflow; thousands of worlds would flood the log.
+        # The kernels print every overflow; thousands of environments would flood the log.
         self._model.opt.warn_overflow = 0
         self._sensing = self._model.opt.disableflags
         self._blind = self._sensing | mujoco_warp.DisableBit.SENSOR
 
     def fill(self, objects: Objects, meshes: dict[str, Any]) -> None:
-        """Takes what worlds are filled from: rows, and the fields of the model that hold their meshes."""
+        """Takes what environments are filled from: rows, and the fields of the model that hold their meshes."""
         self._objects, self._graph = objects, None
         for name, value in meshes.items():
             setattr(self._model, name, value)
@@ -90,7 +90,7 @@ class WarpWorlds:
         sensordata: Any,
         occupancy: Any,
     ) -> None:
-        """Steps all worlds on the current stream; the first three arrays are changed, the last two written."""
+        """Steps all environments on the current stream; the first three arrays are changed, the last two written."""
         data = self._data
         state = (data.qpos, qpos), (data.qvel, qvel), (data.qacc_warmstart, qacc_warmstart)
         for mine, given in (*state, (data.ctrl, ctrl)):
@@ -107,6 +107,7 @@ class WarpWorlds:
             wp.copy(given, mine)
 
     def _capture(self) -> wp.Graph:
+        """Records the kernels of one control step as a CUDA graph."""
         with wp.ScopedCapture() as capture:
             self._substep_all()
         return capture.graph
@@ -140,14 +141,14 @@ def meshes_on(device: wp.Device, model: mujoco.MjModel) -> dict[str, Any]:
     return values
 
 
-_worlds: "weakref.WeakValueDictionary[int, WarpWorlds]" = weakref.WeakValueDictionary()
+_buffers: "weakref.WeakValueDictionary[int, WarpBuffers]" = weakref.WeakValueDictionary()
 _handles = itertools.count()
 
 
-def register(worlds: WarpWorlds) -> int:
-    """A number by which `control_step` finds these worlds for as long as someone holds them."""
+def register(buffers: WarpBuffers) -> int:
+    """A number by which `control_step` finds these environments for as long as someone holds them."""
     handle = next(_handles)
-    _worlds[handle] = worlds
+    _buffers[handle] = buffers
     return handle
 
 
@@ -169,15 +170,16 @@ def _control_step(
     sensordata: wp.array2d[float],
     occupancy: wp.array[int],
 ) -> None:
+    """What JAX calls: finds the buffers by their handle and steps them; arrays as in `WarpPhysics.step`."""
     placed = [table, row, mass_scale, friction, base_position, base_quaternion]
     placed += [anchor_position, anchor_quaternion, stationary]
-    _worlds[handle].control_step(qpos, qvel, qacc_warmstart, ctrl, placed, sensordata, occupancy)
+    _buffers[handle].control_step(qpos, qvel, qacc_warmstart, ctrl, placed, sensordata, occupancy)
 
 
 control_step = jax_callable(
     _control_step,
     num_outputs=5,
-    # `WarpWorlds` captures a graph of its own: Warp's would be of JAX's buffers, and made anew wherever those move to.
+    # `WarpBuffers` captures a graph of its own: Warp's would be of JAX's buffers, and made anew wherever those move to.
     graph_mode=JaxCallableGraphMode.NONE,
     vmap_method=None,
     in_out_argnames=["qpos", "qvel", "qacc_warmstart"],

@@ -1,0 +1,81 @@
+"""An engine that only this file knows: it is registered here, and episodes and tables are made on it."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from actors.bank import build_bank
+from actors.physics import ENGINES, Engine, make_physics, resolve_physics
+from actors.physics.native import NativePhysics
+from actors.rollout import RolloutWorker
+from common.config import NetworkConfig, RunConfig, TaskConfig, run_config_from_json, to_json
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects import procedural
+from services.evaluate.evaluator import Evaluator
+from services.train.command import untrained
+
+HAND, TASK = get_hand("human"), TaskConfig()
+OBJECTS = procedural.generate_many(2, 0, ("box", "cylinder"))
+BATCH = 4
+
+
+class CountingPhysics(NativePhysics):
+    """MuJoCo C that counts the steps of all environments."""
+
+    name = "counting"
+    steps = 0
+
+    def step(self, state, target, table):
+        CountingPhysics.steps += len(target)
+        return super().step(state, target, table)
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    monkeypatch.setitem(ENGINES, "counting", Engine(CountingPhysics, batch=BATCH))
+    monkeypatch.setattr(CountingPhysics, "steps", 0)
+
+
+def test_rollouts_are_made_on_it():
+    physics = make_physics("counting", HAND, TASK, OBJECTS, threads=1)
+
+    def policy(parameters, observation, key):
+        return 0.3 * jax.random.normal(key, (BATCH, len(HAND.joints) + 6)), jnp.zeros(BATCH)
+
+    bank = build_bank(HAND, TASK, OBJECTS, 0)
+    rollout = RolloutWorker(HAND, TASK, physics, bank, policy, batch=BATCH, seed=0, half_precision=False).collect(
+        None, 3
+    )
+    assert CountingPhysics.steps == 3 * BATCH and np.all(np.isfinite(rollout.reward))
+    physics.close()
+
+
+def test_an_evaluation_takes_its_batch_from_its_row():
+    policy = untrained(RunConfig(network=NetworkConfig(hidden=(8,))))
+    (row,) = Evaluator(policy, OBJECTS, physics="counting", threads=1).rows(["heading"], 2 * BATCH)
+    task = policy.task
+    assert row.episodes == 2 * BATCH
+    assert CountingPhysics.steps == 2 * BATCH * (task.approach_steps + task.hold_steps)
+
+
+def test_a_run_and_errors_name_it():
+    config = RunConfig(physics="counting")
+    assert run_config_from_json(to_json(config)) == config
+    assert resolve_physics("counting") == "counting" and resolve_physics("auto", "cpu") == "native"
+    with pytest.raises(CongraspError, match=r"no physics engine 'abacus'\. Choose from: auto, warp, .*, counting\."):
+        make_physics("abacus", HAND, TASK, OBJECTS, threads=1)
+
+
+def test_command_lines_offer_it():
+    program = (
+        "from actors.physics import ENGINES, Engine; from services.cli.main import run; "
+        "ENGINES['counting'] = Engine(None, batch=1); run(['train', '--help'])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert "--physics {auto,warp,jax,native,counting}" in done.stdout
+    assert "(default: native)" in done.stdout.split("--physics")[1][:200]
