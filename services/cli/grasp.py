@@ -3,14 +3,19 @@
 import dataclasses
 import pathlib
 import sys
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from rich.console import Console
+from rich.markup import escape
 from typing_extensions import Doc
 
 from common.errors import CongraspError
 from common.task.constraints import CONSTRAINTS
 from services.assets.objects.options import ImportOptions
+
+if TYPE_CHECKING:
+    from services.grasp.jobs import Result
 
 NOT_HELD, BAD_INPUT = 1, 2
 
@@ -61,14 +66,11 @@ def grasp(
       again: Also redo finished objects.
       options: How meshes become objects.
     """
-    from rich.console import Console
-    from rich.markup import escape
-
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
     from services.cli.console import bars
     from services.grasp.grasper import Grasper
-    from services.grasp.jobs import SHEET, Result, Settings, find_objects, grasp_object, save_summary
+    from services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
@@ -76,7 +78,6 @@ def grasp(
         raise CongraspError(f"--tries is {tries}.", "It must be at least 1.")
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
-    console = Console(highlight=False)
     file = policy_file(policy, hand)
     loaded = bundles.load(file)
     found, results = find_objects(objects)
@@ -84,19 +85,8 @@ def grasp(
     settings = Settings(out, options, dataclasses.asdict(constraints), identity, video, pictures, again)
     grasper = Grasper(loaded, attempts=tries, seed=seed)
 
-    def show(result: Result) -> None:
-        results.append(result)
-        if result.error:
-            print(f"congrasp: error: {result.error}", file=sys.stderr)
-            return
-        done = " (done before)" if result.skipped else ""
-        console.print(f"[bold]{escape(result.name)}[/]{done}: {escape(result.line())}", soft_wrap=True)
-        for note in result.facts["notes"]:
-            console.print(f"  {escape(note)}", soft_wrap=True)
-
-    for result in results[:]:
-        results.remove(result)
-        show(result)
+    for result in results:
+        _show(result)
     with bars() as bar:
         whole = bar.add_task("Objects", total=len(found), visible=len(found) > 1)
         part = bar.add_task("Starting", total=None)
@@ -105,18 +95,37 @@ def grasp(
             def progress(what: str, done: int, total: int, name: str = at.name) -> None:
                 bar.update(part, description=f"{escape(name)}: {what}", completed=done, total=total if done else None)
 
-            show(grasp_object(at, grasper, settings, progress))
+            results.append(grasp_object(at, grasper, settings, progress))
+            _show(results[-1])
             bar.advance(whole)
     grasper.close()
     if found:
         save_summary(out, grasper.hand.name, results)
+    return _conclude(results, len(found), out)
+
+
+def _show(result: "Result") -> None:
+    """Prints the outcome for one object, and what its user should know of it."""
+    if result.error:
+        print(f"congrasp: error: {result.error}", file=sys.stderr)
+        return
+    done = " (done before)" if result.skipped else ""
+    Console(highlight=False).print(f"[bold]{escape(result.name)}[/]{done}: {escape(result.line())}", soft_wrap=True)
+    for note in result.facts["notes"]:
+        Console(highlight=False).print(f"  {escape(note)}", soft_wrap=True)
+
+
+def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
+    """Prints where everything is; returns the exit code."""
+    from services.grasp.jobs import SHEET
+
     held = sum(bool(result.facts.get("success")) for result in results)
-    failed = [result for result in results if result.error]
+    failed = sum(bool(result.error) for result in results)
     if len(results) > 1:
-        summary = f"{held} of {len(results)} objects are held; {len(failed)} could not be used."
-        console.print(f"{summary} {escape(str(out / SHEET))} shows them.", soft_wrap=True)
-    if len(found) > len(failed):
-        console.print(f"Everything is in {escape(str(out))}.", soft_wrap=True)
+        summary = f"{held} of {len(results)} objects are held; {failed} could not be used."
+        Console(highlight=False).print(f"{summary} {escape(str(out / SHEET))} shows them.", soft_wrap=True)
+    if found > failed:
+        Console(highlight=False).print(f"Everything is in {escape(str(out))}.", soft_wrap=True)
     return BAD_INPUT if failed else NOT_HELD if held < len(results) else 0
 
 
