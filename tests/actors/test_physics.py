@@ -163,7 +163,7 @@ def test_gains_hold_half_a_kilogram_without_shaking():
     physics.close()
 
 
-def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp_path, monkeypatch):
+def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(env, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     physics = NativePhysics(HAND, TASK, OBJECTS, 2)
     start = above(env.reset_state, 0.3)
@@ -181,7 +181,7 @@ def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(env, tmp
     physics.close()
 
 
-def test_a_world_that_was_used_before_is_as_good_as_new(env):
+def test_an_environment_that_was_used_before_is_as_good_as_new(env):
     """Worlds are recycled: neither state nor mass of an earlier episode may be left in them."""
     physics, fresh = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, OBJECTS, 1)
     start = above(env.reset_state, 0.19)

@@ -123,11 +123,8 @@ def test_rows_are_what_mujoco_compiles():
             hand = slice(0, scene.nv - 6) if name.startswith("dof") else slice(0, body)
             np.testing.assert_allclose(getattr(catalogue.model, name)[hand], getattr(scene, name)[hand], rtol=1e-6)
         used = [g for g in range(scene.ngeom) if scene.geom_bodyid[g] == body]
-        filled = (
-            rows["geom_dataid"][n] >= 0
-            if not all(piece.kind != "mesh" for piece in obj.pieces)
-            else rows["geom_rbound"][n] > 0.002
-        )
+        meshed = any(piece.kind == "mesh" for piece in obj.pieces)
+        filled = rows["geom_dataid"][n] >= 0 if meshed else rows["geom_rbound"][n] > 0.002
         assert filled.sum() == len(used)
         for name in ("geom_size", "geom_rbound", "geom_aabb"):
             mine = np.sort(rows[name][n][filled].reshape(len(used), -1), 0)
@@ -212,7 +209,7 @@ def test_a_compiled_loop_is_the_same_as_single_steps(start):
         _same(after, jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
 
 
-def test_meshes_are_absent_from_a_world_alone_too(start):
+def test_meshes_are_absent_from_an_environment_alone_too(start):
     """An unused mesh slot in the middle of a sheet would touch the table."""
     sheet = dataclasses.replace(OBJECTS[0], pieces=(Piece("box", (0.04, 0.04, 0.0003)),))
     warp = WarpPhysics(HAND, TASK, [sheet])
@@ -227,16 +224,16 @@ def test_meshes_are_absent_from_a_world_alone_too(start):
     np.testing.assert_array_equal(*occupancy)
 
 
-def test_a_diverged_world_is_marked_and_put_back_while_the_others_go_on(start):
+def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(start):
     warp = WarpPhysics(HAND, TASK, OBJECTS)
-    start = warp.start(start)
+    first = warp.start(start)
     target, table = jnp.asarray(grasp(start, 0)), jnp.ones(4, bool)
-    state, _ = warp.step(start, target, table)
+    state, _ = warp.step(first, target, table)
     _, expected = warp.step(state, target, table)
     state, after = warp.step(state._replace(qvel=state.qvel.at[1].set(jnp.nan)), target, table)
     np.testing.assert_array_equal(after.diverged, [False, True, False, False])
     assert all(np.isfinite(field).all() for field in after)
-    _same(jax.tree.map(lambda leaf: leaf[1], state), jax.tree.map(lambda leaf: leaf[1], start))
+    _same(jax.tree.map(lambda leaf: leaf[1], state), jax.tree.map(lambda leaf: leaf[1], first))
     np.testing.assert_allclose(after.q[2:], expected.q[2:], atol=1e-6)
     _, after = warp.step(state, target, table)
     assert not after.diverged.any()
@@ -258,7 +255,7 @@ def test_buffers_are_as_full_as_what_mujoco_finds(start):
 
 
 def test_what_had_no_room_is_counted(start, monkeypatch):
-    monkeypatch.setattr(warp_buffers, "CONTACTS_PER_WORLD", 2)
+    monkeypatch.setattr(warp_buffers, "CONTACTS_PER_ENVIRONMENT", 2)
     warp = WarpPhysics(HAND, TASK, OBJECTS)
     _, crowded = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
     assert crowded.occupancy[0] > 1 > crowded.occupancy[1]

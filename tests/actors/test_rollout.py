@@ -226,7 +226,7 @@ class _Touching:
         )
 
 
-def test_a_world_that_goes_on_keeps_its_contacts_when_another_restarts(bank):
+def test_an_environment_that_goes_on_keeps_its_contacts_when_another_restarts(bank):
     worker = RolloutWorker(HAND, TASK, _Touching(), bank, _noise, batch=2, seed=0, half_precision=False)
     state = worker.state
     worker.state = state._replace(
