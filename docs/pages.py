@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from docutils import nodes
 from docutils.parsers.rst import Directive
 from sphinx.application import Sphinx
+from typing_extensions import Doc
 
 from common.config import RunConfig
 from common.wire import messages
@@ -88,8 +89,14 @@ def _meanings(kind: type) -> dict[str, str]:
     """What the fields of a dataclass mean: the docstrings under them, or `Doc` where constraints declare them."""
     written = "".join(inspect.getsource(base) for base in kind.__mro__ if base.__module__ == kind.__module__)
     hints = typing.get_type_hints(kind, include_extras=True)
+    declared = {
+        name: mark.documentation
+        for name, hint in hints.items()
+        for mark in getattr(hint, "__metadata__", ())
+        if isinstance(mark, Doc)
+    }
     return {
-        **{name: hint.__metadata__[0].documentation for name, hint in hints.items() if hasattr(hint, "__metadata__")},
+        **declared,
         **dict(re.findall(r'^    (\w+): [^\n]*\n    """(.+?)"""', written, re.M | re.S)),
     }
 

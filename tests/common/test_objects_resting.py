@@ -123,7 +123,7 @@ def test_the_mujoco_body_is_the_object(family):
     np.testing.assert_array_equal(model.geom_contype, 2)
     np.testing.assert_array_equal(model.geom_conaffinity, 4)
     for i, piece in enumerate(obj.pieces):
-        geom = model.geom(f"thing_{i}")
+        geom = model.geom(f"body_{i}")
         if piece.vertices is None:
             np.testing.assert_allclose(geom.pos, piece.pos, atol=1e-9)
             continue

@@ -76,8 +76,10 @@ def test_within_a_process_a_name_is_enough():
 def test_who_connects_waits_for_the_listener(tmp_path):
     for url in ("memory/late", f"socket/{tmp_path}/late"):
         opened = []
-        threading.Timer(0.2, lambda url=url, opened=opened: opened.append(urls.listen(url, "learner"))).start()
+        late = threading.Timer(0.2, lambda url=url, opened=opened: opened.append(urls.listen(url, "learner")))
+        late.start()
         with urls.connect(url, "observer", wait=10.0):
+            late.join(10.0)
             opened[0].close()
 
 
