@@ -11,11 +11,12 @@ from common.config import TaskConfig
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands.spec import Hand
+from common.inputs import file_name, read_file
 from common.objects import store
 from common.objects.pool import object_scale, scale_objects
 from common.objects.spec import GraspObject
 from common.task.bank import ConstraintBank
-from common.wire.codec import Message, decode, encode
+from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 SUFFIX = ".constraints.safetensors"
 VARIANTS = ("whole surface", "O+")
@@ -235,7 +236,7 @@ def _filled(row: ConstraintBank, rests: int, poses: int) -> ConstraintBank:
 
 def save(constraints: Message, folder: pathlib.Path) -> pathlib.Path:
     """Writes a set under its object's name; returns the file."""
-    path = folder / f"{constraints.meta['object']}{SUFFIX}"
+    path = folder / f"{file_name(constraints.meta['object'], 'a constraint set')}{SUFFIX}"
     write_atomically(path, encode(constraints))
     return path
 
@@ -248,7 +249,7 @@ def load(path: pathlib.Path) -> Message:
     """
     remedy = "Make it anew with 'congrasp constraints generate'."
     try:
-        message = decode(path.read_bytes())
+        message = decode(read_file(path, MAX_MESSAGE))
     except OSError as error:
         raise CongraspError(f"The constraint set {path} cannot be read: {error.strerror}.", remedy) from None
     except CongraspError as error:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from common.errors import CongraspError
 from common.files import write_atomically
+from common.inputs import file_name
 from common.objects import store
 from common.objects.spec import GraspObject
 from services.assets.objects.meshes import import_source
@@ -116,8 +117,8 @@ def _distinct(jobs: Sequence[Job]) -> Iterator[str]:
 
 def run_job(job: Job, grasper: Grasper, settings: Settings, progress: Progress) -> Result:
     """Grasps one object and writes its folder, unless that is done already."""
-    folder = settings.out / job.name
     try:
+        folder = settings.out / file_name(job.name, "the folder of an object")
         given = {
             name: [_content(part) for part in ([text] if isinstance(text, str) else text)]
             for name, text in settings.constraints.items()

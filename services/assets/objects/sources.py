@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from common.errors import CongraspError
+from common.inputs import LONGEST_NAME
 from services.assets.objects import repair
 from services.assets.objects.kinds import CONVERT, SUFFIXES, kind_of
 
@@ -180,4 +181,4 @@ def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
 def safe_name(text: str) -> str:
     """A text as the name of an object, which can be a file name."""
     safe = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in text).lstrip("._-")
-    return safe or "object"
+    return safe[:LONGEST_NAME] or "object"
