@@ -48,7 +48,7 @@ def read_file(path: pathlib.Path, largest: int, remedy: str = "") -> bytes:
             raise CongraspError(f"{path} is no regular file.", remedy)
         if found.st_size > largest:
             raise CongraspError(f"{path} has {found.st_size} bytes, more than the {largest} that are read.", remedy)
-        return file.read(largest)
+        return file.read(found.st_size)
 
 
 def _without_waiting(path: str, flags: int) -> int:
