@@ -20,6 +20,7 @@ from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.task.constraints import CONSTRAINTS
 from common.wire.codec import Message
+from services.assets.objects.headers import check_header
 from services.assets.objects.sizes import size_in_words
 from services.export.motion_file import GraspMotion, load_motion
 from services.grasp import constraint_sets
@@ -160,6 +161,7 @@ def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
         return np.where(inside, 0.0, 1.0)
     if not path.is_file():
         raise CongraspError(f"{name}: there is no file {path}.", "Check the path.")
+    check_header(path, path.suffix.lower(), "Export it as PLY.")
     try:
         geometry: Any = trimesh.load_scene(path, process=False).to_geometry()
         points = np.asarray(geometry.vertices, float)
