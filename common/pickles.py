@@ -7,16 +7,31 @@ refuses the file.
 
 import codecs
 import io
+import math
 import pathlib
 import pickletools
+import re
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from common.errors import CongraspError
+from common.inputs import read_file
 
 _REMEDY = "Only pickles of plain values and arrays are read; get the file again."
-_LARGEST = 256 * 2**20
+MAX_BYTES = 256 << 20
+"""Bytes that a pickle may have."""
+MAX_STEPS = 1_000_000
+"""Opcodes that a pickle may have, those of the tensors inside of it included."""
+MAX_DEPTH = 100
+"""Containers and objects inside of one another."""
+MAX_WRITTEN_OUT = 1 << 30
+"""Bytes of all values with what is shared counted as often as it is used, at `_VALUE` each beside an array's own."""
+MAX_COPIED = 512 << 20
+"""Bytes of all arrays and texts that are made of the file's."""
+_VALUE = 512
+_NUMBER = re.compile(r"[<>=|]?(\?|[biuf]\d{1,2})")
 _ARRAY = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 _BUFFER = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
 _SCALAR = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
@@ -78,9 +93,7 @@ def read_pickle(path: pathlib.Path, *, mixed: bool = False) -> Any:
       CongraspError: there is no such file, or it is no pickle of arrays; the line says which name or opcode it is.
     """
     try:
-        if path.stat().st_size > _LARGEST:
-            raise CongraspError(f"{path} has more than {_LARGEST >> 20} MB.", _REMEDY)
-        return parse_pickle(path.read_bytes(), str(path), mixed=mixed)
+        return parse_pickle(read_file(path, MAX_BYTES, _REMEDY), str(path), mixed=mixed)
     except OSError as error:
         raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
 
@@ -93,22 +106,43 @@ def parse_pickle(data: bytes, name: str, *, mixed: bool = False) -> Any:
       name: where it comes from, for error messages.
       mixed: see there.
     """
+    budget = _Budget()
     try:
-        return _Plain(mixed)(_run(io.BytesIO(data), KNOWN | TORCH if mixed else KNOWN))
+        return _Plain(mixed, budget)(_run(io.BytesIO(data), KNOWN | TORCH if mixed else KNOWN, budget))
     except _Refused as error:
         what = str(error)
     except RecursionError:
         what = "is nested too deeply"
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, LookupError, MemoryError, OverflowError):
+    except (ValueError, TypeError, LookupError, AttributeError, MemoryError, OverflowError):
         what = "is damaged"
     raise CongraspError(f"{name} {what}.", _REMEDY)
 
 
-def _run(stream: io.BytesIO, known: set[str]) -> Any:
+class _Budget:
+    """What a file may still cost, before it is spent."""
+
+    def __init__(self) -> None:
+        self._steps, self._copied = MAX_STEPS, MAX_COPIED
+
+    def step(self) -> None:
+        """One opcode more."""
+        self._steps -= 1
+        if self._steps < 0:
+            raise _Refused(f"has more than {MAX_STEPS} opcodes")
+
+    def copy(self, size: int) -> None:
+        """An array or a text of this many bytes is about to be made."""
+        self._copied -= size
+        if size < 0 or self._copied < 0:
+            raise _Refused(f"makes more than {MAX_COPIED >> 20} MB of arrays")
+
+
+def _run(stream: io.BytesIO, known: set[str], budget: _Budget) -> Any:
     """What the opcodes leave on the stack at their end; globals must have known names."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     while True:
+        budget.step()
         code = stream.read(1)
         opcode = _OPCODES.get(code.decode("latin-1"))
         if opcode is None:
@@ -151,7 +185,7 @@ def _step(name: str, argument: Any, stack: list[Any], memo: dict[int, Any], know
             stack.append(set())
         case "DICT":
             items = _since_mark(stack)
-            stack.append(dict(zip(items[::2], items[1::2], strict=True)))
+            stack.append(dict(zip(_keys(items[::2]), items[1::2], strict=True)))
         case "LIST":
             stack.append(_since_mark(stack))
         case "TUPLE":
@@ -164,10 +198,10 @@ def _step(name: str, argument: Any, stack: list[Any], memo: dict[int, Any], know
             _of(list, stack).extend(items)
         case "SETITEM" | "SETITEMS":
             items = _since_mark(stack) if name == "SETITEMS" else [stack.pop(-2), stack.pop()]
-            _of(dict, stack).update(zip(items[::2], items[1::2], strict=True))
+            _of(dict, stack).update(zip(_keys(items[::2]), items[1::2], strict=True))
         case "ADDITEMS":
             items = _since_mark(stack)
-            _of(set, stack).update(items)
+            _of(set, stack).update(_keys(items))
         case "PUT" | "BINPUT" | "LONG_BINPUT":
             memo[argument] = stack[-1]
         case "MEMOIZE":
@@ -209,6 +243,14 @@ def _since_mark(stack: list[Any]) -> list[Any]:
     raise _Refused("is damaged")
 
 
+def _keys(items: Iterable[Any]) -> list[Any]:
+    """Keys of a dictionary or members of a set: texts and numbers, whose hashes take no time whatever they hold."""
+    keys = list(items)
+    if not all(item is None or isinstance(item, (str, bytes, int, float)) for item in keys):
+        raise _Refused("has keys that are neither texts nor numbers")
+    return keys
+
+
 def _of(kind: type, stack: list[Any]) -> Any:
     """The top of the stack, which must be of this type."""
     if not isinstance(stack[-1], kind):
@@ -226,21 +268,48 @@ def _known(name: str, known: set[str]) -> _Name:
 class _Plain:
     """From what was read to plain values and arrays; what the file shares is turned once."""
 
-    def __init__(self, mixed: bool) -> None:
-        self._mixed = mixed
-        self._done: dict[int, Any] = {}
+    def __init__(self, mixed: bool, budget: _Budget) -> None:
+        self._mixed, self._budget = mixed, budget
+        self._done: dict[int, tuple[Any, int]] = {}
+        self._depth = self._size = 0
 
     def __call__(self, value: Any) -> Any:
-        """The plain value; the same for the same object."""
+        """The plain value; `_size` grows by its bytes, written out."""
         if not isinstance(value, (list, tuple, dict, _Made)):
+            self._grow(_VALUE + (len(value) if isinstance(value, (str, bytes, bytearray, set)) else 0))
             return None if isinstance(value, _Name) else value
         key = id(value)
         if key not in self._done:
-            self._done[key] = _ENDED
-            self._done[key] = self._turned(value)
-        if self._done[key] is _ENDED:
+            self._done[key] = _ENDED, 0
+            before, self._depth = self._size, self._depth + 1
+            if self._depth > MAX_DEPTH:
+                raise _Refused("is nested too deeply")
+            turned = self._turned(value)
+            self._grow(_VALUE + (turned.nbytes if isinstance(turned, np.ndarray) else 0))
+            self._done[key] = turned, self._size - before
+            self._depth -= 1
+            return turned
+        turned, size = self._done[key]
+        if turned is _ENDED:
             raise _Refused("contains itself")
-        return self._done[key]
+        self._grow(size)
+        return turned
+
+    def _grow(self, size: int) -> None:
+        self._size += size
+        if self._size > MAX_WRITTEN_OUT:
+            raise _Refused("repeats its values until they fill the memory")
+
+    def _bytes(self, data: Any) -> bytes:
+        """The bytes that a text or a buffer holds."""
+        self._budget.copy(len(data))
+        return data.encode("latin-1") if isinstance(data, str) else bytes(data)
+
+    def _numbers(self, data: Any, kind: Any, count: int = -1) -> np.ndarray:
+        """An array (n,) of a buffer's numbers."""
+        dtype, content = _dtype(kind), self._bytes(self(data))
+        self._budget.copy(len(content))
+        return np.frombuffer(content, dtype, count=count).copy()
 
     def _turned(self, value: Any) -> Any:
         """One value, for the first time."""
@@ -259,41 +328,38 @@ class _Plain:
                 for i, item in enumerate(items):
                     array[i] = item
                 return array.reshape(tuple(shape), order="F" if fortran else "C")
-            dtype = _dtype(kind)
-            return np.frombuffer(_bytes(self(data)), dtype).copy().reshape(tuple(shape), order="F" if fortran else "C")
+            return self._numbers(data, kind).reshape(tuple(shape), order="F" if fortran else "C")
         if name in _BUFFER:
             data, kind, shape, order = arguments
-            return np.frombuffer(_bytes(self(data)), _dtype(kind)).copy().reshape(tuple(shape), order=order)
+            return self._numbers(data, kind).reshape(tuple(shape), order=order)
         if name in _SCALAR:
-            return np.frombuffer(_bytes(self(arguments[1])), _dtype(arguments[0]), count=1)[0]
+            return self._numbers(arguments[1], arguments[0], 1)[0]
         if name in _SPARSE:
-            return _dense(self(state))
+            return _dense(self(state), self._budget)
         if name == _VARIABLE:
             return self(state["x"])
         if name == _SELECTION:
-            return self(state["a"]).ravel()[self(state["idxs"])].reshape(self(state["preferred_shape"]))
+            whole, index = self(state["a"]), self(state["idxs"])
+            self._budget.copy(whole.nbytes + index.size * whole.itemsize)
+            return whole.ravel()[index].reshape(self(state["preferred_shape"]))
         if name == _ENCODE:
             text, encoding = arguments
             if encoding != "latin1":
                 raise _Refused(f"encodes bytes as {encoding!r:.40}")
-            return text.encode("latin-1")
+            return self._bytes(text)
         if name in _SETS:
-            return set(self(arguments[0]))
+            return set(_keys(self(arguments[0])))
         if name == _STORAGE_BYTES:
-            return _storage(_bytes(self(arguments[0])))
+            return _storage(self._bytes(self(arguments[0])), self._budget)
         if name == _TENSOR:
             flat, start, shape, strides = (self(argument) for argument in arguments[:4])
             last = start + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
             if start < 0 or min((*shape, *strides), default=1) < 0 or (0 not in shape and last >= len(flat)):
                 raise _Refused("has a tensor that is larger than its data")
             size = flat.itemsize
+            self._budget.copy(math.prod(shape) * size)
             return np.lib.stride_tricks.as_strided(flat[start:], shape, [size * step for step in strides]).copy()
         return None
-
-
-def _bytes(data: Any) -> bytes:
-    """Bytes that older protocols write as Latin-1 text."""
-    return data.encode("latin-1") if isinstance(data, str) else bytes(data)
 
 
 def _dtype(made: Any) -> np.dtype[Any]:
@@ -301,33 +367,35 @@ def _dtype(made: Any) -> np.dtype[Any]:
     if not (isinstance(made, _Made) and made.name == _DTYPE):
         raise _Refused("has an array of an unknown type")
     kind = str(made.arguments[0])
-    dtype = np.dtype(kind).newbyteorder(">" if made.state and made.state[1] == ">" else "<")
-    if dtype.kind not in "biuf":
+    if not _NUMBER.fullmatch(kind):
         raise _Refused(f"has an array of {kind[:20]!r}, not of numbers")
-    return dtype
+    return np.dtype(kind).newbyteorder(">" if made.state and made.state[1] == ">" else "<")
 
 
-def _storage(data: bytes) -> np.ndarray:
+def _storage(data: bytes, budget: _Budget) -> np.ndarray:
     """The numbers of a PyTorch storage in the format of before version 1.6, which pickled tensors still use.
 
     Five pickles follow one another (a magic number, a version, facts about the machine, a reference to the storage and
     the keys of all storages), then the number of elements as an integer of eight bytes, and the elements.
     """
     stream = io.BytesIO(data)
-    magic, _, machine, reference, keys = (_run(stream, TORCH) for _ in range(5))
+    magic, _, machine, reference, keys = (_run(stream, TORCH, budget) for _ in range(5))
     if magic != _TORCH_MAGIC or not machine["little_endian"] or len(keys) != 1:
         raise _Refused("has a tensor of an unknown format")
     kind = np.dtype(_STORAGES[reference.arguments[1].text])
     count = int.from_bytes(stream.read(8), "little")
+    budget.copy(2 * len(data))
     return np.frombuffer(stream.read(), kind, count=count).copy()
 
 
-def _dense(state: dict[str, Any]) -> np.ndarray:
+def _dense(state: dict[str, Any], budget: _Budget) -> np.ndarray:
     """A matrix of compressed columns as an array."""
     rows, columns = state["_shape"]
-    data, indices, starts = state["data"], state["indices"], state["indptr"]
-    if not (0 < rows * columns <= 1e7 and len(starts) == columns + 1 and len(data) == len(indices)):
+    data, indices, starts = state["data"], state["indices"], np.asarray(state["indptr"], np.int64)
+    fits = 0 < rows * columns <= 1e7 and len(starts) == columns + 1 and len(data) == len(indices) == starts[-1]
+    if not fits or starts[0] != 0 or (np.diff(starts) < 0).any():
         raise _Refused("has a sparse matrix that is damaged or very large")
+    budget.copy(rows * columns * data.itemsize)
     dense = np.zeros((rows, columns), data.dtype)
     dense[indices, np.repeat(np.arange(columns), np.diff(starts))] = data
     return dense

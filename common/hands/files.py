@@ -8,14 +8,21 @@ import dataclasses
 import functools
 import json
 import pathlib
+from collections.abc import Iterator
+from typing import Any
 
 import dacite
 import numpy as np
 
 from common.errors import CongraspError
 from common.hands.spec import Hand, chain_of
+from common.inputs import LONGEST_NAME, read_file
 
 FORMAT = 1
+MAX_BYTES = 1 << 20
+"""Bytes that a hand file may have."""
+_LINKS, _JOINTS, _CAPSULES = 64, 64, 16  # most of a hand, of a hand, of a link
+_LARGEST = 1e4  # of any number
 _REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-hand.md."
 _TAKEN = {"hand_base", "table", "anchor", "object", "hold", "world"}
 _WRIST = {"wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz"}
@@ -39,12 +46,14 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
       CongraspError: it is not JSON, a field is missing or has the wrong type, or the hand cannot be as it says.
     """
     try:
-        fields = json.loads(text)
-        found = fields.pop("format", None)
-    except (ValueError, AttributeError):
-        raise CongraspError(f"{source} is not JSON.", _REMEDY) from None
+        fields = json.loads(text) if len(text) <= MAX_BYTES else None
+    except (ValueError, RecursionError):
+        fields = None
+    if not isinstance(fields, dict):
+        raise CongraspError(f"{source} is not JSON, or has more than {MAX_BYTES} characters.", _REMEDY)
+    found = fields.pop("format", None)
     if found != FORMAT:
-        raise CongraspError(f"{source} has the format {found}, not {FORMAT}.", _REMEDY)
+        raise CongraspError(f"{source} has the format {found!r:.20}, not {FORMAT}.", _REMEDY)
     # Without spaces: the text is sent with every episode.
     hand, wrong = _described(json.dumps({"format": FORMAT, **fields}, separators=(",", ":")))
     if hand is None or wrong:
@@ -52,22 +61,22 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
     return hand
 
 
-@functools.cache
+@functools.lru_cache(maxsize=64)
 def _described(text: str) -> tuple[Hand | None, str]:
     """The hand of a file's text, or what is wrong with it."""
     fields = json.loads(text)
     del fields["format"]
     try:
         hand = dacite.from_dict(Hand, {**fields, "text": text}, dacite.Config(strict=True, cast=[tuple, float]))
-    except (dacite.DaciteError, TypeError, ValueError) as error:
-        return None, f"no hand, {error}"
+    except (dacite.DaciteError, TypeError, ValueError, OverflowError) as error:
+        return None, f"no hand, {str(error)[:200]}"
     return hand, next(iter(faults(hand)), "")
 
 
 def read_hand(path: pathlib.Path) -> Hand:
     """The hand of a file; see `hand_from_text`."""
     try:
-        return hand_from_text(path.read_text(), str(path))
+        return hand_from_text(read_file(path, MAX_BYTES, _REMEDY).decode(), str(path))
     except OSError as error:
         raise CongraspError(f"The hand file {path} cannot be read: {error.strerror}.", _REMEDY) from None
     except UnicodeDecodeError:
@@ -76,10 +85,12 @@ def read_hand(path: pathlib.Path) -> Hand:
 
 def faults(hand: Hand) -> list[str]:
     """What is wrong with a hand, one phrase for each fault."""
+    if too_much := _out_of_bounds(hand):
+        return [too_much]
     found: list[str] = []
     names = [link.name for link in hand.links]
     joints = [joint.name for joint in hand.joints]
-    if not hand.name.isidentifier():
+    if not hand.name.isidentifier() or len(hand.name) > LONGEST_NAME:
         found.append(f"the name '{hand.name}' is more than letters, digits and underscores")
     for name in sorted({name for name in names + joints if (names + joints).count(name) > 1 or not name}):
         found.append(f"the name '{name}' is there more than once, or empty")
@@ -115,3 +126,26 @@ def faults(hand: Hand) -> list[str]:
     if not hand.object_scale > 0:
         found.append("the object scale must be above zero")
     return found
+
+
+def _out_of_bounds(hand: Hand) -> str:
+    """Why a hand is no hand at all, whatever else it says: numbers that are not finite, too many parts; or nothing."""
+    if len(hand.links) > _LINKS or len(hand.joints) > _JOINTS:
+        return f"it has more than {_LINKS} links or {_JOINTS} joints"
+    if any(len(link.capsules) > _CAPSULES for link in hand.links):
+        return f"it has a link of more than {_CAPSULES} capsules"
+    fields = dataclasses.asdict(hand)
+    del fields["text"]
+    for number in _numbers(fields):
+        if not abs(number) <= _LARGEST:
+            return f"it holds {number:g}, which is not a finite number of at most {_LARGEST:g}"
+    return ""
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """The numbers in fields, at any depth."""
+    if isinstance(value, (int, float)):
+        yield value
+    elif isinstance(value, (dict, list, tuple)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _numbers(item)

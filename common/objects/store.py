@@ -3,21 +3,23 @@
 import hashlib
 import os
 import pathlib
-import re
 from typing import Any
 
 import numpy as np
 
 from common.errors import CongraspError
 from common.files import write_atomically
+from common.inputs import file_name, read_file
+from common.objects.checks import faults
 from common.objects.spec import GraspObject, Piece
 from common.wire.codec import Message, decode, encode
 
 SUFFIX = ".safetensors"
+MAX_BYTES = 64 << 20
+"""Bytes that an object file may have."""
 _FORMAT = 1
 _KINDS = ("box", "cylinder", "capsule", "ellipsoid", "mesh")
 _ARRAYS = ("graspable", "inertia", "points", "normals", "labels", "rest_poses", "visual_vertices", "visual_faces")
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def digest(obj: GraspObject) -> str:
@@ -38,22 +40,25 @@ def load(path: str | os.PathLike[str]) -> GraspObject:
     """Reads an object. Its arrays are read-only.
 
     Raises:
-      CongraspError: no such file, another kind of file, or damaged content.
+      CongraspError: no such file, another kind of file, damaged content, or values that no object has (`faults`).
     """
     path = pathlib.Path(path)
     remedy = "Make it anew with 'congrasp objects import' or 'congrasp objects generate'."
-    if not path.is_file():
+    if not path.exists():
         raise CongraspError(f"There is no object file {path}.", "'congrasp objects list' shows what a folder holds.")
     try:
-        message = decode(path.read_bytes())
+        message = decode(read_file(path, MAX_BYTES))
     except (CongraspError, OSError) as error:
         raise CongraspError(f"{path} cannot be read as an object: {error}", remedy) from None
     if message.meta.get("kind") != "object" or message.meta.get("format") != _FORMAT:
         raise CongraspError(f"{path} is not an object of this version of congrasp.", remedy)
     try:
-        return _from_message(message)
-    except (KeyError, IndexError, ValueError) as error:
+        obj = _from_message(message)
+    except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
         raise CongraspError(f"{path} lacks a part of an object: {error}.", remedy) from None
+    for fault in faults(obj):
+        raise CongraspError(f"{path}: {fault}.", remedy)
+    return obj
 
 
 class Catalogue:
@@ -94,11 +99,7 @@ class Catalogue:
         Raises:
           CongraspError: the name cannot be a file name.
         """
-        if not _NAME.fullmatch(name):
-            raise CongraspError(
-                f"'{name}' cannot name an object.", "Use letters, digits, dots, hyphens and underscores."
-            )
-        return self.folder / f"{name}{SUFFIX}"
+        return self.folder / f"{file_name(name, 'an object')}{SUFFIX}"
 
 
 def _to_message(obj: GraspObject) -> Message:

@@ -21,12 +21,14 @@ from common.config import NetworkConfig, TaskConfig
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands import get_hand
+from common.inputs import read_file
 from common.policy import network, normalizer
 from common.policy.network import Layout, Params
 from common.policy.normalizer import Affine, Statistics
+from common.ranges import network_faults, task_faults
 from common.task import observation as task_observation
 from common.task.types import Array
-from common.wire.codec import Message, decode, encode
+from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 FORMAT = 1
 _REMEDY = "Use a bundle made by 'congrasp train' of this version."
@@ -147,9 +149,12 @@ class PolicyBundle:
             )
             task = _dataclass(TaskConfig, meta["task"])
             version, epoch, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
+            for fault in (*network_faults(spec.network, spec.layout, spec.action_size), *task_faults(task)):
+                raise ValueError(fault)
             shapes = _shapes(spec)
-        except (KeyError, TypeError, ValueError, CongraspError, dacite.DaciteError) as error:
-            raise CongraspError(f"The policy {source} has bad meta data: {str(error).rstrip('.')}.", _REMEDY) from None
+        except (LookupError, TypeError, ValueError, OverflowError, CongraspError, dacite.DaciteError) as error:
+            why = str(error).rstrip(".")[:200]
+            raise CongraspError(f"The policy {source} has bad meta data: {why}.", _REMEDY) from None
         if meta.get("schema") != spec.schema:
             raise CongraspError(f"The policy {source} names a schema that is not its own.", _REMEDY)
         _check_arrays(message.arrays, shapes, source)
@@ -171,7 +176,7 @@ def save(bundle: PolicyBundle, path: pathlib.Path) -> None:
 def load(path: pathlib.Path) -> PolicyBundle:
     """Reads a bundle from a file; errors name it."""
     try:
-        data = path.read_bytes()
+        data = read_file(path, MAX_MESSAGE, _REMEDY)
     except OSError as error:
         remedy = "Name a policy file (policy.safetensors in a run's folder)."
         raise CongraspError(f"The policy {path} cannot be read: {error.strerror}.", remedy) from None

@@ -164,7 +164,7 @@ def _portable(name: str, value: Any) -> np.ndarray:
 
 def _header(text: bytes) -> dict[str, Any]:
     try:
-        header = json.loads(text.decode(), object_pairs_hook=_unique, parse_constant=_no_constant)
+        header = json.loads(text.decode(), object_pairs_hook=_unique, parse_constant=_no_constant, parse_float=_number)
     except (ValueError, RecursionError) as error:
         raise CongraspError(f"The message's header is not JSON: {str(error)[:80]}.") from None
     if not isinstance(header, dict):
@@ -177,6 +177,12 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(result) < len(pairs):
         raise CongraspError("The message's header has a key twice.")
     return result
+
+
+def _number(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise CongraspError(f"The message's header holds {text[:30]}, which is no number that fits.")
+    return number
 
 
 def _no_constant(name: str) -> Any:

@@ -7,9 +7,9 @@ axis points up and the table's top is at z = 0. T frames, F finger joints, L lin
 import dataclasses
 import io
 import json
+import math
 import os
 import pathlib
-import zipfile
 from typing import Annotated, Any, get_type_hints
 
 import numpy as np
@@ -18,11 +18,17 @@ from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands import get_hand
 from common.hands.spec import Hand, link_origin
+from common.inputs import file_name
+from common.npz import read_npz
 from common.task.constraints import CONSTRAINTS
 from common.wire.codec import Message
 from services.record.goals import active_constraints
 
 FORMAT = 2
+MAX_BYTES = 256 << 20
+"""Bytes that the arrays of a motion may have together."""
+_LARGEST = 1e6
+_INDICES = ("object_faces", "joint_link", "link_parent", "capsule_link")
 _META = "meta"
 _OLDER = {"pose_joints": "pose_q"}
 """Names of goal arrays in files of format 1."""
@@ -172,30 +178,43 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
     """Reads a motion.
 
     Raises:
-      CongraspError: there is no such file, it is another kind of file, or it is damaged.
+      CongraspError: there is no such file, it is another kind of file, larger than `MAX_BYTES`, or damaged.
     """
     remedy = "Make it anew with 'congrasp grasp'."
+    arrays = read_npz(pathlib.Path(path), remedy, kind="a grasp motion", largest=MAX_BYTES)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
         meta = json.loads(str(arrays.pop(_META)))
         if meta["format"] not in (1, FORMAT):
-            raise CongraspError(f"{path} has format {meta['format']}, not {FORMAT}.", remedy)
+            raise CongraspError(f"{path} has format {meta['format']!r:.20}, not {FORMAT}.", remedy)
         facts = {name: meta[name] for name in _FACTS}
         facts["constraints"] = tuple(facts["constraints"])
+        _check_facts(facts)
         named = {_OLDER.get(name, name): array for name, array in arrays.items()}
         goal = {name: array for name, array in named.items() if name in _GOALS}
-        _check_shapes({**arrays, **goal}, {**_ARRAYS, **{name: _GOALS[name] for name in goal}})
+        _check_arrays({**arrays, **goal}, {**_ARRAYS, **{name: _GOALS[name] for name in goal}})
         return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, goal=goal)
-    except OSError as error:
-        raise CongraspError(f"The motion {path} cannot be read: {error.strerror or error}.", remedy) from None
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        why = error if zipfile.is_zipfile(path) else "it is no NPZ file, or was cut"
-        raise CongraspError(f"{path} is not a grasp motion ({why}).", remedy) from None
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise CongraspError(f"{path} is not a grasp motion ({str(error)[:200]}).", remedy) from None
 
 
-def _check_shapes(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> None:
-    """A ValueError where an array has another shape than its meaning says, or none, or a face names no vertex."""
+def _check_facts(facts: dict[str, Any]) -> None:
+    """A ValueError or CongraspError where a fact is of another kind than `GraspMotion` says."""
+    for name in ("hand", "object"):
+        file_name(facts[name], f"the {name} of a motion")
+    if not (isinstance(facts["success"], bool) and isinstance(facts["about"], dict)):
+        raise ValueError("success is no boolean, or about no object")
+    if not all(isinstance(name, str) for name in facts["constraints"]):
+        raise ValueError("constraints are no names")
+    numbers = {"control_dt": facts["control_dt"], **facts["metrics"]}
+    for name, number in numbers.items():
+        if not isinstance(number, (int, float)) or not math.isfinite(number):
+            raise ValueError(f"{name} is not a finite number")
+    if not 0 < numbers["control_dt"] <= 1:
+        raise ValueError("control_dt is not above 0 and at most 1 s")
+
+
+def _check_arrays(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> None:
+    """A ValueError where an array has another shape than its meaning says, or none, or values that cannot be."""
     sizes: dict[str, int] = {}
     for name, meaning in meanings.items():
         words = meaning[1 : meaning.index(")")]
@@ -208,6 +227,25 @@ def _check_shapes(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> No
         wanted = [sizes.get(letter) for letter in letters]
         if wanted != list(shape):
             raise ValueError(f"{name} has shape {shape}, where ({words}) is {tuple(wanted)}")
+        _check_values(name, meaning, arrays[name])
     faces = arrays["object_faces"]
     if faces.min() < 0 or faces.max() >= sizes["V"]:
         raise ValueError("object_faces names vertices that are not there")
+    for name, below in (("link_parent", "L"), ("joint_link", "L"), ("capsule_link", "L")):
+        if arrays[name].min() < -(name == "link_parent") or arrays[name].max() >= sizes[below]:
+            raise ValueError(f"{name} names links that are not there")
+    if not (arrays["joint_limits"][:, 0] <= arrays["joint_limits"][:, 1]).all():
+        raise ValueError("joint_limits are in the wrong order")
+    if not (arrays["capsule_radius"] > 0).all() or not 0 < arrays["object_file_scale"] < _LARGEST:
+        raise ValueError("capsule_radius or object_file_scale is not above zero")
+
+
+def _check_values(name: str, meaning: str, array: np.ndarray) -> None:
+    """A ValueError where values are not of the kind that the array's meaning says, not finite, or absurdly large."""
+    kinds = "U" if ") text" in meaning else "b" if "bool" in meaning else "biuf"
+    if array.dtype.kind not in kinds:
+        raise ValueError(f"{name} is of the type {array.dtype}")
+    if array.dtype.kind == "f" and not (np.isfinite(array).all() and np.abs(array).max() < _LARGEST):
+        raise ValueError(f"{name} holds numbers that are not finite, or absurdly large")
+    if name in _INDICES and array.dtype.kind not in "iu":
+        raise ValueError(f"{name} is of the type {array.dtype}")

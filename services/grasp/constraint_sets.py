@@ -1,7 +1,7 @@
 """Constraint sets as files: headings, reference poses and wrist trajectories of one object for one hand."""
 
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -11,11 +11,12 @@ from common.config import TaskConfig
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands.spec import Hand
+from common.inputs import file_name, read_file
 from common.objects import store
 from common.objects.pool import object_scale, scale_objects
 from common.objects.spec import GraspObject
 from common.task.bank import ConstraintBank
-from common.wire.codec import Message, decode, encode
+from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 SUFFIX = ".constraints.safetensors"
 REGIONS = ("whole surface", "graspable region")
@@ -23,6 +24,7 @@ REGIONS = ("whole surface", "graspable region")
 Split = Literal["all", "training", "held-out"]
 _FORMAT = 2
 _TRAINING = 0.8
+_LARGEST = 100.0  # m or rad
 _MEANING = {
     "surface/points": "(P, 3) m, object frame",
     "surface/minus": "(P,) bool, the point belongs to the avoid region",
@@ -235,7 +237,7 @@ def _filled(row: ConstraintBank, rests: int, poses: int) -> ConstraintBank:
 
 def save(constraints: Message, folder: pathlib.Path) -> pathlib.Path:
     """Writes a set under its object's name; returns the file."""
-    path = folder / f"{constraints.meta['object']}{SUFFIX}"
+    path = folder / f"{file_name(constraints.meta['object'], 'a constraint set')}{SUFFIX}"
     write_atomically(path, encode(constraints))
     return path
 
@@ -248,7 +250,7 @@ def load(path: pathlib.Path) -> Message:
     """
     remedy = "Make it anew with 'congrasp constraints generate'."
     try:
-        message = decode(path.read_bytes())
+        message = decode(read_file(path, MAX_MESSAGE))
     except OSError as error:
         raise CongraspError(f"The constraint set {path} cannot be read: {error.strerror}.", remedy) from None
     except CongraspError as error:
@@ -257,7 +259,41 @@ def load(path: pathlib.Path) -> Message:
         raise CongraspError(f"{path} is not a constraint set of this version of congrasp.", remedy)
     if missing := sorted(_MEANING.keys() - message.arrays.keys()):
         raise CongraspError(f"The constraint set {path} lacks '{missing[0]}'.", remedy)
+    for fault in _faults(message):
+        raise CongraspError(f"The constraint set {path} is damaged: {fault}.", remedy)
     return message
+
+
+def _faults(message: Message) -> Iterator[str]:
+    """Facts of another kind, and arrays whose shape or values are not what `_MEANING` says."""
+    meta, sizes = message.meta, {"V": len(REGIONS), "F": len(_names(message.meta.get("finger_joints")))}
+    for name in ("object", "hand"):
+        try:
+            file_name(meta.get(name), f"the {name} of a constraint set")
+        except CongraspError as error:
+            yield str(error).split(". ")[0]
+    scale = meta.get("object_scale")
+    if not isinstance(scale, (int, float)) or not 0 < scale <= 100 or not isinstance(meta.get("object_digest"), str):
+        yield "its object_scale or object_digest is none"
+    if len(_names(meta.get("variants"))) != len(REGIONS):
+        yield f"it has other variants than {', '.join(REGIONS)}"
+    for name, meaning in _MEANING.items():
+        array = message.arrays[name]
+        letters = meaning[1 : meaning.index(")")].replace(",", " ").split()
+        for letter, size in zip(letters, array.shape, strict=False):
+            sizes.setdefault(letter, int(letter) if letter.isdigit() else size)
+        if array.shape != tuple(sizes.get(letter) for letter in letters) or not array.size > 0:
+            yield f"{name} has the shape {array.shape}, not ({', '.join(letters)})"
+        elif array.dtype.kind not in ("b" if "bool" in meaning else "iu" if "indices" in meaning else "f"):
+            yield f"{name} is of the type {array.dtype}"
+        elif array.dtype.kind == "f" and not (np.isfinite(array).all() and np.abs(array).max() <= _LARGEST):
+            yield f"{name} holds numbers that are not finite, or absurdly large"
+        elif array.dtype.kind in "iu" and not (array.min() >= 0 and array.max() < sizes["n"]):
+            yield f"{name} names vertices that are not there"
+
+
+def _names(value: Any) -> list[str]:
+    return value if isinstance(value, list) and all(isinstance(name, str) for name in value) else []
 
 
 def load_for(folder: pathlib.Path, objects: Sequence[GraspObject]) -> tuple[list[GraspObject], list[Message]]:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from common.errors import CongraspError
 from common.files import write_atomically
+from common.inputs import file_name
 from common.objects.spec import GraspObject
 from services.assets.objects.named import ObjectAt, objects_at
 from services.assets.objects.options import ImportOptions, check_options
@@ -97,8 +98,8 @@ def _distinct(found: Sequence[ObjectAt]) -> Iterator[str]:
 
 def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: Progress) -> Result:
     """Grasps one object and writes its folder, unless it is finished already."""
-    folder = settings.out / at.name
     try:
+        folder = settings.out / file_name(at.name, "the folder of an object")
         given = {
             name: [_identity(part) for part in ([text] if isinstance(text, str) else text)]
             for name, text in settings.constraints.items()

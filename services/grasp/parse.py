@@ -22,6 +22,7 @@ from common.request import GraspRequest
 from common.task.constraints import CONSTRAINTS
 from common.task.constraints.base import Option
 from common.wire.codec import Message
+from services.assets.objects.headers import check_header
 from services.assets.objects.sizes import size_in_words
 from services.export.frames import continuous_quaternions
 from services.export.motion_file import GraspMotion, load_motion
@@ -170,6 +171,7 @@ def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
         return np.where(inside, 0.0, 1.0)
     if not path.is_file():
         raise CongraspError(f"{name}: there is no file {path}.", "Check the path.")
+    check_header(path, path.suffix.lower(), "Export it as PLY.")
     try:
         geometry: Any = trimesh.load_scene(path, process=False).to_geometry()
         points = np.asarray(geometry.vertices, float)

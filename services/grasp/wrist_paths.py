@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
+from common.npz import read_npz
 
 _UP = {"y": Rotation.from_euler("X", 90, degrees=True), "z": Rotation.identity()}
 _AXES = {
@@ -152,11 +153,11 @@ def _csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
 def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
     """The same of an NPZ file."""
     try:
-        with np.load(path, allow_pickle=False) as data:
-            keys = ("wrist_position", "wrist_quaternion") if "wrist_position" in data else ("position", "quaternion")
-            position, quaternion = (data[key] for key in keys)
-    except (KeyError, ValueError, OSError) as error:
-        raise CongraspError(f"{path} cannot be read: {error}.", "It needs 'position' and 'quaternion'.") from None
+        data = read_npz(path, remedy := "It needs 'position' and 'quaternion'.")
+        keys = ("wrist_position", "wrist_quaternion") if "wrist_position" in data else ("position", "quaternion")
+        position, quaternion = (data[key].astype(float) for key in keys)
+    except (KeyError, ValueError) as error:
+        raise CongraspError(f"{path} cannot be read: {error}.", remedy) from None
     return _checked(path, position, quaternion)
 
 

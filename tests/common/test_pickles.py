@@ -3,6 +3,7 @@
 import collections
 import os
 import pickle
+import re
 import threading
 
 import numpy as np
@@ -12,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.errors import CongraspError
-from common.pickles import read_pickle
+from common.pickles import parse_pickle, read_pickle
+from tests.limits import limited
 from tests.mano_file import Reduced, content, dumps, mano_pickle, selection
 
 
@@ -115,12 +117,56 @@ def test_hostile_pickles_are_refused_in_one_line_and_nothing_runs(tmp_path):
     assert not mark.exists() and threading.active_count() == before
 
 
+def _laugh(levels):
+    """Lists each of which holds the one before it twice."""
+    return b"\x80\x02]q\x00" + b"".join(b"]q%c(h%ch%ce" % (i + 1, i, i) for i in range(levels)) + b"."
+
+
 def test_shared_parts_are_turned_once(tmp_path):
-    """Forty lists, each of which holds the one before it twice, would be 2^40 values."""
-    data = b"\x80\x02]q\x00" + b"".join(b"]q%c(h%ch%ce" % (i + 1, i, i) for i in range(40)) + b"."
-    (tmp_path / "laugh.pkl").write_bytes(data)
-    value = read_pickle(tmp_path / "laugh.pkl")
+    (tmp_path / "shared.pkl").write_bytes(_laugh(10))
+    value = read_pickle(tmp_path / "shared.pkl")
     assert value[0] is value[1]
+
+
+_TUPLES = b"\x80\x02)" + b"".join(b"q%c0h%ch%c\x86" % (i, i, i) for i in range(40))
+_NESTED = b"\x80\x02)" + b"\x85" * 200_000
+_BYTES = Reduced("numpy dtype", ("u1",))
+_WIDE = Reduced("numpy.core.multiarray _reconstruct", (), (1, (1 << 20,), _BYTES, 0, "x" * (1 << 20)))
+_TORCH = (
+    *(0x1950A86A20F9469CFC6C, 1001, {"little_endian": True}),
+    *(b"\x80\x02(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000tQ.", ["0"]),
+)
+_STORAGE = (
+    b"".join(part if isinstance(part, bytes) else dumps(part) for part in _TORCH) + (1).to_bytes(8, "little") + bytes(4)
+)
+_TENSOR = Reduced(
+    "torch._utils _rebuild_tensor_v2",
+    (Reduced("torch.storage _load_from_bytes", (_STORAGE,)), 0, (600_000_000,), (0,), False, {}),
+)
+
+
+@pytest.mark.parametrize(
+    ("data", "word"),
+    [
+        pytest.param(_laugh(40), "repeats its values", id="lists that repeat"),
+        pytest.param(b"\x80\x02}" + _TUPLES[2:] + b"Ns.", "keys", id="a key of 2^40 values"),
+        pytest.param(b"\x80\x04\x8f(" + _TUPLES[2:] + b"\x90.", "keys", id="a member of 2^40 values"),
+        pytest.param(b"\x80\x02}" + _NESTED[2:] + b"Ns.", "keys", id="a deep key"),
+        pytest.param(_NESTED + b".", "too deeply", id="deep tuples"),
+        pytest.param(b"\x80\x02(" + b"]" * 2_000_000 + b"l.", "opcodes", id="many values"),
+        pytest.param(dumps([_TENSOR]), "arrays", id="a tensor of one number"),
+        pytest.param(
+            b"\x80\x02](" + dumps(_WIDE)[2:-2] + b"q\x01" + b"h\x01" * 4000 + b"e.", "arrays|repeats", id="one buffer"
+        ),
+    ],
+)
+def test_a_small_pickle_takes_little_memory_and_time(data, word):
+    said = limited(parse_mixed, data)
+    assert said.startswith("CongraspError: a.pkl") and re.search(word, said), said
+
+
+def parse_mixed(data):
+    return type(parse_pickle(data, "a.pkl", mixed=True))
 
 
 _MANO = mano_pickle({name: value for name, value in content().items() if name in ("J", "shapedirs", "all_directions")})

@@ -17,6 +17,7 @@ from common.errors import CongraspError
 from common.hands.files import faults, hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Capsule, Hand, Joint, Link, chain_of, vector, wrist_gains
+from services.assets.hands.compile import compiled_model
 from services.assets.hands.poses import opening, propose_poses, thumb_of
 
 TORQUE = 1.0
@@ -58,7 +59,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
       CongraspError: the file cannot be read, or what it shows is no hand of hinges with at least two fingers.
     """
     notes: list[str] = []
-    model = _model(path, notes)
+    model = compiled_model(path, notes)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     palm = _palm(model, choices.palm)
@@ -111,35 +112,6 @@ def describe(proposal: Proposal) -> list[str]:
 def _text(vector: np.ndarray) -> str:
     """A vector (3,) with three digits."""
     return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
-
-
-def _model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
-    """The file as MuJoCo compiles it, without meshes that are missing."""
-    if path.suffix.lower() not in (".xml", ".urdf", ".mjcf"):
-        raise CongraspError(f"{path} is neither URDF nor MJCF.", "Name a file that ends in .urdf or .xml.")
-    if not path.is_file():
-        raise CongraspError(f"There is no file {path}.", "Check the path.")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.compiler.fusestatic = False
-        missing = [mesh for mesh in spec.meshes if mesh.file and not _found(path, spec, mesh.file)]
-        if missing:
-            names = {mesh.name for mesh in missing}
-            for geom in [geom for geom in spec.geoms if geom.meshname in names]:
-                spec.delete(geom)
-            for mesh in missing:
-                spec.delete(mesh)
-            notes.append(f"{len(missing)} meshes were not found beside the file: their links are thin capsules")
-        return spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        reason = str(error).strip().splitlines()[0].rstrip(".")
-        raise CongraspError(f"{path} cannot be read: {reason}.", "MuJoCo must be able to load it.") from None
-
-
-def _found(path: pathlib.Path, spec: mujoco.MjSpec, file: str) -> bool:
-    """Whether a mesh file is where the model says, or beside it."""
-    folder = path.parent / (spec.compiler.meshdir or "")
-    return (folder / file).exists() or (folder / pathlib.Path(file).name).exists()
 
 
 def _name(model: mujoco.MjModel, body: int) -> str:

@@ -9,7 +9,9 @@ import numpy as np
 import trimesh
 
 from common.errors import CongraspError
+from common.inputs import LONGEST_NAME
 from services.assets.objects import repair
+from services.assets.objects.headers import MAX_FACES, check_header
 from services.assets.objects.kinds import CONVERT, SUFFIXES, kind_of
 
 _GRASPABLE_WORDS = ("handle", "grip", "neck", "stem", "shaft", "body")
@@ -94,14 +96,17 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Tri
     kind = suffix[1:].upper()
     if suffix != path.suffix.lower():
         said.append(f"its content is {kind}, whatever its name says, and was read as that")
+    check_header(path, suffix, "Export it again, or convert it.")
     try:
-        mesh = trimesh.load_scene(path, file_type=suffix[1:], process=False).to_mesh()
+        mesh = trimesh.load_scene(path, file_type=suffix[1:], process=False, skip_materials=True).to_mesh()
     except Exception as error:  # the readers raise whatever they stumble over
         reason = (str(error) or type(error).__name__).splitlines()[0].rstrip(" .!")
         raise CongraspError(f"{path} cannot be read as {kind}: {reason}.", "Export it again, or convert it.") from None
     if len(mesh.faces) == 0:
         points = f"only {len(mesh.vertices)} points" if len(mesh.vertices) else "nothing that can be read as a mesh"
         raise CongraspError(f"{path} has no triangles: it holds {points}.", f"Export it as a triangle mesh ({kind}).")
+    if len(mesh.faces) > MAX_FACES or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise CongraspError(f"{path} has triangles without vertices, or too many.", "Export it again, or convert it.")
     finite = repair.without_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), said)
     if finite is None:
         bad = int((~np.isfinite(mesh.vertices)).any(-1).sum())
@@ -121,6 +126,7 @@ def load_geometry(path: pathlib.Path, remedy: str, **options: Any) -> Any:
     Raises:
       CongraspError: it cannot be read; the line ends with the remedy.
     """
+    check_header(path, path.suffix.lower(), remedy)
     try:
         return trimesh.load(path, process=False, **options)
     except Exception as error:  # the readers raise whatever they stumble over
@@ -180,4 +186,4 @@ def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
 def safe_name(text: str) -> str:
     """A text as the name of an object, which can be a file name."""
     safe = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in text).lstrip("._-")
-    return safe or "object"
+    return safe[:LONGEST_NAME] or "object"

@@ -1,0 +1,140 @@
+"""Whether an object's values are those of an object that a hand could grasp, wherever they come from."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from common.errors import CongraspError
+from common.inputs import LONGEST_NAME, file_name
+from common.objects.spec import SURFACE_POINTS, GraspObject, Piece
+
+LARGEST = 10.0
+"""Metres from the object frame's origin to anything of the object."""
+HEAVIEST = 1000.0
+"""Kilograms."""
+_PIECES, _PARTS, _RESTS, _NOTES = 64, 256, 256, 100  # most of each
+_CORNERS = 4096  # most vertices of a piece
+_SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "ellipsoid": 3, "mesh": 0}
+_ROUNDING = 1e-3
+
+
+def faults(obj: GraspObject) -> Iterator[str]:
+    """What is wrong with an object, one phrase for each fault; those that come first make sense of the others."""
+    yield from _facts(obj)
+    wrong_shape = list(_shapes(obj))
+    yield from wrong_shape
+    if not wrong_shape:
+        yield from _arrays(obj)
+        yield from _inertia(obj)
+    if not 1 <= len(obj.pieces) <= _PIECES:
+        yield f"it has {len(obj.pieces)} pieces, not 1 to {_PIECES}"
+    for i, piece in enumerate(obj.pieces[:_PIECES]):
+        yield from (f"its piece {i} {fault}" for fault in _piece(piece, len(obj.part_names)))
+
+
+def _facts(obj: GraspObject) -> Iterator[str]:
+    """Faults of names and single numbers."""
+    try:
+        file_name(obj.name, "an object")
+    except CongraspError as error:
+        yield str(error).split(". ")[0]
+    if not isinstance(obj.family, str) or len(obj.family) > LONGEST_NAME:
+        yield "its family is no name"
+    if not 1 <= len(obj.part_names) <= _PARTS or not all(_is_text(name) for name in obj.part_names):
+        yield f"its parts have no names, or are more than {_PARTS}"
+    if len(obj.notes) > _NOTES or not all(isinstance(note, str) for note in obj.notes):
+        yield f"its notes are no text, or more than {_NOTES}"
+    if not (_is_number(obj.mass) and 0 < obj.mass <= HEAVIEST):
+        yield f"its mass is {obj.mass!r:.20}, not above 0 and at most {HEAVIEST:g} kg"
+    if not (_is_number(obj.file_scale) and 0 < obj.file_scale < 1e9):
+        yield f"its file_scale is {obj.file_scale!r:.20}"
+    if len(obj.origin) != 3 or not all(_is_number(x) and abs(x) < 1e9 for x in obj.origin):
+        yield "its origin is not three finite numbers"
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and -1e300 < value < 1e300
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and len(value) <= LONGEST_NAME
+
+
+def _shapes(obj: GraspObject) -> Iterator[str]:
+    """Arrays of another shape or kind than `GraspObject` says."""
+    wanted: dict[str, tuple[str, tuple[int | None, ...]]] = {
+        "graspable": ("b", (len(obj.part_names),)),
+        "inertia": ("f", (3, 3)),
+        "points": ("f", (SURFACE_POINTS, 3)),
+        "normals": ("f", (SURFACE_POINTS, 3)),
+        "labels": ("iu", (SURFACE_POINTS,)),
+        "rest_poses": ("f", (None, 7)),
+        "visual_vertices": ("f", (None, 3)),
+        "visual_faces": ("iu", (None, 3)),
+    }
+    for name, (kinds, shape) in wanted.items():
+        array = np.asarray(getattr(obj, name))
+        fits = len(array.shape) == len(shape) and all(w in (None, n) for w, n in zip(shape, array.shape, strict=True))
+        if array.dtype.kind not in kinds or not fits:
+            words = ", ".join("n" if size is None else str(size) for size in shape)
+            yield f"its {name} has the shape {array.shape} and type {array.dtype}, not ({words})"
+
+
+def _arrays(obj: GraspObject) -> Iterator[str]:
+    """Values of arrays that cannot be."""
+    for name in ("inertia", "points", "normals", "rest_poses", "visual_vertices"):
+        values = np.asarray(getattr(obj, name))
+        if not np.isfinite(values).all():
+            yield f"its {name} holds numbers that are not finite"
+        elif values.size and np.abs(values).max() > (HEAVIEST * LARGEST**2 if name == "inertia" else LARGEST):
+            yield f"its {name} goes up to {np.abs(values).max():.3g}, which is no size of an object"
+    if obj.labels.min() < 0 or obj.labels.max() >= len(obj.part_names):
+        yield "its labels name parts that are not there"
+    if not 1 <= len(obj.rest_poses) <= _RESTS:
+        yield f"it has {len(obj.rest_poses)} resting poses, not 1 to {_RESTS}"
+    elif np.abs(np.linalg.norm(obj.rest_poses[:, 3:], axis=-1) - 1).max() > _ROUNDING:
+        yield "its rest_poses hold quaternions that are not of length one"
+    if np.abs(np.linalg.norm(obj.normals, axis=-1) - 1).max() > 10 * _ROUNDING:
+        yield "its normals are not of length one"
+    faces = obj.visual_faces
+    if not len(faces) or faces.min() < 0 or faces.max() >= len(obj.visual_vertices):
+        yield "its visual_faces are none, or name vertices that are not there"
+
+
+def _inertia(obj: GraspObject) -> Iterator[str]:
+    """An inertia that no body has: its principal moments are positive, and two of them exceed the third."""
+    if not np.isfinite(obj.inertia).all():
+        return
+    if np.abs(obj.inertia - obj.inertia.T).max() > _ROUNDING * np.abs(obj.inertia).max():
+        yield "its inertia is not symmetric"
+        return
+    small, middle, large = np.linalg.eigvalsh(obj.inertia.astype(float))
+    if small <= 0 or small + middle < (1 - _ROUNDING) * large:
+        yield f"its inertia has the principal moments {small:.3g}, {middle:.3g} and {large:.3g}, which no body has"
+
+
+def _piece(piece: Piece, parts: int) -> Iterator[str]:
+    """What is wrong with a piece."""
+    numbers = [*piece.size, *piece.pos, *piece.quat]
+    if (len(piece.size), len(piece.pos), len(piece.quat)) != (3, 3, 4) or not all(map(math.isfinite, numbers)):
+        yield "has a size or pose that is not of finite numbers"
+        return
+    used = piece.size[: _SIZES[piece.kind]]
+    if any(not 0 < x <= LARGEST for x in used) or any(abs(x) > LARGEST for x in piece.pos):
+        yield f"has the size {piece.size} and position {piece.pos}"
+    if abs(math.hypot(*piece.quat) - 1) > _ROUNDING:
+        yield "has a quaternion that is not of length one"
+    if not 0 <= piece.part < parts:
+        yield "belongs to a part that is not there"
+    vertices = piece.vertices
+    if (piece.kind == "mesh") != (vertices is not None):
+        yield "needs vertices if it is a mesh, and otherwise none"
+    elif vertices is not None and not (
+        vertices.ndim == 2
+        and vertices.shape[1] == 3
+        and 4 <= len(vertices) <= _CORNERS
+        and np.isfinite(vertices).all()
+        and np.abs(vertices).max() <= LARGEST
+    ):
+        yield f"has vertices that are not 4 to {_CORNERS} points of finite numbers within {LARGEST:g} m"

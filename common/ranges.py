@@ -1,0 +1,63 @@
+"""What a task and its networks may be set to where a file or a message says it: sizes that a machine can hold."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from common.config import NetworkConfig, TaskConfig
+from common.objects.spec import SURFACE_POINTS
+
+MAX_NUMBER = 1e6
+"""Largest number of any field."""
+MAX_INPUTS, MAX_ACTIONS = 16_384, 256
+"""Largest observation and action of a policy."""
+_TASK: dict[str, tuple[float, float]] = {
+    "object_scale": (0.0, 100.0),
+    "control_dt": (1e-4, 1.0),
+    "substeps": (1, 100),
+    "approach_steps": (1, 10_000),
+    "hold_steps": (1, 10_000),
+    "hold_steps_max": (1, 10_000),
+    "surface_points": (1, SURFACE_POINTS),
+    "trajectory_points": (2, 1000),
+}
+_LAYERS, _UNITS = 16, 8192
+
+
+def task_faults(task: TaskConfig) -> Iterator[str]:
+    """What is out of range in a task, one phrase for each fault."""
+    yield from _numbers(task)
+    for name, (low, high) in _TASK.items():
+        value = getattr(task, name)
+        if not low <= value <= high:
+            yield f"{name} is {value:g}, not {low:g} to {high:g}"
+    for name in ("mass_range", "friction_range"):
+        low, high = getattr(task, name)
+        if not 0 <= low <= high:
+            yield f"{name} is {low:g} to {high:g}"
+
+
+def network_faults(network: NetworkConfig, layout: Sequence[tuple[str, int]], action_size: int) -> Iterator[str]:
+    """What is out of range in the networks of a policy with an observation and an action of these sizes."""
+    yield from _numbers(network)
+    if not 1 <= len(network.hidden) <= _LAYERS or not all(1 <= units <= _UNITS for units in network.hidden):
+        yield f"hidden is {str(network.hidden)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} units"
+    if not 1 <= network.encoder <= _UNITS:
+        yield f"encoder is {network.encoder}, not 1 to {_UNITS}"
+    if not all(size >= 1 for _, size in layout) or not 1 <= sum(size for _, size in layout) <= MAX_INPUTS:
+        yield f"the observation has {str([size for _, size in layout])[:60]} values, not 1 to {MAX_INPUTS}"
+    if not 1 <= action_size <= MAX_ACTIONS:
+        yield f"the action has {action_size} values, not 1 to {MAX_ACTIONS}"
+
+
+def _numbers(config: Any) -> Iterator[str]:
+    """Numbers of a configuration, at any depth, that are not finite or absurdly large."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _numbers(value)
+            continue
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, (int, float)) and not (math.isfinite(number) and abs(number) <= MAX_NUMBER):
+                yield f"{field.name} is not a finite number of at most {MAX_NUMBER:g}"

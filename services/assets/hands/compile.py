@@ -1,0 +1,155 @@
+"""MuJoCo reads robot descriptions in a process of its own: a few lines of one can ask for more than a machine has.
+
+`python -m services.assets.hands.compile FILE RESULT` is that process. It leaves the compiled model in RESULT, and what
+it left out of it, or why there is none, in RESULT.json.
+"""
+
+import json
+import os
+import pathlib
+import re
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+
+import mujoco
+import numpy as np
+
+from common.errors import CongraspError
+
+MEMORY = 3 << 30
+"""Bytes of address space for reading a file."""
+SECONDS = 30
+"""Time for the same."""
+MAX_FILE = 64 << 20
+"""Bytes of a file."""
+MAX_COUNT = 1000
+"""Largest count of a replicate, composite or flexcomp in the file itself; nested ones meet the limits above."""
+LIMITS = {"nbody": 1000, "nv": 500, "ngeom": 10_000, "nmesh": 1000, "nmeshvert": 5_000_000, "nu": 1000, "neq": 1000}
+"""Most parts of a model, by MuJoCo's names."""
+_COUNTS = re.compile(r"""\bcount\s*=\s*["']([^"']*)["']""")
+_FINITE = (
+    *(
+        "body_pos",
+        "body_quat",
+        "body_mass",
+        "body_inertia",
+        "jnt_pos",
+        "jnt_axis",
+        "jnt_range",
+        "geom_pos",
+        "geom_size",
+    ),
+    *("geom_quat", "mesh_vert", "dof_armature", "dof_damping", "actuator_biasprm", "actuator_forcerange"),
+)
+_ROOT = pathlib.Path(__file__).parents[3]
+_REMEDY = "MuJoCo must be able to load it."
+
+
+def compiled_model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
+    """The model of a URDF or MJCF file, without the meshes that are not there.
+
+    Args:
+      path: the file.
+      notes: what was left out is added to it.
+
+    Raises:
+      CongraspError: it cannot be read, or not within `MEMORY` and `SECONDS`, or it has more parts than `LIMITS`.
+    """
+    if path.suffix.lower() not in (".xml", ".urdf", ".mjcf"):
+        raise CongraspError(f"{path} is neither URDF nor MJCF.", "Name a file that ends in .urdf or .xml.")
+    if not path.is_file():
+        raise CongraspError(f"There is no file {path}.", "Check the path.")
+    if path.stat().st_size > MAX_FILE:
+        raise CongraspError(f"{path} has more than {MAX_FILE >> 20} MB.", "Name a robot description.")
+    with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
+        result = pathlib.Path(folder, "model.mjb")
+        search = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
+        command = [sys.executable, "-m", "services.assets.hands.compile", str(path.resolve()), str(result)]
+        try:
+            subprocess.run(
+                command,
+                timeout=SECONDS,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                cwd=folder,
+                env={**os.environ, "PYTHONPATH": search, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise CongraspError(f"{path} was not read within {SECONDS} s.", _REMEDY) from None
+        try:
+            said = json.loads(result.with_suffix(".json").read_text())
+        except (OSError, ValueError):
+            why = f"reading it takes more than {MEMORY >> 30} GB, or MuJoCo fails on it"
+            raise CongraspError(f"{path} cannot be read: {why}.", _REMEDY) from None
+        if "error" in said:
+            raise CongraspError(f"{path} cannot be read: {said['error']}.", _REMEDY)
+        notes += said["notes"]
+        return mujoco.MjModel.from_binary_path(str(result))
+
+
+def _child(source: str, result: str) -> None:
+    """Compiles a file into another; ends by itself, should the parent be gone."""
+    signal.alarm(SECONDS + 5)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    path, notes = pathlib.Path(source), list[str]()
+    try:
+        model = _compiled(path, notes)
+        for name, most in LIMITS.items():
+            if getattr(model, name) > most:
+                raise ValueError(f"it has {getattr(model, name)} parts of the kind {name}, more than {most}")
+        _check_values(model)
+        mujoco.mj_saveModel(model, result)
+        said: dict[str, object] = {"notes": notes}
+    except MemoryError:
+        said = {"error": f"it takes more than {MEMORY >> 30} GB"}
+    except (ValueError, mujoco.FatalError) as error:
+        said = {"error": (str(error).strip().splitlines() or ["MuJoCo does not say why"])[0].rstrip(".")[:300]}
+    pathlib.Path(result).with_suffix(".json").write_text(json.dumps(said))
+
+
+def _check_values(model: mujoco.MjModel) -> None:
+    """A ValueError where a body or a joint has values that none has; a mass of zero is one that the file leaves out."""
+    for name in _FINITE:
+        values = getattr(model, name)
+        if not np.isfinite(values).all():
+            raise ValueError(f"its {name} holds numbers that are not finite")
+    for name in ("body_mass", "body_inertia"):
+        if (getattr(model, name) < 0).any():
+            raise ValueError(f"its {name} holds numbers below zero")
+
+
+def _compiled(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
+    """The model of a file; a ValueError or MuJoCo's error where it cannot be read."""
+    for count in _COUNTS.findall(path.read_text(errors="replace")):
+        if any(float(number) > MAX_COUNT for number in count.split()):
+            raise ValueError(f"it repeats a part {count[:40]} times, more than {MAX_COUNT}")
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.compiler.fusestatic = False
+    for body in spec.bodies:
+        if body.explicitinertial and body.mass < 0:
+            raise ValueError(f"the body '{body.name[:60]}' has the mass {body.mass:g} kg")
+    missing = [mesh for mesh in spec.meshes if mesh.file and not _found(path, spec, mesh.file)]
+    if missing:
+        names = {mesh.name for mesh in missing}
+        for geom in [geom for geom in spec.geoms if geom.meshname in names]:
+            spec.delete(geom)
+        for mesh in missing:
+            spec.delete(mesh)
+        notes.append(f"{len(missing)} meshes were not found beside the file: their links are thin capsules")
+    return spec.compile()
+
+
+def _found(path: pathlib.Path, spec: mujoco.MjSpec, file: str) -> bool:
+    """Whether a mesh file is where the model says, or beside it."""
+    folder = path.parent / (spec.compiler.meshdir or "")
+    return (folder / file).exists() or (folder / pathlib.Path(file).name).exists()
+
+
+if __name__ == "__main__":
+    _child(*sys.argv[1:])

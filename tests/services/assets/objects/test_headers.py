@@ -1,0 +1,94 @@
+"""Mesh files that announce more than they hold, and valid ones with whatever noise in them."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.errors import CongraspError
+from services.assets.objects.sources import read_mesh
+from tests.limits import limited
+
+_PLY = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float y\nproperty float z\n"
+)
+_FACES = b"element face %d\nproperty list uchar int vertex_indices\nend_header\n"
+
+
+def _glb(change=lambda tree: None):
+    data = trimesh.creation.box().export(file_type="glb")
+    length = int.from_bytes(data[12:16], "little")
+    tree = json.loads(data[20 : 20 + length])
+    change(tree)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+
+
+def _many(tree):
+    tree["nodes"] = [{"mesh": 0}] * 9000
+    tree["scenes"][0]["nodes"] = list(range(9000))
+
+
+def _twice(tree):
+    tree["nodes"] = [{"children": [i + 1, i + 1]} for i in range(40)] + [{"mesh": 0}]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "why"),
+    [
+        pytest.param("a.ply", _PLY % 4_000_000_000 + _FACES % 1, "announces 4000000000 rows", id="PLY vertices"),
+        pytest.param("a.ply", _PLY % 0 + _FACES % 4_000_000_000 + bytes(99), "announces 4000000000", id="PLY faces"),
+        pytest.param("a.ply", b"ply\nformat ascii 1.0\nelement vertex -5\nend_header\n", "without values", id="PLY -5"),
+        pytest.param("a.ply", b"ply\n" + b"comment\n" * 10_000, "does not end", id="PLY without an end"),
+        pytest.param("a.stl", bytes(80) + b"\xff" * 4 + bytes(50), "announces 4294967295 triangles", id="STL"),
+        pytest.param("a.glb", _glb(lambda t: t["accessors"][0].update(count=1 << 33)), "has a count", id="GLB count"),
+        pytest.param(
+            "a.glb",
+            _glb(lambda t: t["accessors"].extend([{"count": 900, "type": "MAT4", "componentType": 5126}] * 2000)),
+            "accessors take",
+            id="GLB accessors without data",
+        ),
+        pytest.param("a.glb", _glb(_twice), "two parents", id="GLB nodes that multiply"),
+        pytest.param(
+            "a.glb", _glb(lambda t: t.update(nodes=[{"mesh": 0}] * 20_000)), "more than 10000", id="GLB nodes"
+        ),
+        pytest.param("a.glb", b"glTF" + b"\xff" * 40, "announces", id="GLB length"),
+    ],
+)
+def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path, name, data, why):
+    (tmp_path / name).write_bytes(data)
+    said = limited(read_mesh, tmp_path / name)
+    assert said.startswith(f"CongraspError: {tmp_path / name}") and why in said, said
+
+
+def test_a_scene_that_shows_a_mesh_often_is_read_in_bounded_memory(tmp_path):
+    (tmp_path / "a.glb").write_bytes(_glb(_many))
+    assert "Trimesh" in limited(read_mesh, tmp_path / "a.glb")
+
+
+_VALID = {kind: trimesh.creation.icosphere(1).export(file_type=kind) for kind in ("stl", "obj", "ply")} | {
+    "glb": _glb()
+}
+_VALID = {kind: data.encode() if isinstance(data, str) else data for kind, data in _VALID.items()}
+
+
+@pytest.mark.parametrize("kind", _VALID)
+def test_a_mesh_with_noise_in_it_is_read_or_refused(tmp_path, kind):
+    path, data = tmp_path / f"a.{kind}", _VALID[kind]
+
+    @settings(max_examples=60, deadline=4000, database=None)
+    @given(st.integers(0, len(data)), st.binary(max_size=6), st.integers(0, len(data)))
+    def mutated(at, noise, end):
+        path.write_bytes((data[:at] + noise + data[at + len(noise) :])[: max(end, at) if end % 3 == 0 else None])
+        try:
+            assert np.isfinite(read_mesh(path).vertices).all()
+        except CongraspError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+
+    assert limited(mutated, seconds=30) == "None"

@@ -1,0 +1,260 @@
+"""Files with names, values and sizes that no file of the project has: one line each, in bounded memory and time."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.config import NetworkConfig, TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.hands.files import hand_text, read_hand
+from common.inputs import file_name, read_file
+from common.objects import store
+from common.objects.procedural import generate
+from common.policy import bundle as bundles
+from common.policy import network, normalizer
+from common.policy.bundle import PolicyBundle
+from common.policy.pretrained import policy_file
+from common.wire.codec import Message, decode, encode
+from services.export.motion_file import load_motion, motion_of_episode, save_motion
+from services.grasp import constraint_sets
+from tests.episodes import episode
+from tests.limits import limited
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize("name", ["mug", "mug_7", "Becher groß (2)", "x" * 100, "v1.2-b+c"])
+def test_names_are_names(name):
+    assert file_name(name, "an object") == name
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "../../x", "/etc/x", "a/b", "a\\b", ".x", "-x", "a\n", "a\0", "x" * 101, None, 3, ["a"]]
+)
+def test_paths_and_anything_else_are_not(name):
+    with pytest.raises(CongraspError, match="cannot name an object"):
+        file_name(name, "an object")
+
+
+def test_an_object_that_names_another_folder_is_not_read(tmp_path):
+    path = tmp_path / "a.safetensors"
+    store.save(dataclasses.replace(generate(0, "box"), name="../../x"), path)
+    with pytest.raises(CongraspError, match=r"a\.safetensors: '\.\./\.\./x' cannot name an object"):
+        store.load(path)
+    with pytest.raises(CongraspError, match="cannot name an object"):
+        store.Catalogue(tmp_path / "b").add(dataclasses.replace(generate(0, "box"), name="../../x"))
+    with pytest.raises(CongraspError, match="cannot name a constraint set"):
+        constraint_sets.save(Message({}, {"object": "../../x"}), tmp_path / "c")
+    assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def test_pipes_and_folders_are_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.safetensors")
+    for read in (store.load, bundles.load, constraint_sets.load, load_motion, read_hand):
+        assert "no regular file" in limited(read, tmp_path / "a.safetensors", seconds=5)
+    with pytest.raises(CongraspError, match="more than the 3"):
+        (tmp_path / "b").write_bytes(b"1234")
+        read_file(tmp_path / "b", 3)
+
+
+def _with(values, index, value):
+    changed = np.array(values)
+    changed[index] = value
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda o: {"mass": -1.0}, "mass is -1.0"),
+        (lambda o: {"mass": 1e300}, r"mass is 1e\+300"),
+        (lambda o: {"points": _with(o.points, (3, 1), NAN)}, "points holds numbers that are not finite"),
+        (lambda o: {"points": _with(o.points, 3, 1e9)}, r"points goes up to 1e\+09"),
+        (lambda o: {"points": o.points[:7]}, "points has the shape"),
+        (lambda o: {"normals": 0 * o.normals}, "normals are not of length one"),
+        (lambda o: {"labels": o.labels + 99}, "labels name parts"),
+        (lambda o: {"labels": o.labels - 99}, "labels name parts"),
+        (lambda o: {"inertia": -o.inertia}, "principal moments"),
+        (lambda o: {"inertia": np.diag([1.0, 1.0, 9.0])}, "which no body has"),
+        (lambda o: {"inertia": _with(o.inertia, (0, 1), 1.0)}, "not symmetric"),
+        (lambda o: {"rest_poses": o.rest_poses[:0]}, "0 resting poses"),
+        (lambda o: {"rest_poses": 2 * o.rest_poses}, "quaternions"),
+        (lambda o: {"visual_faces": o.visual_faces + 10**6}, "visual_faces"),
+        (lambda o: {"pieces": o.pieces * 200}, "pieces"),
+        (lambda o: {"pieces": (dataclasses.replace(o.pieces[0], size=(-1.0, 1.0, 1.0)),)}, "piece 0 has the size"),
+        (lambda o: {"pieces": (dataclasses.replace(o.pieces[0], pos=(INF, 0.0, 0.0)),)}, "finite numbers"),
+        (lambda o: {"file_scale": 0.0}, "file_scale"),
+    ],
+)
+def test_objects_with_values_that_none_has_are_named(tmp_path, change, why):
+    obj = generate(0, "box")
+    store.save(dataclasses.replace(obj, **change(obj)), tmp_path / "a.safetensors")
+    with pytest.raises(CongraspError, match=why) as raised:
+        store.load(tmp_path / "a.safetensors")
+    assert str(tmp_path) in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("part", "changes", "why"),
+    [
+        ("task", {"surface_points": 1_000_000}, "surface_points is 1e[+]06, not 1 to 512"),
+        ("task", {"trajectory_points": 10**9}, "trajectory_points"),
+        ("task", {"substeps": 0}, "substeps is 0"),
+        ("task", {"hold_steps_max": 10**12}, "hold_steps_max"),
+        ("task", {"control_dt": -1.0}, "control_dt"),
+        ("task", {"mass_range": (2.0, 1.0)}, "mass_range"),
+        ("network", {"hidden": (10**9,)}, "hidden"),
+        ("network", {"hidden": (8,) * 10_000}, "hidden"),
+        ("network", {"encoder": 0}, "encoder"),
+        (None, {"layout": [["task", 10**12]]}, "observation"),
+        (None, {"action_size": 10**9}, "action"),
+    ],
+)
+def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, part, changes, why):
+    made = decode(policy_file(None).read_bytes())
+    meta = {**made.meta, **({part: {**made.meta[part], **changes}} if part else changes)}
+    (tmp_path / "a.safetensors").write_bytes(encode(Message(made.arrays, meta)))
+    with pytest.raises(CongraspError, match=why):
+        bundles.load(tmp_path / "a.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda h: h["links"][0].update(mass=-1.0), "needs a mass above zero"),
+        (lambda h: h["links"][0].update(mass=NAN), "not a finite number"),
+        (lambda h: h["links"][1]["joints"][0].update(lower=2.0, upper=-2.0), "wrong order"),
+        (lambda h: h["links"][1]["joints"][0].update(kp=1e300), "not a finite number"),
+        (lambda h: h["links"][1].update(capsules=h["links"][1]["capsules"] * 10_000), "more than"),
+        (lambda h: h.update(links=h["links"] * 1000), "more than"),
+        (lambda h: h.update(name="../../x"), "the name"),
+        (lambda h: h.update(object_scale=INF), "not a finite number"),
+    ],
+)
+def test_hands_with_values_that_none_has_are_named(tmp_path, change, why):
+    fields = json.loads(hand_text(get_hand("human")))
+    change(fields)
+    (tmp_path / "a.json").write_text(json.dumps(fields))
+    with pytest.raises(CongraspError, match=why):
+        read_hand(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, "[]", "3", '{"a": ' * 100_000, "9" * 5000, " " * (2 << 20), '"\\ud800"']
+)
+def test_json_that_is_no_hand_is_refused(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    assert limited(read_hand, tmp_path / "a.json").startswith("CongraspError")
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda m: {"object": "../../x"}, "cannot name the object"),
+        (lambda m: {"control_dt": 0.0}, "control_dt"),
+        (lambda m: {"joint_position": m.joint_position * NAN}, "joint_position holds numbers that are not finite"),
+        (lambda m: {"joint_limits": m.joint_limits[:, ::-1]}, "joint_limits are in the wrong order"),
+        (lambda m: {"link_parent": m.link_parent + 100}, "link_parent names links"),
+        (lambda m: {"capsule_radius": -m.capsule_radius}, "capsule_radius"),
+        (lambda m: {"table": m.table.astype(float)}, "table is of the type"),
+    ],
+)
+def test_motions_with_values_that_none_has_are_named(tmp_path, change, why):
+    motion = motion_of_episode(episode())
+    save_motion(tmp_path / "a.npz", dataclasses.replace(motion, **change(motion)))
+    with pytest.raises(CongraspError, match=why):
+        load_motion(tmp_path / "a.npz")
+
+
+def _set():
+    made = {"object": "mug", "hand": "human", "object_scale": 1.0, "object_digest": "0" * 16, "kind": "constraints"}
+    made |= {"format": 2, "variants": list(constraint_sets.REGIONS), "finger_joints": ["a", "b"]}
+    sizes = {"P": 8, "R": 2, "V": 2, "H": 4, "M": 3, "F": 2, "K": 5, "n": 4, "m": 4}
+    arrays = {}
+    for name, meaning in constraint_sets._MEANING.items():
+        letters = meaning[1 : meaning.index(")")].replace(",", " ").split()
+        kind = bool if "bool" in meaning else np.int32 if "indices" in meaning else np.float32
+        arrays[name] = np.ones([int(x) if x.isdigit() else sizes[x] for x in letters], kind)
+    return Message(arrays, made)
+
+
+def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
+    path, made = tmp_path / "a.safetensors", _set()
+    for change, why in (
+        (Message(made.arrays, {**made.meta, "object": "../../x"}), "cannot name the object"),
+        (Message(made.arrays, {**made.meta, "object_scale": -1}), "object_scale"),
+        (Message({**made.arrays, "pose/q": np.full((2, 3, 2), NAN, np.float32)}, made.meta), "pose/q holds"),
+        (Message({**made.arrays, "pose/q": np.ones((2, 3, 9), np.float32)}, made.meta), "pose/q has the shape"),
+    ):
+        path.write_bytes(encode(change))
+        with pytest.raises(CongraspError, match=why):
+            constraint_sets.load(path)
+    path.write_bytes(encode(made))
+    assert constraint_sets.load(path).meta == made.meta
+
+
+def _recomputed(data: bytes) -> bytes:
+    """The message with the checksum of its damaged data, as one who means harm would write it."""
+    try:
+        length = int.from_bytes(data[:8], "little")
+        header = json.loads(data[8 : 8 + length])
+        header["__metadata__"]["crc32"] = f"{zlib.crc32(data[8 + length :]):08x}"
+        text = json.dumps(header).encode()
+        return len(text).to_bytes(8, "little") + text + data[8 + length :]
+    except (ValueError, KeyError, TypeError):
+        return data
+
+
+def _files(folder: pathlib.Path):
+    store.save(generate(0, "box"), folder / "object")
+    (folder / "set").write_bytes(encode(_set()))
+    (folder / "hand").write_text(hand_text(get_hand("human")))
+    save_motion(folder / "motion", motion_of_episode(episode()))
+    task, sizes = TaskConfig(surface_points=4, trajectory_points=2), NetworkConfig((2,), 2)
+    spec = bundles.policy_spec(task, sizes)
+    seen = normalizer.empty((sum(size for _, size in spec.layout),))
+    params = network.init(0, spec.layout, spec.action_size, sizes)
+    bundles.save(PolicyBundle(spec, task, params, seen, normalizer.empty(), 7, "e", 1), folder / "policy")
+
+
+LOADERS = {
+    "object": store.load,
+    "set": constraint_sets.load,
+    "hand": read_hand,
+    "motion": load_motion,
+    "policy": bundles.load,
+}
+
+
+@pytest.mark.parametrize("kind", LOADERS)
+def test_a_file_with_noise_in_it_is_read_or_refused(tmp_path, kind):
+    _files(tmp_path)
+    path = tmp_path / kind
+    data = path.read_bytes()
+    sealed = kind in ("object", "set", "policy")
+
+    @settings(max_examples=150, deadline=3000, database=None)
+    @given(
+        st.integers(0, len(data)) | st.integers(0, min(2000, len(data))),
+        st.binary(max_size=6) | st.sampled_from([b"9" * 5, b"-1", b"1e9", b"null", b"[]", b'"', b"NaN"]),
+        st.sampled_from([1.0, 1.0, 1.0, 0.5, 0.99]),
+    )
+    def mutated(at, noise, share):
+        changed = data[:at] + noise + data[at + len(noise) :]
+        changed = changed[: int(share * len(changed))]
+        path.write_bytes(_recomputed(changed) if sealed else changed)
+        try:
+            LOADERS[kind](path)
+        except CongraspError as error:
+            assert "\n" not in str(error)
+
+    LOADERS[kind](path)
+    assert limited(mutated, seconds=40) == "None"
