@@ -57,6 +57,14 @@ def journal_path(run_dir: pathlib.Path, name: str) -> pathlib.Path:
     return run_dir / AUDIT / f"learner-{name}.jsonl"
 
 
+def journalled_version(run_dir: pathlib.Path) -> int:
+    """The newest version that a run's journals tell of; -1 if there are none. After a use its update's may be out."""
+    versions = [-1]
+    for path in sorted((run_dir / AUDIT).glob("learner-*.jsonl")):
+        versions += [entry["version"] + ("used" in entry) for entry in read_journal(path) if "version" in entry]
+    return max(versions)
+
+
 def replay(entries: Iterable[dict[str, Any]]) -> tuple[list[Used], list[Used]]:
     """The uses that stand, and those that resumes from checkpoints undid, in their order."""
     standing: list[tuple[int, Used]] = []
