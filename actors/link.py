@@ -112,7 +112,7 @@ class ActorLink:
             journal=journal,
         )
         self._closed = self._uploads.closed
-        self._write(actor=actor, incarnation=self.incarnation)
+        self._write()
         self._announcements = transport.subscribe(self.keys.announcement, depth=1)
         transport.declare_alive(self.keys.alive("actor", actor, self.incarnation))
         threading.Thread(target=self._follow, daemon=True, name="announcements").start()
@@ -305,7 +305,7 @@ class ActorLink:
     def _write(self, **entry: Any) -> None:
         """Writes an entry into the journal, if there is one."""
         if self._journal is not None:
-            self._journal.write(**entry)
+            self._journal.write(actor=self.actor, incarnation=self.incarnation, **entry)
 
 
 def _restarted(before: str, now: Any) -> RunRestarted:

@@ -177,7 +177,9 @@ class Uploads:
                     raise self.failure
                 outcome = reply.meta["outcome"]
                 if outcome != "retry" and self._journal is not None:
-                    self._journal.write(answer=message.meta["sequence"], outcome=outcome, life=reply.meta["life"])
+                    who = {name: message.meta[name] for name in ("actor", "incarnation")}
+                    answer = {"answer": message.meta["sequence"], "outcome": outcome, "life": reply.meta["life"]}
+                    self._journal.write(**who, **answer)
                 if outcome == "refused":
                     return self._refused(str(reply.meta["why"]))
                 if outcome != "retry":

@@ -267,8 +267,11 @@ def to_json(config: Any) -> str:
 def run_config_from_json(text: str | bytes) -> RunConfig:
     """The inverse of `to_json` for a `RunConfig`; unknown keys and wrong types are errors that name the key."""
     try:
-        return dacite.from_dict(RunConfig, json.loads(text), dacite.Config(strict=True, cast=[tuple, float]))
-    except json.JSONDecodeError as error:
+        fields = json.loads(text)
+        if not isinstance(fields, dict):
+            raise ValueError("it is no object")
+        return dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
+    except (ValueError, RecursionError) as error:  # what is no UTF-8, and what is nested too deep, too
         raise CongraspError(
             f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."
         ) from None

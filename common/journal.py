@@ -1,19 +1,25 @@
 """Append-only journals of JSON lines, by which what several processes did can be compared afterwards.
 
-Every line is one write to the operating system, so that it survives the death of its process. A line that was cut is
-skipped when reading.
+Every line is one write to the operating system, so that it survives the death of its process. It ends with the CRC-32
+of what comes before, as the field `crc32`. A line that was cut or changed is left out when reading, and counted.
 """
 
 import json
 import pathlib
 import threading
-from collections.abc import Callable, Iterator
-from typing import Any
+import zlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from common.errors import CongraspError
 
 AUDIT = "audit"
 """Folder of a run directory where its journals are."""
+MAX_NUMBER = 1 << 53
+"""Integers from here on, which JSON readers do not keep exactly, are in no journal."""
+_CHECK = ', "crc32": "{:08x}"}}\n'
+_CHECK_BYTES = len(_CHECK.format(0))
+_MAX_LINE = 1 << 22
 
 
 class Journal:
@@ -36,19 +42,19 @@ class Journal:
             self._file = path.open("ab", buffering=0)
         except OSError as error:
             raise CongraspError(f"The journal {path} cannot be opened: {error.strerror}.") from None
-        self._corrupted = self._file.tell() > 0  # whoever wrote the last line may have been killed in it
+        self._cut = self._file.tell() > 0  # whoever wrote the last line may have been killed in it
         self._lost = 0
 
     def write(self, **entry: Any) -> None:
         """Adds a line; one that the disk refuses is counted in the next that it takes, as `lost`."""
         with self._lock:
             lost = {"lost": self._lost} if self._lost else {}
-            line = b"\n" * self._corrupted + json.dumps({**entry, **lost}).encode() + b"\n"
+            line = b"\n" * self._cut + _line({**entry, **lost})
             try:
-                self._corrupted = self._file.write(line) < len(line)
-                reason = "No space left" if self._corrupted else ""
+                self._cut = self._file.write(line) < len(line)
+                reason = "No space left" if self._cut else ""
             except OSError as error:
-                self._corrupted, reason = True, error.strerror or str(error)
+                self._cut, reason = True, error.strerror or str(error)
             if reason and not self._lost:
                 self._warn(f"{self._path} could not be written ({reason}); what happens meanwhile is not in it.")
             self._lost = self._lost + 1 if reason else 0
@@ -59,15 +65,96 @@ class Journal:
             self._file.close()
 
 
-def read_journal(path: pathlib.Path) -> Iterator[dict[str, Any]]:
-    """The lines of a journal that are whole; none if there is no such file."""
-    if not path.exists():
-        return
-    with path.open("rb") as file:
-        for line in file:
-            try:
-                entry = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(entry, dict):
-                yield entry
+class JournalLines(NamedTuple):
+    """What a journal holds."""
+
+    entries: list[dict[str, Any] | None]
+    """The intact lines in their order; None stands where damaged ones were."""
+    lost: int
+    """Lines that are missing because the disk was full, or that were cut at the end."""
+    damaged: int
+    """Lines that are not what was written."""
+    unchecked: int
+    """Lines before the first with a checksum: older versions of congrasp wrote none."""
+
+    @property
+    def intact(self) -> list[dict[str, Any]]:
+        """The intact lines."""
+        return [entry for entry in self.entries if entry is not None]
+
+
+def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] = lambda entry: True) -> JournalLines:
+    """Reads a journal, whatever is in the file.
+
+    Args:
+      path: the file.
+      is_entry: whether a line is one of this kind of journal; others are damaged.
+
+    Raises:
+      CongraspError: the file cannot be read.
+    """
+    entries: list[dict[str, Any] | None] = []
+    lost = damaged = unchecked = run = 0
+    checked, cut = False, False
+    try:
+        with path.open("rb") as file:
+            while line := file.readline(_MAX_LINE):
+                if not line.strip(b"\n"):
+                    continue
+                cut = not line.endswith(b"\n")
+                entry, check = _parse(line)
+                if entry is None or (checked and not check) or not is_entry(entry):
+                    run += 1
+                    entries.append(None)
+                    continue
+                checked |= check
+                unchecked += not check
+                # The disk took a part of the first line that it refused: `lost` counts that one, too.
+                refused = min(number(entry.pop("lost", 0)), MAX_NUMBER)
+                lost, damaged, run = lost + refused, damaged + max(0, run - bool(refused)), 0
+                entries.append(entry)
+    except OSError as error:
+        raise CongraspError(f"The journal {path} cannot be read: {error.strerror}.") from None
+    cut = cut and run > 0
+    return JournalLines(entries, lost + cut, damaged + run - cut, unchecked)
+
+
+def number(value: Any) -> int:
+    """A value as it is if it is a count; 0 for everything else."""
+    return value if type(value) is int and 0 <= value < MAX_NUMBER else 0
+
+
+def has_fields(entry: dict[str, Any], **types: type) -> bool:
+    """Whether an entry has these fields, of these types; integers only below `MAX_NUMBER`."""
+    return all(is_value(entry.get(name), kind) for name, kind in types.items())
+
+
+def is_rows(value: Any, *types: type) -> bool:
+    """Whether a value is a list of rows whose columns have these types."""
+    return isinstance(value, list) and all(
+        isinstance(row, list) and len(row) == len(types) and all(map(is_value, row, types)) for row in value
+    )
+
+
+def is_value(value: Any, kind: type) -> bool:
+    """Whether a value of a JSON line is of a type; integers only below `MAX_NUMBER`."""
+    return type(value) is kind and not (isinstance(value, int) and abs(value) >= MAX_NUMBER)
+
+
+def _line(entry: dict[str, Any]) -> bytes:
+    text = json.dumps(entry)[:-1]
+    return (text + _CHECK.format(zlib.crc32(text.encode()))).encode()
+
+
+def _parse(line: bytes) -> tuple[dict[str, Any] | None, bool]:
+    """A line's entry, None if it is none or its checksum is another; and whether it has a checksum."""
+    try:
+        entry = json.loads(line)
+    except (ValueError, RecursionError):
+        return None, False
+    if not isinstance(entry, dict):
+        return None, False
+    if entry.pop("crc32", None) is None:
+        return entry, False
+    check = _CHECK.format(zlib.crc32(line[:-_CHECK_BYTES])).encode()
+    return (entry if line.endswith(check) else None), True

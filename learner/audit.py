@@ -8,7 +8,7 @@ import pathlib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
-from common.journal import AUDIT, Journal, read_journal
+from common.journal import AUDIT, Journal, JournalLines, has_fields, is_rows, read_journal
 from common.wire.codec import Message, checksum
 
 
@@ -35,7 +35,7 @@ class AuditLog:
     def begin(self, session_id: str, run_id: str, version: int, max_staleness: int) -> int:
         """A session begins from a checkpoint of `version`, or 0; returns how many rollouts the run lost by undoing."""
         self._journal.write(life=session_id, epoch=run_id, version=version, max_staleness=max_staleness)
-        return len(replay(read_journal(self._path))[1])
+        return len(replay(read_uses(self._path).intact)[1])
 
     def used(self, version: int, lags: Sequence[int], messages: Sequence[Message]) -> None:
         """Rollouts are handed to the update that follows `version`."""
@@ -55,6 +55,28 @@ class AuditLog:
 def journal_path(run_dir: pathlib.Path, name: str) -> pathlib.Path:
     """Where the learner called `name` keeps its journal."""
     return run_dir / AUDIT / f"learner-{name}.jsonl"
+
+
+def read_uses(path: pathlib.Path) -> JournalLines:
+    """The lines of a learner's journal; a CongraspError if the file cannot be read."""
+    return read_journal(path, _is_entry)
+
+
+def _is_entry(entry: dict[str, Any]) -> bool:
+    """Whether a line is one that an `AuditLog` writes."""
+    if "life" in entry:
+        return has_fields(entry, life=str, epoch=str, version=int, max_staleness=int)
+    if "used" in entry:
+        return has_fields(entry, version=int) and is_rows(entry["used"], str, str, int, int, str)
+    return any(name in entry and is_rows(entry[name], str, str, int) for name in ("dropped", "end"))
+
+
+def journalled_version(run_dir: pathlib.Path) -> int:
+    """The newest version that a run's journals tell of; -1 if there are none. After a use its update's may be out."""
+    versions = [-1]
+    for path in sorted((run_dir / AUDIT).glob("learner-*.jsonl")):
+        versions += [e["version"] + ("used" in e) for e in read_uses(path).intact if "version" in e]
+    return max(versions)
 
 
 def replay(entries: Iterable[dict[str, Any]]) -> tuple[list[Used], list[Used]]:

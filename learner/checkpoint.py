@@ -1,15 +1,18 @@
 """Complete checkpoints: a pytree's arrays by path and JSON for the rest, in one safetensors file each.
 
-A checkpoint is written beside its final name, flushed, renamed, and only then pointed at by the link `latest`; so
-`latest` always names a whole file, whenever the process or the machine dies.
+A checkpoint is written beside its final name, flushed and renamed, so that every file is whole, whenever the process or
+the machine dies. Its name gives its update, and the newest intact one is what a run resumes from; the link `latest` is
+for people. A checksum in the header covers names, types, shapes and content of the arrays.
 """
 
 import contextlib
+import itertools
 import json
 import os
 import pathlib
+import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -19,10 +22,13 @@ import numpy as np
 from common.errors import CongraspError
 from common.files import sync_directory, write_atomically
 from common.wire.codec import Message, decode, encode
+from common.wire.codec import checksum as checksum_of
 
 _LATEST = "latest"
 _META = "meta"
 _PATTERN = "checkpoint_*.safetensors"
+_NUMBER = re.compile(r"checkpoint_(\d{1,15})\.safetensors")
+_ASIDE = ".aside"
 
 
 class Checkpoints:
@@ -45,7 +51,9 @@ class Checkpoints:
         """
         path = self._directory / f"checkpoint_{version:09d}.safetensors"
         text = np.frombuffer(json.dumps(meta).encode(), np.uint8)  # as an array: a header's length is limited
-        write_atomically(path, encode(Message({**flatten(jax.device_get(tree)), _META: text}, {"version": version})))
+        message = Message({**flatten(jax.device_get(tree)), _META: text}, {"version": version})
+        check = {"checksum": checksum_of(message)}
+        write_atomically(path, encode(Message(message.arrays, {**message.meta, **check})))
         link = self._directory / f".{_LATEST}.{os.getpid()}.tmp"
         try:
             link.unlink(missing_ok=True)
@@ -54,34 +62,103 @@ class Checkpoints:
             sync_directory(self._directory)
         except OSError as error:
             raise CongraspError(f"{self._directory / _LATEST} could not be set: {error.strerror}.") from None
-        for old in sorted(self._directory.glob(_PATTERN))[: -self._keep]:
+        for old in self.files()[self._keep :]:
             if old != path:
                 with contextlib.suppress(OSError):
                     old.unlink()
         return path
 
-    def load(self, template: Any) -> tuple[Any, dict[str, Any]]:
-        """The latest checkpoint's tree, shaped as `template`, and its meta data.
+    def files(self) -> list[pathlib.Path]:
+        """The checkpoints, intact or not, the newest first."""
+        return sorted((path for path in self._directory.glob(_PATTERN) if _update(path) >= 0), key=_update)[::-1]
+
+    def newest(self) -> int:
+        """The update of the newest checkpoint, intact or not; -1 if there is none."""
+        return max(map(_update, self.files()), default=-1)
+
+    def load(
+        self, template: Any, on_event: Callable[[str, str], None] = lambda level, text: None
+    ) -> tuple[Any, dict[str, Any]]:
+        """The newest intact checkpoint's tree, shaped as `template` (see `restore`), and its meta data.
 
         Raises:
-          CongraspError: if there is none, or it is damaged or of another shape.
+          CongraspError: see `find`, or the checkpoint is of another shape.
         """
-        path = self._directory / _LATEST
-        try:
-            path = path.resolve(strict=True)
-            data = path.read_bytes()
-        except OSError:
+        path, arrays, meta = self.find(on_event)
+        return restore(arrays, template, str(path)), meta
+
+    def find(self, on_event: Callable[[str, str], None]) -> tuple[pathlib.Path, Mapping[str, Any], dict[str, Any]]:
+        """The newest intact checkpoint: its file, its arrays and its meta data.
+
+        Newer ones that are damaged are renamed, so that training does not overwrite them when it comes to their update.
+
+        Args:
+          on_event: given (level, text) for each damaged checkpoint, and for the one that is found.
+
+        Raises:
+          CongraspError: if there is none, or a damaged one cannot be renamed.
+        """
+        damaged = []
+        for path in self.files():
+            try:
+                arrays, meta = _read(path)
+            except CongraspError as error:
+                damaged.append((path, str(error)))
+                continue
+            for other, why in damaged:
+                kept = set_aside(other)
+                on_event(
+                    "warning", f"The checkpoint {other} is damaged: {why} It is left out, and kept as {kept.name}."
+                )
+            on_event("info", f"Resuming from the checkpoint {path}.")
+            return path, arrays, meta
+        if damaged:
             raise CongraspError(
-                f"There is no checkpoint in {self._directory}.", "Start the run without --resume."
-            ) from None
-        try:
-            arrays = decode(data, max_bytes=len(data)).arrays
-        except CongraspError as error:
-            raise CongraspError(
-                f"The checkpoint {path} is damaged: {error}",
-                f"Point {self._directory / _LATEST} at an older one to go on from there.",
-            ) from None
-        return restore(arrays, template, str(path)), json.loads(arrays[_META].tobytes())
+                f"No checkpoint in {self._directory} is intact; the newest, {damaged[0][0].name}, is damaged: "
+                f"{damaged[0][1]}",
+                "Start anew in another --run-dir.",
+            )
+        raise CongraspError(f"There is no checkpoint in {self._directory}.", "Start anew in another --run-dir.")
+
+
+def set_aside(path: pathlib.Path) -> pathlib.Path:
+    """Renames a file so that nothing overwrites it, and returns its new name.
+
+    Raises:
+      CongraspError: it cannot be renamed.
+    """
+    others = (path.with_name(f"{path.name}{_ASIDE}{number or ''}") for number in itertools.count())
+    target = next(other for other in others if not os.path.lexists(other))
+    try:
+        return path.rename(target)
+    except OSError as error:
+        raise CongraspError(f"{path} cannot be renamed to {target.name}: {error.strerror}.") from None
+
+
+def _update(path: pathlib.Path) -> int:
+    """The update that a checkpoint's name gives; -1 if it gives none."""
+    found = _NUMBER.fullmatch(path.name)
+    return int(found[1]) if found else -1
+
+
+def _read(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
+    """Arrays and meta data of a checkpoint; a CongraspError says why it is not intact."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CongraspError(f"It cannot be read: {error.strerror}.") from None
+    message = decode(data, max_bytes=len(data))
+    if message.meta.get("version") != _update(path):
+        raise CongraspError("Its header names another update than the file's name.")
+    if message.meta.get("checksum", "") not in ("", checksum_of(message)):  # older versions of congrasp wrote none
+        raise CongraspError("Its content does not match the header's checksum.")
+    try:
+        meta = json.loads(message.arrays[_META].tobytes())
+    except (KeyError, ValueError):
+        meta = None
+    if not isinstance(meta, dict):
+        raise CongraspError("It lacks its meta data.")
+    return message.arrays, meta
 
 
 def checksum(tree: Any) -> int:

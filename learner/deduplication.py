@@ -5,6 +5,7 @@ import dataclasses
 from common.wire.messages import RolloutHeader
 
 _WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another
+_GAP = 1 << 16  # rollouts that one gap counts at most; an actor that makes its numbers up has no more to count
 
 
 @dataclasses.dataclass
@@ -34,7 +35,7 @@ class Sequences:
             self.refused.add(header.sequence)
         self.ahead.add(header.sequence)
         if len(self.ahead) > _WINDOW:
-            self.skipped += min(self.ahead) - self.next
+            self.skipped += min(_GAP, min(self.ahead) - self.next)
             self.next = min(self.ahead)
         while self.next in self.ahead:
             self.ahead.remove(self.next)
@@ -45,4 +46,5 @@ class Sequences:
     @property
     def missing(self) -> int:
         """Sequence numbers below the highest that are not decided on."""
-        return self.skipped + max(self.ahead, default=self.next - 1) + 1 - self.next - len(self.ahead)
+        ahead = max(self.ahead, default=self.next - 1) + 1 - self.next - len(self.ahead)
+        return self.skipped + min(_GAP, ahead)

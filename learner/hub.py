@@ -89,7 +89,7 @@ class LearnerHub:
         self._alive: set[Alive] = set()
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
         self._last_event: dict[str, float] = {}
-        self._finished = False
+        self._finished = self._closed = False
         self._audit = audit
         self._saved = 0 if durable is None else durable["version"]
         self._held_until = 0.0 if durable is None else float("inf")
@@ -169,9 +169,10 @@ class LearnerHub:
         self._transport.publish(self.keys.announcement, Message(meta=self._state()))
 
     def close(self) -> None:
-        """Notes what waits unused at an orderly end."""
-        if self._audit is not None:
-            with self._changed:
+        """Stops accepting rollouts, though the transport still answers, and notes what waits unused."""
+        with self._changed:
+            self._closed = True
+            if self._audit is not None:
                 self._audit.end((*header.owner, header.sequence) for header, _ in self._queue)
 
     def status(self) -> dict[str, Any]:
@@ -280,6 +281,8 @@ class LearnerHub:
     def _admit(self, header: RolloutHeader, ticket: str, message: Message) -> Message:
         if self._bundle is None:
             return self._answer("retry", why="The learner is starting.")
+        if self._closed:
+            return self._answer("retry", why="The learner is stopping.")
         sequences = self._sequences_of(header.owner)
         if header.sequence in sequences.refused:
             self._staleness.redeem(header.owner, ticket)

@@ -33,7 +33,16 @@ from learner.checkpoint import Checkpoints, checksum, flatten, restore
 from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
 from learner.ranks import Ranks, ended_by
-from learner.run_directory import CONFIG_FILE, INITIAL_FILE, POLICY_FILE, note_version, open_run, published_version
+from learner.run_directory import (
+    CHECKPOINTS,
+    CONFIG_FILE,
+    INITIAL_FILE,
+    POLICY_FILE,
+    keep_policy,
+    note_version,
+    open_run,
+    published_version,
+)
 from learner.staleness import Counters, StalenessManager
 from learner.statistics import Pace, overall, summary
 
@@ -73,7 +82,7 @@ def run_learner(
         no array.
       transport: the learner's endpoint; it stays the caller's.
       stop_event: ends training after the update that is under way.
-      resume: go on from the latest checkpoint (of rank 0), which any number of ranks may have written.
+      resume: go on from the newest intact checkpoint (of rank 0), which any number of ranks may have written.
       ranks: the learner's processes, where there are several.
       audit: keep the journal in `audit/`; it needs rollouts on the host, so not where they stay on a device.
       recorder: entered while the learner runs, for example one that writes the run's logs.
@@ -150,7 +159,7 @@ class _Learner:
             config.half_observations,
             self._algorithm.batch_schema,
         )
-        self._checkpoints = Checkpoints(run_dir / "checkpoints")
+        self._checkpoints = Checkpoints(run_dir / CHECKPOINTS)
         self._state, meta = self._first_state(resume)
         self._run_id, self._skipped, hubs = meta["run_id"], meta["skipped"], meta["hubs"]
         if ranks.count > 1:
@@ -183,10 +192,18 @@ class _Learner:
             initial = Policy(given.params, given.observation, given.value)
         state = self._algorithm.init(config.seed, initial)
         meta: dict[str, Any] = {"run_id": secrets.token_hex(8), "skipped": 0, "hubs": []}
-        if ranks.rank == 0 and resume:
-            state, meta = self._checkpoints.load(state)
-            meta = {**meta, "skipped": self._skip_lost_versions(state.version + meta["skipped"]) + meta["skipped"]}
-            write_atomically(self._run_dir / CONFIG_FILE, to_json(config).encode())
+        if ranks.rank == 0:
+            newest = self._checkpoints.newest()
+            if resume:
+                state, meta = self._checkpoints.load(state, self._event)
+                keep_policy(self._run_dir, state.version + meta["skipped"], self._event)
+                write_atomically(self._run_dir / CONFIG_FILE, to_json(config).encode())
+            elif newest >= 0:
+                raise CongraspError(
+                    f"{self._run_dir} holds checkpoints of a run.", "Go on with --resume, or choose another --run-dir."
+                )
+            version, newest = state.version + meta["skipped"], newest + meta["skipped"]
+            meta = {**meta, "skipped": self._skip_lost_versions(version, newest) + meta["skipped"]}
         if ranks.count > 1:
             message = ranks.exchange(meta, flatten(state) if ranks.rank == 0 else None)
             state, meta = restore(message.arrays, state, "The state of rank 0"), message.meta["entries"][0]
@@ -306,9 +323,12 @@ class _Learner:
         meta = {"version": self.version, "epoch": self._run_id, "schema": self._spec.schema}
         self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
 
-    def _skip_lost_versions(self, version: int) -> int:
-        """Versions that were published after the checkpoint's died with the process; they are not given out again."""
-        published = published_version(self._run_dir)
+    def _skip_lost_versions(self, version: int, newest: int) -> int:
+        """Versions that were published after the checkpoint's died with the process; they are not given out again.
+
+        `newest` is the least version that the newest checkpoint, intact or not, can be of.
+        """
+        published = max(newest, published_version(self._run_dir))
         if published <= version:
             return 0
         self._event("warning", f"{published - version} update(s) after the checkpoint were lost.")

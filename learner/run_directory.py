@@ -3,24 +3,29 @@
 It holds `config.json`, `initial.safetensors` where training does not begin with random weights, `checkpoints/`,
 `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `version` (the
 newest version that was ever published, so that versions rise over a crash, too) and, after an update that was not
-finite, `failure/`.
+finite, `failure/`. What a resume could not read, or does not go on from, is kept beside it as `*.aside`.
 """
 
 import dataclasses
 import os
 import pathlib
+from collections.abc import Callable
 
 from common.config import RunConfig, run_config_from_json, to_json
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
+from learner.audit import journalled_version
+from learner.checkpoint import Checkpoints, set_aside
 
 POLICY_FILE = "policy.safetensors"
 INITIAL_FILE = "initial.safetensors"
 CONFIG_FILE = "config.json"
 LOGS = "logs"
+CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
+_MAX_VERSION = 1 << 53
 CHANGEABLE = ("updates", "checkpoint_every", "collapse_patience", "physics", "ppo")
 """Fields of the configuration that a run may go on with other values of; actors that are there do not use them."""
 
@@ -34,11 +39,16 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
       initial: a policy to begin with instead of random weights: its networks and normalisers.
 
     Raises:
-      CongraspError: there is a run in it already, or the initial policy does not fit the run.
+      CongraspError: there is a run in it already, or what is left of one, or the initial policy does not fit the run.
     """
     if (run_dir / CONFIG_FILE).exists():
         raise CongraspError(
             f"{run_dir} holds a run already.", "Choose another --run-dir, or continue it with --resume."
+        )
+    if remains := _remains(run_dir):
+        raise CongraspError(
+            f"{run_dir} holds {remains[0].name} of a run, but no {CONFIG_FILE}.",
+            "Put that back and add --resume, or choose another --run-dir.",
         )
     if initial is not None:
         bundles.policy_spec(config.task, config.network).require(initial.spec, "to begin with")
@@ -49,14 +59,42 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
 
 
 def open_run(run_dir: pathlib.Path) -> RunConfig:
-    """The configuration of a run directory; a CongraspError if it is not one."""
+    """The configuration of a run directory; a CongraspError if it is not one, or the file is damaged."""
+    path = run_dir / CONFIG_FILE
     try:
-        text = (run_dir / CONFIG_FILE).read_bytes()
+        text = path.read_bytes()
     except OSError:
         raise CongraspError(
             f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Name one made by 'congrasp train'."
         ) from None
-    return run_config_from_json(text)
+    try:
+        return run_config_from_json(text)
+    except CongraspError as error:
+        raise CongraspError(f"{path} cannot be used: {error}") from None
+
+
+def has_checkpoints(run_dir: pathlib.Path) -> bool:
+    """Whether a run can go on from a checkpoint; false for one that has not come to its first.
+
+    Raises:
+      CongraspError: the run had checkpoints, and they are gone; to begin it anew here would overwrite what is left.
+    """
+    if Checkpoints(run_dir / CHECKPOINTS).files():
+        return True
+    if remains := _remains(run_dir):
+        policy = run_dir / POLICY_FILE
+        begin = f" with --initial {policy}" if policy.exists() else ""
+        raise CongraspError(
+            f"{run_dir} has no checkpoint to resume from, but had one: there is {remains[0].name}.",
+            f"Start anew in another --run-dir{begin}.",
+        )
+    return False
+
+
+def _remains(run_dir: pathlib.Path) -> list[pathlib.Path]:
+    """What only a run that has come to a checkpoint leaves behind."""
+    found = [path for path in (run_dir / CHECKPOINTS).glob("*") if not path.name.startswith(".")]
+    return sorted(found) + [path for path in [run_dir / POLICY_FILE] if path.exists()]
 
 
 def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
@@ -98,8 +136,37 @@ def note_version(run_dir: pathlib.Path, version: int) -> None:
 
 
 def published_version(run_dir: pathlib.Path) -> int:
-    """The version of `note_version`; -1 if there is none."""
+    """The newest version of which the run's folder knows: by `note_version`, the policy or the journals; -1 if none."""
     try:
-        return int((run_dir / _VERSION_FILE).read_text())
+        noted = int((run_dir / _VERSION_FILE).read_text())
     except (OSError, ValueError):
-        return -1
+        noted = -1
+    policy = _policy_version(run_dir)
+    known = (noted, -1 if policy is None else policy, journalled_version(run_dir))
+    return max((version for version in known if version < _MAX_VERSION), default=-1)
+
+
+def keep_policy(run_dir: pathlib.Path, version: int, on_event: Callable[[str, str], None]) -> None:
+    """Keeps a policy file that is newer than the checkpoint that a run resumes from, or that cannot be read.
+
+    Args:
+      run_dir: the run's directory.
+      version: of the checkpoint.
+      on_event: given (level, text) if a file is kept under another name.
+
+    Raises:
+      CongraspError: it cannot be renamed.
+    """
+    path = run_dir / POLICY_FILE
+    found = _policy_version(run_dir)
+    if os.path.lexists(path) and (found is None or found > version):
+        what = "cannot be read" if found is None else f"is of version {found}, newer than the checkpoint"
+        on_event("warning", f"{path} {what}; it is kept as {set_aside(path)}.")
+
+
+def _policy_version(run_dir: pathlib.Path) -> int | None:
+    """The version of the run's policy file; None if there is none, or it is damaged."""
+    try:
+        return bundles.load(run_dir / POLICY_FILE).version
+    except CongraspError:
+        return None

@@ -9,7 +9,8 @@ import tyro
 def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tuple[pathlib.Path, ...] = ()) -> int:
     """Compares the journals of a run's actors and of its learner: was every accepted rollout used once, and whole?
 
-    Exits with 1 if one was lost, duplicated, corrupted or unmatched.
+    Exits with 1 if a rollout was lost, else with 5 if there is a surplus (one was used twice, or nobody made it), else
+    with 6 if a rollout or a journal is damaged.
 
     Args:
       run_dir: Directory of the run.
@@ -22,16 +23,20 @@ def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tupl
 
     report = audit(run_dir, journals)
     console = Console()
-    table = Table("rollouts", "number", title=f"Audit of {run_dir}")
+    table = Table("rollouts", "number", "kind", title=f"Audit of {run_dir}")
     for name, value in report.counts.items():
-        table.add_row(name, str(value), style="bold red" if name in FAULTS and value else "")
+        style = "bold red" if name in FAULTS and value else ""
+        table.add_row(name, str(value), FAULTS.get(name, ""), style=style)
+    table.add_section()
+    table.add_row("damaged lines", str(report.damaged), "damage", style="bold red" if report.damaged else "")
+    table.add_row("lines without a checksum", str(report.unchecked), "unchecked" if report.unchecked else "")
     console.print(table)
     console.print(f"Lag: mean {report.lag_mean:.2f}, at most {report.lag_max} of {report.max_staleness} versions.")
     if report.holes:
-        console.print(f"A full disk kept {report.holes} line(s) out of the journals.")
+        console.print(f"{report.holes} line(s) are missing in the journals: the disk was full, or their end was cut.")
     for line in report.faults[:20]:
         console.print(line)
-    return 1 if report.faults else 0
+    return report.exit_code
 
 
 COMMAND = audit

@@ -51,7 +51,8 @@ def learner(
       certs: Folder of a learner's certificate (congrasp certs): mutual TLS, and each role may do only what is its own.
       insecure: Listen beyond loopback without certificates.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
-      resume: Go on with the run in --run-dir, from its latest checkpoint if it has one.
+      resume: Go on with the run in --run-dir, from its newest intact checkpoint; a run that has not come to one
+        begins anew.
       or_resume: Begin the run, or go on with it if --run-dir holds one: for supervisors that give the same command
         every time.
       rank: Number of this process among several that train together; each needs a GPU of its own
@@ -103,13 +104,14 @@ def _learn(
 ) -> None:
     """Runs the learner until it is finished or told to stop."""
     from learner.process import run_learner
+    from learner.run_directory import has_checkpoints
     from services.ops.logs import log
     from services.ops.metrics import LearnerMetrics
     from services.ops.status import ask
     from services.train.in_process import train_in_process
     from services.train.metric_writers import recorded
 
-    resume = resume and (run_dir / "checkpoints" / "latest").exists()
+    resume = resume and ranks.rank == 0 and has_checkpoints(run_dir)
     metrics = LearnerMetrics(functools.partial(ask, transport, config.name))
 
     def updated(values: dict[str, float]) -> None:

@@ -44,8 +44,8 @@ def train(
       ranks: Learners that train together, data parallel; each has a GPU of its own where there are GPUs, and --actors
         actors. The batch grows with them.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
-      resume: Go on from the latest checkpoint in --run-dir, with the run's own configuration; what the learner alone
-        uses, such as --updates and --ppo.…, may be changed.
+      resume: Go on from the newest intact checkpoint in --run-dir, with the run's own configuration; what the learner
+        alone uses, such as --updates and --ppo.…, may be changed.
       listen: Endpoint where actors of other machines may join, such as tls/0.0.0.0:7447; on this machine alone by
         default.
       certs: The authority's folder (congrasp certs), for mutual TLS.

@@ -3,6 +3,9 @@
 Actors note what they made, with a checksum, and every answer to it; the learner notes what it used, with a
 checksum taken when the update began, what it dropped, and where its sessions began and ended. Neither reads the other's
 journal; nothing here uses the code that decided.
+
+What a journal's missing or damaged lines told cannot be known: what they may have been about is no fault, but counted
+as not in the journals.
 """
 
 import collections
@@ -11,12 +14,15 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from common.errors import CongraspError
-from common.journal import AUDIT, read_journal
-from learner.audit import Used, replay
+from common.journal import AUDIT, JournalLines, has_fields, read_journal
+from learner.audit import Used, read_uses, replay
 
 Identity = tuple[str, str, int]
 """Actor, incarnation and sequence number."""
-FAULTS = ("lost", "duplicated", "corrupted", "unmatched")
+FAULTS = {"lost": "loss", "duplicated": "surplus", "corrupted": "damage", "unmatched": "surplus"}
+"""Faults of rollouts, and their kinds."""
+EXIT_CODES = {"loss": 1, "surplus": 5, "damage": 6}
+"""What `congrasp audit` exits with, by the gravest kind of what it found; 2 to 4 are those of errors."""
 
 
 class Made(NamedTuple):
@@ -39,7 +45,24 @@ class Report(NamedTuple):
     lag_max: int
     max_staleness: int
     holes: int
-    """Lines that a full disk kept out of the journals; what they were about cannot be judged."""
+    """Lines that a full disk kept out of the journals, or that were cut at the end."""
+    damaged: int
+    """Lines of the journals that are not what was written."""
+    unchecked: int
+    """Lines without a checksum, of older versions of congrasp: damage to them may look like any fault."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 if nothing was found, else that of the gravest kind."""
+        kinds = {FAULTS[name] for name in FAULTS if self.counts[name]} | ({"damage"} if self.damaged else set())
+        return next((code for kind, code in EXIT_CODES.items() if kind in kinds), 0)
+
+
+class _Gaps(NamedTuple):
+    """Whether lines are missing in the journals."""
+
+    actors: bool
+    learners: bool
 
 
 def audit(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
@@ -61,46 +84,73 @@ def audit(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
             f"There is no journal of {'an' if kind == 'actor' else 'a'} {kind} in {folder}.",
             "Actors elsewhere write theirs with 'congrasp actor --audit FILE'; name these files.",
         )
-    made, holes = _made(actors)
-    books = [list(read_journal(path)) for path in learners]
-    holes += sum(entry.get("lost", 0) for book in books for entry in book)
-    return _compare(made, books, holes)
+    notes = [read_journal(path, _is_entry) for path in actors]
+    books = [read_uses(path) for path in learners]
+    gaps = _Gaps(*(any(each.lost or each.damaged for each in group) for group in (notes, books)))
+    return _compare(_made(notes), _outcomes(book.intact for book in books), gaps, [*notes, *books])
 
 
-def _made(paths: Iterable[pathlib.Path]) -> tuple[dict[Identity, Made], int]:
-    """What actors made, the answers that they got, and the holes in their journals."""
+def _is_entry(entry: dict[str, Any]) -> bool:
+    """Whether a line is one that an actor writes."""
+    if "made" in entry:
+        return has_fields(entry, made=int, version=int, checksum=str)
+    if "answer" in entry:
+        return has_fields(entry, answer=int, outcome=str, life=str)
+    return has_fields(entry, actor=str, incarnation=str)
+
+
+def _made(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
+    """What actors made, and the answers that they got."""
     made: dict[Identity, Made] = {}
-    holes = 0
-    for path in paths:
-        who = ("?", "?")
-        for entry in read_journal(path):
-            holes += entry.get("lost", 0)
-            if "actor" in entry:
+    for journal in journals:
+        who: tuple[str, str] | None = None
+        for entry in journal.entries:
+            if entry is None:
+                who = None  # the lines that follow may be another incarnation's, if they do not name it
+                continue
+            if has_fields(entry, actor=str, incarnation=str):
                 who = entry["actor"], entry["incarnation"]
-            elif "made" in entry:
+            if who is not None and "made" in entry:
                 made[*who, entry["made"]] = Made(entry["version"], entry["checksum"], [])
-            elif (identity := (*who, entry.get("answer", -1))) in made:
+            elif who is not None and (identity := (*who, entry.get("answer", -1))) in made:
                 made[identity].answers.append((entry["outcome"], entry["life"]))
-    return made, holes
+    return made
 
 
-def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], holes: int) -> Report:
-    """Judges every rollout by what its actor was told and by what the learner's sessions did with it."""
-    standing: dict[Identity, list[Used]] = collections.defaultdict(list)
-    undone: set[Identity] = set()
-    dropped: set[Identity] = set()
-    waiting: set[Identity] = set()
-    sessions = [entry for book in books for entry in book if "life" in entry]
-    running = {[entry["life"] for entry in book if "life" in entry][-1] for book in books if "end" not in book[-1]}
+class _Outcomes(NamedTuple):
+    """What the learner's sessions did with rollouts."""
+
+    sessions: list[dict[str, Any]]
+    running: set[str]
+    """Sessions that have not noted their end."""
+    standing: dict[Identity, list[Used]]
+    undone: set[Identity]
+    dropped: set[Identity]
+    waiting: set[Identity]
+
+
+def _outcomes(books: Iterable[list[dict[str, Any]]]) -> _Outcomes:
+    """The outcomes of which the learners' journals tell."""
+    found = _Outcomes([], set(), collections.defaultdict(list), set(), set(), set())
     for book in books:
+        begun = [entry for entry in book if "life" in entry]
+        found.sessions.extend(begun)
+        if begun and "end" not in book[-1]:
+            found.running.add(begun[-1]["life"])
         stands, lost = replay(book)
         for use in stands:
-            standing[use.actor, use.incarnation, use.sequence].append(use)
-        undone |= {(use.actor, use.incarnation, use.sequence) for use in lost}
+            found.standing[use.actor, use.incarnation, use.sequence].append(use)
+        found.undone.update((use.actor, use.incarnation, use.sequence) for use in lost)
         for entry in book:
-            dropped |= {(a, i, s) for a, i, s in entry.get("dropped", ())}
-            waiting |= {(a, i, s) for a, i, s in entry.get("end", ())}
+            found.dropped.update((a, i, s) for a, i, s in entry.get("dropped", ()))
+            found.waiting.update((a, i, s) for a, i, s in entry.get("end", ()))
+    return found
 
+
+def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals: Sequence[JournalLines]) -> Report:
+    """Judges every rollout by what its actor was told and by what the learner's sessions did with it."""
+    sessions, running, standing, undone, dropped, waiting = found
+    begun = {session["life"] for session in sessions}
     counts = collections.Counter({"made": len(made)})
     faults: list[str] = []
 
@@ -115,10 +165,13 @@ def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], 
             counts["of actors without a journal"] += 1
             continue
         if identity not in made:
-            fault("unmatched", identity, "used, but never made")
+            if gaps.actors:
+                counts["used, not in the journals"] += 1
+            else:
+                fault("unmatched", identity, "used, but never made")
         elif any(use.checksum != made[identity].checksum for use in uses):
             fault("corrupted", identity, "used with another content than it was made with")
-        if len(uses) > 1:
+        if len(uses) > 1 and not gaps.learners:  # the line may be missing by which a resume undid one of them
             fault("duplicated", identity, f"used {len(uses)} times")
     for identity, rollout in made.items():
         outcomes = [outcome for outcome, _ in rollout.answers]
@@ -136,7 +189,7 @@ def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], 
             counts["undone"] += 1
         elif identity in waiting or rollout.answers[-1][1] in running:
             counts["waiting"] += 1
-        elif holes:
+        elif any(gaps) or not {session for _, session in rollout.answers} <= begun:
             counts["not in the journals"] += 1
         else:
             fault("lost", identity, "accepted, and never seen again")
@@ -147,7 +200,9 @@ def _compare(made: dict[Identity, Made], books: Sequence[list[dict[str, Any]]], 
         sum(lags) / max(1, len(lags)),
         max(lags, default=0),
         max((session["max_staleness"] for session in sessions), default=0),
-        holes,
+        sum(journal.lost for journal in journals),
+        sum(journal.damaged for journal in journals),
+        sum(journal.unchecked for journal in journals),
     )
 
 

@@ -1,26 +1,23 @@
-"""Reads recordings, whole or cut off: a killed writer's file reads up to its last flush."""
+"""Reads recordings, whole, cut off or damaged: a killed writer's file reads up to its last flush."""
 
 import collections
 import json
+import logging
 import pathlib
-import struct
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-import zstandard
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
 from mcap.writer import MCAP0_MAGIC
 
 from common.errors import CongraspError
 from common.wire.codec import Message, decode
 from services.record.channels import ROLLOUT_SCHEMA, flatten
+from services.record.salvage import Dropped, read_messages
 from services.record.scene import EPISODE_SCHEMA
 from services.record.writer import PART
 
-_CUT = (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError)
-_RECORD_LIMIT = 1 << 30
+_log = logging.getLogger(__name__)
 
 
 class Record(NamedTuple):
@@ -60,12 +57,15 @@ def is_complete(path: pathlib.Path) -> bool:
         return size > 2 * len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC
 
 
-def read_records(path: pathlib.Path, wanted: Callable[[str], bool] = lambda topic: True) -> Iterator[Record]:
+def read_records(
+    path: pathlib.Path, wanted: Callable[[str], bool] = lambda topic: True, warn: Callable[[str], None] = _log.warning
+) -> Iterator[Record]:
     """Messages of one file in the order in which they were written, as far as the file is intact.
 
     Args:
       path: the file.
       wanted: which topics to read.
+      warn: called with one line at the end if damage kept messages from being read, which says how many and where.
 
     Raises:
       CongraspError: the file cannot be opened, or is no MCAP file.
@@ -78,15 +78,16 @@ def read_records(path: pathlib.Path, wanted: Callable[[str], bool] = lambda topi
         start = file.read(len(MCAP0_MAGIC))
         if not MCAP0_MAGIC.startswith(start):
             raise CongraspError(f"{path} is not an MCAP file.", "Name a file that 'congrasp record' wrote.")
-        file.seek(0)
-        reader = NonSeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT)
+        dropped = Dropped()
         try:
-            for schema, channel, message in reader.iter_messages(log_time_order=False):
+            for schema, channel, message in read_messages(file, dropped):
                 if wanted(channel.topic):
                     name = schema.name if schema else ""
                     yield Record(channel.topic, name, channel.message_encoding, message.log_time, message.data)
-        except _CUT:
-            return  # cut off here; everything before has been given
+        except OSError as error:
+            raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
+        if text := str(dropped):
+            warn(f"{path} is {text}.")
 
 
 def is_episode(topic: str) -> bool:

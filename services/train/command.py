@@ -24,7 +24,8 @@ from common.transport import urls
 from common.transport.ports import LEARNER_URL
 from common.transport.security import CERTIFICATE_FILE, check_exposure
 from learner.algorithms import make_algorithm
-from learner.run_directory import CONFIG_FILE, LOGS, POLICY_FILE, continue_run, create_run
+from learner.checkpoint import Checkpoints
+from learner.run_directory import CHECKPOINTS, CONFIG_FILE, LOGS, POLICY_FILE, continue_run, create_run, has_checkpoints
 from services.evaluate.evaluator import Evaluator
 from services.evaluate.scores import Row
 from services.evaluate.showcase import showcase
@@ -161,8 +162,9 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
     """Makes the run's directory, or takes up the one that is there."""
     if resume:
         continue_run(run_dir, config)
-        if not (run_dir / "checkpoints" / "latest").exists():
+        if not has_checkpoints(run_dir):
             raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start it anew in another --run-dir.")
+        Checkpoints(run_dir / CHECKPOINTS).find(lambda level, text: console.print(text, markup=False, soft_wrap=True))
         return
     if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / CONFIG_FILE).exists():
         raise CongraspError(f"{run_dir} is not empty and is no run.", "Choose another --run-dir.")

@@ -108,10 +108,11 @@ def test_a_journal_says_how_many_lines_a_full_disk_cost_it(disk):
     filler.unlink()
     journal.write(line=400)
     journal.write(line=401)
-    entries = list(read_journal(disk / AUDIT / "x.jsonl"))
-    *before, after, last = entries
+    journal_lines = read_journal(disk / AUDIT / "x.jsonl")
+    *before, after, last = journal_lines.intact
     assert [entry["line"] for entry in before] == [*range(len(before))]
-    assert (after, last) == ({"line": 400, "lost": 400 - len(before)}, {"line": 401})
+    assert (after, last) == ({"line": 400}, {"line": 401})
+    assert (journal_lines.lost, journal_lines.damaged) == (400 - len(before), 0)
 
 
 @pytest.mark.timeout(120)

@@ -3,11 +3,14 @@ import pathlib
 import resource
 import subprocess
 import sys
+import tempfile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from common.errors import CongraspError
 from learner.algorithms.ppo import PPO
@@ -129,3 +132,53 @@ def test_no_checkpoint_a_damaged_one_and_one_of_another_shape(tmp_path):
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(CongraspError, match="damaged"):
         checkpoints.load(tree(0.0))
+
+
+def lines_of(checkpoints: Checkpoints) -> tuple[float, list[str]]:
+    """The value in the checkpoint that is found, and what was said."""
+    said: list[str] = []
+    loaded, _ = checkpoints.load(tree(0.0), lambda level, text: said.append(text))
+    assert not any("\n" in text for text in said)
+    return loaded["host"][0], said
+
+
+@pytest.mark.parametrize("link", ["missing", "dangling", "of an older one"])
+def test_the_newest_checkpoint_is_found_whatever_the_link_says(tmp_path, link):
+    checkpoints = Checkpoints(tmp_path)
+    for version in (8, 9, 10):
+        checkpoints.save(tree(version), {}, version)
+    (tmp_path / "latest").unlink()
+    if link != "missing":
+        name = "nothing" if link == "dangling" else "checkpoint_000000008.safetensors"
+        (tmp_path / "latest").symlink_to(name)
+    value, said = lines_of(checkpoints)
+    assert value == 10.0 and said == [f"Resuming from the checkpoint {tmp_path}/checkpoint_000000010.safetensors."]
+
+
+def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    paths = [checkpoints.save(tree(version), {}, version) for version in (1, 2, 3)]
+    paths[2].write_bytes(paths[2].read_bytes()[:-3])
+    paths[1].write_bytes(b"")
+    value, said = lines_of(checkpoints)
+    assert value == 1.0 and len(said) == 3
+    assert "000000003.safetensors is damaged: The message" in said[0] and "000000002.safetensors is damaged" in said[1]
+    checkpoints.save(tree(7.0), {}, 3)  # training comes to update 3 again
+    assert len((tmp_path / "checkpoint_000000003.safetensors.aside").read_bytes()) > 0
+    assert lines_of(checkpoints)[0] == 7.0
+
+
+@settings(max_examples=150, deadline=None)
+@given(bit=st.integers(0, 8 * 900 - 1))
+def test_no_flipped_bit_goes_unnoticed(bit):
+    with tempfile.TemporaryDirectory() as name:
+        checkpoints = Checkpoints(pathlib.Path(name))
+        checkpoints.save(tree(1.0), {"skipped": 0}, 1)
+        path = checkpoints.save(tree(2.0), {"skipped": 0}, 2)
+        data = bytearray(path.read_bytes())
+        data[bit // 8 % len(data)] ^= 1 << bit % 8
+        path.write_bytes(data)
+        loaded, meta = checkpoints.load(tree(0.0))
+        # The older one, or the newer one with the same content: a bit of white space may differ.
+        assert meta == {"skipped": 0} and loaded["host"][0] in (1.0, 2.0)
+        jax.tree.map(np.testing.assert_array_equal, loaded, tree(loaded["host"][0]))

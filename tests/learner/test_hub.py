@@ -398,6 +398,24 @@ def test_deduplication_stays_small_whatever_is_missing():
     assert known.missing == 10_000
 
 
+def test_nothing_is_accepted_after_the_end_was_noted(bench):
+    """The transport still answers then: what it accepted would be in no journal, and lost."""
+    b = bench(batch=2)
+    b.hub.publish_weights(bundle(0), 0)
+    assert b.send(0, version=0)["outcome"] == "accepted"
+    b.hub.close()
+    assert [b.send(sequence, version=0)["outcome"] for sequence in (0, 1)] == ["retry", "retry"]
+    assert b.ledger()["accepted"] == 1
+
+
+def test_made_up_sequence_numbers_do_not_blow_up_what_is_missing():
+    known = Sequences()
+    for number in range(1, 71):
+        known.add(_header(number * 10**12), True)
+    assert known.missing <= 70 * 2**16
+    assert all(number * 10**12 in known for number in range(1, 71))
+
+
 def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
     b = bench(batch=2)
     b.hub.publish_weights(bundle(5), 5)

@@ -168,6 +168,36 @@ def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path):
 
 
 @pytest.mark.timeout(120)
+def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(tmp_path, hub):
+    """The newest checkpoint is damaged, the link gone and the version zeroed: it goes on from the one before."""
+    create_run(tmp_path, CONFIG)
+    actor = MadeUpActor(MemoryTransport(hub))
+    stop = threading.Event()
+    forever = dataclasses.replace(CONFIG, updates=10**6)
+    learn(tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 5 and stop.set())
+    kept = tmp_path / "checkpoints"
+    (kept / "latest").unlink()
+    (kept / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
+    (tmp_path / "version").write_bytes(bytes(21))
+    policy = (tmp_path / "policy.safetensors").read_bytes()
+    with pytest.raises(CongraspError, match=r"holds checkpoints of a run\. Go on with --resume"):
+        learn(tmp_path, hub)
+    seen, said = [], []
+    learn(
+        tmp_path, hub, dataclasses.replace(CONFIG, updates=7), resume=True,
+        on_update=lambda values: seen.append((values["update"], values["version"])),
+        on_event=lambda level, text: said.append(text),
+    )  # fmt: skip
+    actor.stop.set()
+    actor.join(10.0)
+    assert seen == [(5, 7), (6, 8), (7, 9)]  # versions up to 5 are out, and 6 is what the resume begins with
+    assert f"Resuming from the checkpoint {kept}/checkpoint_000000004.safetensors." in said
+    assert any("000000005.safetensors is damaged" in text for text in said)
+    assert (kept / "checkpoint_000000005.safetensors.aside").read_bytes() == damaged
+    assert (tmp_path / "policy.safetensors.aside").read_bytes() == policy
+
+
+@pytest.mark.timeout(120)
 def test_values_that_are_not_finite_stop_the_run_and_are_kept(tmp_path, hub):
     create_run(tmp_path, CONFIG)
     actor = MadeUpActor(MemoryTransport(hub), reward=1e38)

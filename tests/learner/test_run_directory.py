@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 
 from common.errors import CongraspError
-from learner.run_directory import continue_run, create_run, open_run
+from learner.audit import AuditLog
+from learner.run_directory import continue_run, create_run, has_checkpoints, note_version, open_run, published_version
 from services.cli.train import defaults
 from services.train.presets import get_preset
 
@@ -38,3 +39,45 @@ def test_a_command_line_that_resumes_starts_from_the_runs_own_configuration(run)
     assert defaults([f"--run-dir={folder}", "--or-resume", "--preset", "human"])["config"] == config
     assert defaults(["--run-dir", str(folder), "--preset=human"]) == {"preset": "human", "config": get_preset("human")}
     assert defaults(["--or-resume", "--run-dir", str(folder / "none")])["config"] == get_preset("quickstart")
+
+
+@pytest.mark.parametrize("text", [b"\x89MCAP\xff\xfe", b"[1, 2]", b"7", b'{"name": "x", "ppo": 3}', b"[" * 9000, b""])
+def test_a_configuration_that_is_none_is_one_line_that_names_the_file(run, text):
+    folder, _ = run
+    (folder / "config.json").write_bytes(text)
+    with pytest.raises(CongraspError, match=r"run/config\.json ") as caught:
+        open_run(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_left_of_a_run_is_not_begun_anew(run):
+    folder, config = run
+    assert not has_checkpoints(folder)
+    (folder / "policy.safetensors").write_bytes(b"a policy")
+    with pytest.raises(CongraspError, match=r"no checkpoint to resume from, .*policy\..* another .* with --initial"):
+        has_checkpoints(folder)
+    (folder / "policy.safetensors").unlink()
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "latest").symlink_to("gone")
+    with pytest.raises(CongraspError, match=r"there is latest\. Start anew in another --run-dir\."):
+        has_checkpoints(folder)
+    (folder / "checkpoints" / "checkpoint_000000004.safetensors").touch()
+    assert has_checkpoints(folder)
+    (folder / "config.json").unlink()
+    with pytest.raises(CongraspError, match=r"holds checkpoint_000000004.* no config\.json"):
+        create_run(folder, config)
+
+
+@pytest.mark.parametrize("damage", [b"", bytes(21), b"\xff\xfe", b"0" * 20 + b"\n", b"9" * 20 + b"\n", b"-5"])
+def test_versions_go_on_from_the_journals_where_the_version_file_is_damaged(run, damage):
+    folder, _ = run
+    assert published_version(folder) == -1
+    note_version(folder, 22)
+    assert published_version(folder) == 22
+    (folder / "version").write_bytes(damage)
+    assert published_version(folder) == (0 if damage == b"0" * 20 + b"\n" else -1)
+    log = AuditLog(folder, "0")
+    log.begin("session", "run", 3, 1)
+    assert published_version(folder) == 3
+    log.used(21, [], [])
+    assert published_version(folder) == 22

@@ -1,6 +1,13 @@
 """The audit finds what it is there to find: journals of a run in which something went wrong, by hand."""
 
+import json
+import pathlib
+import shutil
+import tempfile
+
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from common.errors import CongraspError
 from common.journal import AUDIT, Journal
@@ -84,3 +91,126 @@ def test_journals_that_are_missing_are_named(tmp_path, run_dir):
     with pytest.raises(CongraspError, match="no journal of an actor"):
         audit(tmp_path / "other")
     assert audit(tmp_path / "other", [run_dir / AUDIT / "a.jsonl"]).counts["accepted"] == 6
+
+
+def test_empty_and_malformed_journals_are_damage_and_no_traceback(run_dir, capsys):
+    path = run_dir / AUDIT / "learner-0.jsonl"
+    for content in (
+        b"",
+        b"\n\n",
+        b"\x00" * 70,
+        b"[1]\n7\nnull\n",
+        b"\xff\xfe\n",
+        b"[" * 9000 + b"\n",
+        b"9" * 5000 + b"\n",
+    ):
+        path.write_bytes(content)
+        assert faults(run_dir) == {"not in the journals": 6}
+        assert command(run_dir) in (0, 6)
+    odd = ({"life": "x"}, {"used": 7, "version": 0}, {"used": [[1]], "version": 0}, {"end": [["a", "1", 10**30]]})
+    path.write_text("".join(f"{json.dumps(line)}\n" for line in odd))
+    (run_dir / AUDIT / "b.jsonl").write_text('{"actor": 5}\n{"made": [1]}\n{"answer": 0}\n')
+    assert (faults(run_dir), audit(run_dir).damaged) == ({"not in the journals": 6}, 7)
+    assert command(run_dir) == 6 and "damaged lines" in capsys.readouterr().out
+
+
+def test_loss_surplus_and_damage_have_exit_codes_of_their_own(run_dir, tmp_path):
+    forged = {"version": 4, "used": [["a", "1", 77, 0, "c"]]}
+    for number, (lines, code) in enumerate(
+        [([], 1), ([used(4), forged], 5), ([used(4, checksum="c9")], 6), ([used(4)], 0)]
+    ):
+        other = tmp_path / str(number)
+        shutil.copytree(run_dir / AUDIT, other / AUDIT)
+        learner(other, life(), used(0, 1), used(2, 3), *lines, {"end": [["a", "1", 5]]})
+        assert command(other) == code
+
+
+def test_what_a_torn_line_told_is_no_surplus(run_dir):
+    """The disk was full for two lines of an actor's journal, and took a part of the first: it is among the two."""
+    learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
+    path = run_dir / AUDIT / "a.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines[:5], lines[5][:20]]))
+    journal = Journal(path)
+    journal._lost = 2
+    journal.write(answer=1, outcome="accepted", life="x", actor="a", incarnation="1")
+    report = audit(run_dir)
+    assert (report.holes, report.damaged, report.faults) == (2, 0, [])
+    assert report.counts["used, not in the journals"] == 4
+
+
+def test_journals_of_older_versions_are_read_and_reported_as_unchecked(run_dir, capsys):
+    learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
+    for path in (run_dir / AUDIT).iterdir():
+        lines = [json.loads(line) for line in path.read_text().split("\n") if line]
+        assert all(line.pop("crc32") for line in lines)
+        path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    report = audit(run_dir)
+    assert (report.counts["used"], report.unchecked, report.damaged, report.exit_code) == (6, 18, 0, 0)
+    command(run_dir)
+    assert any("without a checksum" in line and "18" in line for line in capsys.readouterr().out.split("\n"))
+    Journal(run_dir / AUDIT / "a.jsonl").write(actor="a", incarnation="2")
+    with (run_dir / AUDIT / "a.jsonl").open("a") as file:
+        file.write(json.dumps({"made": 6, "version": 1, "checksum": "c"}) + "\n")  # from here on, all have one
+    assert (audit(run_dir).unchecked, audit(run_dir).damaged, audit(run_dir).counts["made"]) == (18, 1, 6)
+
+
+def whole_run(folder):
+    """Two incarnations of an actor, two sessions of the learner with a resume between them, and no fault."""
+    actor = Journal(folder / AUDIT / "a.jsonl")
+    for incarnation in "12":
+        who = {"actor": "a", "incarnation": incarnation}
+        actor.write(**who)
+        for sequence, checksum in enumerate(CONTENT[:4]):
+            actor.write(**who, made=sequence, version=sequence, checksum=checksum)
+            actor.write(**who, answer=sequence, outcome="accepted", life="x" if incarnation == "1" else "y")
+            if incarnation == "1" and sequence >= 2:
+                actor.write(**who, answer=sequence, outcome="accepted", life="y")
+    learner(
+        folder, life(), used(0), used(1), used(2), used(3),
+        life("y", version=2), used(2, version=5), used(3, version=6),
+        {"dropped": [["a", "2", 0]]}, used(1, 2, version=7, incarnation="2"), {"end": [["a", "2", 3]]},
+    )  # fmt: skip
+
+
+garbage = st.one_of(st.binary(max_size=40), st.sampled_from([b"{}", b"null", b"[]", b'{"made": 1}', b'{"end": [[1]]}']))
+injuries = st.one_of(
+    st.tuples(st.just("cut"), st.floats(0, 1), st.none()),
+    st.tuples(st.just("flip"), st.floats(0, 1), st.integers(0, 7)),
+    st.tuples(st.just("line"), st.floats(0, 1), garbage),
+    st.tuples(st.just("zero"), st.floats(0, 1), st.integers(1, 600)),
+)
+
+
+def injure(data, injury):
+    """The bytes of a journal with one injury at a relative place."""
+    kind, place, what = injury
+    at = min(int(place * len(data)), len(data) - 1)
+    if kind == "cut":
+        return data[:at]
+    if kind == "flip":
+        return data[:at] + bytes([data[at] ^ 1 << what]) + data[at + 1 :]
+    if kind == "zero":
+        return data[:at] + bytes(min(what, len(data) - at)) + data[at + what :]
+    start = data.rfind(b"\n", 0, at) + 1
+    return data[:start] + what + b"\n" + data[start:]
+
+
+@settings(max_examples=400, deadline=None)
+@given(which=st.sampled_from(["a.jsonl", "learner-0.jsonl"]), wounds=st.lists(injuries, min_size=1, max_size=3))
+def test_damage_is_never_a_traceback_and_never_called_a_loss(which, wounds):
+    with tempfile.TemporaryDirectory() as name:
+        folder = pathlib.Path(name)
+        whole_run(folder)
+        assert (audit(folder).faults, audit(folder).damaged) == ([], 0)
+        path = folder / AUDIT / which
+        data = path.read_bytes()
+        for wound in wounds:
+            data = injure(data, wound) if data else data
+        path.write_bytes(data)
+        report = audit(folder)
+        assert not report.counts["lost"] and not report.counts["duplicated"] and not report.counts["corrupted"]
+        # Where a journal was cut between two lines, nothing shows that there were more.
+        assert not report.faults or any(kind == "cut" for kind, *_ in wounds)
+        if [kind for kind, *_ in wounds] == ["flip"]:
+            assert report.damaged + report.holes > 0

@@ -261,3 +261,75 @@ def test_a_file_that_is_being_written_can_be_read(tmp_path: pathlib.Path) -> Non
     writer.flush()
     assert updates(log_files(tmp_path)[0]) == [0, 1, 2, 3, 4]
     writer.close()
+
+
+def flushed_file(directory: pathlib.Path, chunks: int = 5) -> tuple[pathlib.Path, list[tuple[int, int]]]:
+    """A finished file with three messages in each chunk, and where its chunks are."""
+    writer = LogWriter(directory, "log")
+    for entries in (metric_entries(3, 3 * i) for i in range(chunks)):
+        writer.write(*entries)
+        writer.flush()
+    writer.close()
+    with writer.files[0].open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return writer.files[0], [(c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes]
+
+
+@pytest.mark.parametrize("damaged", [0, 2, 4])
+def test_after_a_damaged_chunk_reading_goes_on_and_says_what_was_dropped(tmp_path: pathlib.Path, damaged: int) -> None:
+    path, chunks = flushed_file(tmp_path)
+    data, (start, length) = bytearray(path.read_bytes()), chunks[damaged]
+    data[start + length - 5] ^= 4
+    path.write_bytes(data)
+    said: list[str] = []
+    records = list(read_records(path, warn=said.append))
+    read = [json.loads(record.data)["update"] for record in records]
+    assert read == [i for i in range(15) if i // 3 != damaged]
+    assert {(record.topic, record.schema) for record in records} == {("/metrics/learner/0", records[0].schema)}
+    places = f"damaged in 1 place(s), at byte {start}; at least 3 message(s) were dropped."
+    assert said == [f"{path} is {places}"]
+
+
+def test_what_was_dropped_is_warned_of_by_default(tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, ((start, length), *_) = flushed_file(tmp_path)
+    assert len(read_metrics(tmp_path)["learner/0/kl"][0]) == 15 and not caplog.messages
+    data = path.read_bytes()
+    path.write_bytes(data[: start + 9] + bytes(length) + data[start + 9 + length :])
+    assert len(read_metrics(tmp_path)["learner/0/kl"][0]) == 12
+    assert len(caplog.messages) == 1 and "damaged in 1 place(s)" in caplog.messages[0]
+
+
+@settings(max_examples=600, deadline=None)
+@given(place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+def test_one_flipped_bit_costs_one_chunk_at_most_and_never_without_a_word(
+    tmp_path_factory: pytest.TempPathFactory, place: float, bit: int
+) -> None:
+    folder = tmp_path_factory.mktemp("flip")
+    path, _ = flushed_file(folder)
+    data = bytearray(path.read_bytes())
+    at = 8 + int(place * (len(data) - 8))
+    data[at] ^= 1 << bit
+    path.write_bytes(data)
+    said: list[str] = []
+    read = [json.loads(record.data)["update"] for record in read_records(path, warn=said.append)]
+    missing = sorted(set(range(15)) - set(read))
+    assert read == sorted(set(read)) and len(missing) in (0, 3)
+    assert not missing or (missing[0] % 3 == 0 and missing[-1] - missing[0] == 2)
+    assert bool(missing) <= bool(said) and len(said) <= 1
+
+
+@settings(max_examples=200, deadline=None)
+@given(wounds=st.lists(st.tuples(st.floats(0, 1), st.binary(max_size=60), st.integers(0, 60)), min_size=1, max_size=4))
+def test_overwritten_and_inserted_bytes_end_in_a_line_at_most(
+    tmp_path_factory: pytest.TempPathFactory, wounds: list[tuple[float, bytes, int]]
+) -> None:
+    path, _ = flushed_file(tmp_path_factory.mktemp("wounds"))
+    data = path.read_bytes()
+    for place, content, replaced in wounds:
+        at = 8 + int(place * (len(data) - 8))
+        data = data[:at] + content + data[at + replaced :]
+    path.write_bytes(data)
+    said: list[str] = []
+    read = [json.loads(record.data)["update"] for record in read_records(path, warn=said.append)]
+    assert read == sorted(set(read)) and set(read) <= set(range(15)) and len(said) <= 1

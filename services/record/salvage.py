@@ -1,0 +1,189 @@
+"""Reads an MCAP file as far as it is intact: damaged chunks are left out and counted, those after them are read.
+
+The layout is that of https://mcap.dev/spec: records of an opcode (1 byte), a length (8) and content. A chunk's content
+has a CRC-32 of its uncompressed records. Where a record cannot be one, reading goes on at the next Zstandard chunk.
+"""
+
+import dataclasses
+import io
+import struct
+from collections.abc import Iterator
+from typing import BinaryIO
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+
+_DAMAGE = (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError)
+_FRAME = struct.Struct("<BQ")
+_ZSTD = b"\x04\x00\x00\x00zstd"
+_ZSTD_AT = _FRAME.size + 28  # in a chunk's record; before it are times, size and CRC, after it the data's length
+_HEAD = _ZSTD_AT + len(_ZSTD) + 8
+_LIMIT = 1 << 30
+_BLOCK = 1 << 20
+_PLACES = 5
+
+
+@dataclasses.dataclass
+class Dropped:
+    """What of a file could not be read."""
+
+    places: list[int] = dataclasses.field(default_factory=list)
+    """Bytes at which damage begins."""
+    messages: int = 0
+    """Messages that are known to have been there, from chunks' indexes, or that are of an unknown channel."""
+    cut: int = 0
+    """Bytes of an unfinished record at the end: the writer was killed, or is still writing."""
+
+    def __str__(self) -> str:
+        """One line; empty if there is nothing to say of a file but that its end is cut."""
+        if not self.places and not self.messages:
+            return ""
+        more = ", …" if len(self.places) > _PLACES else ""
+        where = ", ".join(map(str, self.places[:_PLACES])) + more
+        at = f", at byte {where}" if where else ""
+        return f"damaged in {len(self.places)} place(s){at}; at least {self.messages} message(s) were dropped"
+
+
+def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """Messages with their channels, in the order in which they were written.
+
+    Args:
+      file: an MCAP file that can be read at any place.
+      dropped: what could not be read is noted here, completely once the iterator is at its end.
+    """
+    size, position = file.seek(0, io.SEEK_END), len(MCAP0_MAGIC)
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    asked, lost_chunk = False, False
+    while position < size:
+        opcode, records, end = _record_at(file, position, size)
+        if records is None:
+            found = end if end is not None else _next_chunk(file, position + 1, size)
+            if found is None and _is_cut(file, position, size):
+                dropped.cut = size - position
+                return
+            dropped.places.append(position)
+            position, lost_chunk = size if found is None else found, end is not None
+            continue
+        if opcode == Opcode.MESSAGE_INDEX:
+            assert end is not None
+            dropped.messages += lost_chunk * ((end - position - _FRAME.size - 6) // 16)
+        else:
+            lost_chunk = False
+        for record in records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                if record.channel_id not in channels and not asked:  # it was in a chunk that is damaged
+                    asked = True
+                    _add_from_summary(file, schemas, channels)
+                if record.channel_id not in channels:
+                    dropped.messages += 1
+                    continue
+                channel = channels[record.channel_id]
+                yield schemas.get(channel.schema_id), channel, record
+        assert end is not None
+        position = end
+
+
+def _record_at(file: BinaryIO, position: int, size: int) -> tuple[int, list[McapRecord] | None, int | None]:
+    """A record's opcode, the records that it holds (None if it is damaged), and its end (None if that is unknown)."""
+    head = _read(file, position, _HEAD)
+    if head == MCAP0_MAGIC and position + len(head) == size:
+        return 0, [], size
+    if len(head) < _FRAME.size:
+        return 0, None, None
+    opcode, length = _FRAME.unpack_from(head)
+    end = position + _FRAME.size + length
+    if head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD and opcode != Opcode.CHUNK_INDEX:
+        # Opcode and length, which no checksum covers, are not needed where the rest fits.
+        inner = position + _HEAD + int.from_bytes(head[-8:], "little")
+        for each in (inner, end):
+            if each <= min(size, position + _LIMIT) and (records := _chunk(_read(file, position, each - position))):
+                return Opcode.CHUNK, records, each
+        return Opcode.CHUNK, None, end if inner == end <= size else None
+    if not Opcode.HEADER <= opcode <= Opcode.DATA_END or end > min(size, position + _LIMIT):
+        return opcode, None, None
+    whole = _read(file, position, end - position)
+    if opcode == Opcode.CHUNK:
+        return opcode, _chunk(whole), end
+    if opcode == Opcode.MESSAGE_INDEX and int.from_bytes(whole[11:15], "little") != length - 6:
+        return opcode, None, None
+    if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+        hidden = _next_chunk(file, position + 1, end)  # by a length that is too large
+        return opcode, [], end if hidden is None else hidden
+    return opcode, _parse(opcode, whole[_FRAME.size :]), end
+
+
+def _chunk(whole: bytes) -> list[McapRecord] | None:
+    """The records of a chunk's record; None if it is damaged."""
+    try:
+        chunk = Chunk.read(ReadDataStream(io.BytesIO(whole[_FRAME.size :])))
+        compressed = chunk.compression == "zstd"
+        if compressed and max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data)) > _LIMIT:
+            return None
+        return breakup_chunk(chunk, validate_crc=True)
+    except _DAMAGE:
+        return None
+
+
+def _parse(opcode: int, content: bytes) -> list[McapRecord] | None:
+    """A record that is in no chunk; None if it is damaged."""
+    stream = ReadDataStream(io.BytesIO(content))
+    try:
+        if opcode == Opcode.MESSAGE:
+            return [Message.read(stream, len(content))]
+        return [Schema.read(stream) if opcode == Opcode.SCHEMA else Channel.read(stream)]
+    except _DAMAGE:
+        return None
+
+
+def _next_chunk(file: BinaryIO, start: int, end: int) -> int | None:
+    """Where the next Zstandard chunk begins whose two lengths agree; None if there is none before `end`."""
+    first = start
+    while start < end:
+        block = _read(file, start, min(_BLOCK, end - start))
+        at = block.find(_ZSTD)
+        while at >= 0:
+            begin = start + at - _ZSTD_AT
+            if begin >= first and len(head := _read(file, begin, _HEAD)) == _HEAD:
+                length = _FRAME.unpack_from(head)[1]
+                if length == _HEAD - _FRAME.size + int.from_bytes(head[-8:], "little"):
+                    return begin
+            at = block.find(_ZSTD, at + 1)
+        start += max(1, len(block) - len(_ZSTD) + 1)
+    return None
+
+
+def _is_cut(file: BinaryIO, position: int, size: int) -> bool:
+    """Whether a record begins here that would end beyond the file's end."""
+    head = _read(file, position, _FRAME.size)
+    if len(head) < _FRAME.size:
+        return True
+    opcode, length = _FRAME.unpack(head)
+    return bool(Opcode.HEADER <= opcode <= Opcode.DATA_END) and position + _FRAME.size + length > size
+
+
+def _add_from_summary(file: BinaryIO, schemas: dict[int, Schema], channels: dict[int, Channel]) -> None:
+    """Adds the schemas and channels that a finished file repeats at its end."""
+    try:
+        file.seek(0)
+        summary = make_reader(file).get_summary()
+    except _DAMAGE:
+        return
+    if summary is not None:
+        schemas.update({**summary.schemas, **schemas})
+        channels.update({**summary.channels, **channels})
+
+
+def _read(file: BinaryIO, position: int, count: int) -> bytes:
+    file.seek(position)
+    return file.read(count)
