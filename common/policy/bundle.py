@@ -31,6 +31,7 @@ from common.task.types import Array
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 FORMAT = 1
+_MALFORMED = (LookupError, AttributeError, TypeError, ValueError, OverflowError)
 _REMEDY = "Use a bundle made by 'congrasp train' of this version."
 
 
@@ -152,7 +153,7 @@ class PolicyBundle:
             for fault in (*network_faults(spec.network, spec.layout, spec.action_size), *task_faults(task)):
                 raise ValueError(fault)
             shapes = _shapes(spec)
-        except (LookupError, TypeError, ValueError, OverflowError, CongraspError, dacite.DaciteError) as error:
+        except (*_MALFORMED, CongraspError, dacite.DaciteError) as error:
             why = str(error).rstrip(".")[:200]
             raise CongraspError(f"The policy {source} has bad meta data: {why}.", _REMEDY) from None
         if meta.get("schema") != spec.schema:

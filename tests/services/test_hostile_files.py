@@ -258,3 +258,71 @@ def test_a_file_with_noise_in_it_is_read_or_refused(tmp_path, kind):
 
     LOADERS[kind](path)
     assert limited(mutated, seconds=40) == "None"
+
+
+ODD = (
+    None,
+    True,
+    -1,
+    0,
+    10**30,
+    -1e300,
+    1e9,
+    "",
+    "../../x",
+    "\ud800",
+    [],
+    [[]],
+    {},
+    {"a": 1},
+    [None],
+    ["x"] * 3,
+    [1e9] * 3,
+)
+
+
+def _leaves(tree, at=()):
+    yield at
+    for key, item in tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ():
+        yield from _leaves(item, (*at, key))
+
+
+def _replaced(tree, at, value):
+    if not at:
+        return value
+    changed = dict(tree) if isinstance(tree, dict) else list(tree)
+    changed[at[0]] = _replaced(changed[at[0]], at[1:], value)
+    return changed
+
+
+@pytest.mark.parametrize("kind", LOADERS)
+def test_a_file_with_an_odd_fact_in_it_is_read_or_refused(tmp_path, kind):
+    _files(tmp_path)
+    path = tmp_path / kind
+    if kind == "hand":
+        facts = json.loads(path.read_text())
+    elif kind == "motion":
+        with np.load(path) as file:
+            arrays = dict(file)
+        facts = json.loads(str(arrays["meta"]))
+    else:
+        message = decode(path.read_bytes())
+        facts = json.loads(json.dumps(message.meta))
+
+    @settings(max_examples=100, deadline=3000, database=None)
+    @given(st.sampled_from(list(_leaves(facts))[1:]), st.sampled_from(ODD))
+    def mutated(at, value):
+        changed = _replaced(facts, at, value)
+        if kind == "hand":
+            path.write_text(json.dumps(changed))
+        elif kind == "motion":
+            np.savez(path, **{**arrays, "meta": np.array(json.dumps(changed))})
+            path.with_name("motion.npz").replace(path)
+        else:
+            path.write_bytes(encode(Message(message.arrays, changed)))
+        try:
+            LOADERS[kind](path)
+        except CongraspError as error:
+            assert "\n" not in str(error)
+
+    assert limited(mutated, seconds=40) == "None"

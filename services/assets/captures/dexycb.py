@@ -15,11 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands.mano import VARIABLE, ManoModel
+from common.inputs import file_name, read_file
 from services.assets.captures import mano
 from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
 from services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
 
+_LARGEST_YAML = 64 << 10
 HOLDS = "<date>-subject-01/<session>/meta.yml"
 OBJECTS = (
     *("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle"),
@@ -89,8 +91,11 @@ def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
     if not path.is_file():
         raise Dropped(name, "wrong layout", f"there is no {path.name} in {path.parent}")
     try:
-        content = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
+        text = read_file(path, _LARGEST_YAML)
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise ValueError("it repeats its values")
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise Dropped(name, "unreadable", " ".join(str(error).split())) from None
     if not isinstance(content, dict):
         raise Dropped(name, "wrong layout", f"{path} holds no settings")
@@ -106,7 +111,7 @@ def _value(name: str, meta: dict[str, Any], key: str) -> Any:
 
 def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
     """(10,) shape parameters of a calibration."""
-    content = _yaml(name, root / "calibration" / f"mano_{calibration}" / "mano.yml")
+    content = _yaml(name, root / "calibration" / file_name(f"mano_{calibration}", "a calibration") / "mano.yml")
     betas = np.array(content.get("betas", []), float)
     if betas.shape != (10,):
         raise Dropped(name, "wrong layout", f"mano.yml of {calibration} has {betas.size} 'betas', not 10")

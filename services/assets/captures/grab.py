@@ -105,7 +105,8 @@ def _template(root: pathlib.Path, data: dict[str, Any]) -> pathlib.Path | None:
     """The mesh of the subject's right hand, where it is there."""
     text = data["rhand"].get("vtemp")
     path = root / str(text) if text is not None else None
-    return path if path is not None and path.is_file() else None
+    inside = path is not None and path.resolve().is_relative_to(root.resolve())
+    return path if path is not None and inside and path.is_file() else None
 
 
 @functools.lru_cache(maxsize=32)

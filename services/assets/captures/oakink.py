@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands.mano import ManoModel
+from common.inputs import file_name, read_file
 from common.pickles import read_pickle
 from services.assets.captures import mano
 from services.assets.captures.objects import Meshes
@@ -26,6 +27,7 @@ from services.assets.captures.sequence import Dropped, Part, Sequence, read_or_d
 from services.assets.objects.sources import read_mesh
 
 HOLDS = "anno/seq_all.json"
+_LARGEST_JSON = 256 << 20
 _Frames = list[tuple[int, str]]
 
 
@@ -41,7 +43,7 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
         raise CongraspError(f"There is no {index}.", "Name the folder that holds OakInk-Image's 'anno'.")
     found = meshes.beside(root / "obj", path / "obj")
     names = _names(path)
-    for (name, _), frames in sorted(_sequences(json.loads(index.read_text())).items()):
+    for (name, _), frames in sorted(_sequences(_json(index)).items()):
         folder = root / "anno" / "general_info"
         yield read_or_drop(name, _sequence, name, frames, folder, found, model, names, path)
 
@@ -55,11 +57,19 @@ def _sequences(rows: list[list[Any]]) -> dict[tuple[str, int], _Frames]:
     return {key: sorted(of_camera[min(of_camera)]) for key, of_camera in cameras.items()}
 
 
+def _json(path: pathlib.Path) -> Any:
+    """What a JSON file says."""
+    try:
+        return json.loads(read_file(path, _LARGEST_JSON))
+    except (ValueError, RecursionError):
+        raise CongraspError(f"{path} is not JSON.", "Get the file again.") from None
+
+
 def _names(path: pathlib.Path) -> dict[str, str]:
     """Objects' names by their ids."""
     names: dict[str, str] = {}
     for file in sorted(path.glob("**/metaV2/*object_id.json")):
-        names |= {key: str(value.get("name", key)) for key, value in json.loads(file.read_text()).items()}
+        names |= {key: str(value.get("name", key)) for key, value in _json(file).items()}
     return names
 
 
@@ -76,7 +86,7 @@ def _sequence(
     object_id = name.split("_")[0]
     object_name = names.get(object_id, object_id)
     mesh = meshes.find(name, object_id if meshes.has(object_id) else object_name)
-    rows = [_frame(name, folder / f"{stem}.pkl") for _, stem in frames]
+    rows = [_frame(name, folder / f"{file_name(stem, 'a frame')}.pkl") for _, stem in frames]
     known = next((row for row in rows if row is not None), None)
     if known is None:
         raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
@@ -145,6 +155,6 @@ def _parts(root: pathlib.Path, *names: str) -> tuple[Part, ...]:
     parts = []
     for file in sorted(folder.glob("part_*.ply")):
         labels = file.with_suffix(".json")
-        label = json.loads(labels.read_text()).get("name", file.stem) if labels.is_file() else file.stem
+        label = _json(labels).get("name", file.stem) if labels.is_file() else file.stem
         parts.append(Part(str(label), mano.read_vertices(file)))
     return tuple(parts) if len(parts) > 1 else ()

@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 
 from common.errors import CongraspError
+from common.inputs import file_name
 from common.objects.spec import GraspObject
 from services.assets.captures.sequence import Dropped
 from services.assets.objects.meshes import import_source
@@ -44,6 +45,7 @@ class Meshes:
 
     def _look(self, name: str, inside: str) -> pathlib.Path | None:
         """The first mesh of a name."""
+        file_name(name, "the mesh of an object")
         for folder in self.folders:
             for suffix in SUFFIXES:
                 if (file := folder / f"{name}{suffix}").is_file():

@@ -1,0 +1,34 @@
+"""Names in the files of data sets lead nowhere else."""
+
+import pathlib
+
+import pytest
+
+from common.errors import CongraspError
+from services.assets.captures.dexycb import _betas, _yaml
+from services.assets.captures.grab import _template
+from services.assets.captures.objects import Meshes
+from services.assets.captures.sequence import Dropped
+
+
+def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folders(tmp_path):
+    (tmp_path / "x.obj").write_text("v 0 0 0\n")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "y.obj").write_text("v 0 0 0\n")
+    meshes = Meshes((tmp_path / "in",))
+    assert meshes.has("y")
+    for name in ("../x", str(tmp_path / "x"), ".."):
+        with pytest.raises(CongraspError, match="cannot name the mesh"):
+            meshes.find("a", name)
+    with pytest.raises(CongraspError, match="cannot name a calibration"):
+        _betas("a", tmp_path / "in", "/../../x")
+    inside, outside = ({"rhand": {"vtemp": name}} for name in ("y.obj", "../x.obj"))
+    assert _template(tmp_path / "in", inside) == pathlib.Path(tmp_path / "in" / "y.obj")
+    assert _template(tmp_path / "in", outside) is None
+
+
+@pytest.mark.parametrize("text", ["[" * 50_000, "a: " * 5, "\x00", "- a", "a: &x [1]\nb: [*x, *x]"])
+def test_settings_that_are_none_are_dropped(tmp_path, text):
+    (tmp_path / "meta.yml").write_text(text)
+    with pytest.raises(Dropped):
+        _yaml("a", tmp_path / "meta.yml")
