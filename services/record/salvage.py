@@ -60,9 +60,12 @@ def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | N
     size, position = file.seek(0, io.SEEK_END), len(MCAP0_MAGIC)
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    asked, lost_chunk = False, False
+    asked, lost_chunk, chunked = False, False, False
     while position < size:
         opcode, records, end = _record_at(file, position, size)
+        chunked |= opcode == Opcode.CHUNK
+        if opcode == Opcode.MESSAGE and chunked:  # no checksum covers it: another record whose opcode is damaged
+            records = None
         if records is None:
             found = end if end is not None else _next_chunk(file, position + 1, size)
             if found is None and _is_cut(file, position, size):
