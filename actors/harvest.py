@@ -1,7 +1,7 @@
 """Reference poses and trajectories from the policy's own grasps (paper, section Hand Morphology).
 
-Successful episodes under a heading alone leave their final states behind; now and then these replace poses of the task
-set, so that what later episodes ask for is what this hand can do.
+Successful episodes under a heading alone leave their final states behind; now and then these replace poses of the
+constraint bank, so that what later episodes ask for is what this hand can do.
 """
 
 import functools

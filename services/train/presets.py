@@ -33,8 +33,7 @@ PRESETS = {
         network=NetworkConfig(hidden=(256, 128)),
         ppo=PPOConfig(minibatches=8),
     ),
-    # The full task of the paper for the human hand, sized for a GPU. Only primitive objects: any number of them costs
-    # no more than one, whereas every mesh of a pool is in the model of every world.
+    # The full task of the paper for the human hand, sized for a GPU. Only primitive objects, as it was tuned with.
     "human": RunConfig(
         name="human",
         environments=4096,
