@@ -32,6 +32,8 @@ from common.task.types import Array
 
 HEADINGS = 256
 POSES = 20
+_CLOSED_TOGETHER = 16
+"""Objects around which hands close at once, so that an accelerator has enough to do."""
 _CLEARANCE = 0.02
 """Metres over the table that every waypoint of a trajectory keeps."""
 _STEEPEST_UP = 0.1
@@ -136,7 +138,7 @@ def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Pose
         flat = closed_poses(hand, points, normals, *(field.reshape(-1, 3) for field in headings))
         return Poses(*(field.reshape(2, POSES, -1) for field in flat))
 
-    return jax.lax.map(of_object, (points, normals, *headings))
+    return jax.lax.map(of_object, (points, normals, *headings), batch_size=min(_CLOSED_TOGETHER, len(points)))
 
 
 def headings_of(

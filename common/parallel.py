@@ -1,15 +1,19 @@
 """Work that is divided among processes when there is enough of it to pay for starting them."""
 
 import multiprocessing
+import multiprocessing.context
 import os
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import forkserver
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
 _WORTH_IT = 64  # calls; below, starting processes takes longer than it saves
 _MOST_WORKERS = 16
+_PRELOADED = ["common.objects.procedural", "common.task.constraints"]
+"""Imported once by the process that workers are forked from; what else a function needs, its worker imports."""
 
 
 def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> list[Result]:
@@ -20,13 +24,32 @@ def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> li
       columns: arguments, as `map` takes them.
     """
     rows = list(zip(*columns, strict=True))
-    workers = min(len(os.sched_getaffinity(0)), _MOST_WORKERS, len(rows) // (_WORTH_IT // 4))
-    if len(rows) < _WORTH_IT or workers < 2:
+    workers = _workers(len(rows))
+    if not workers:
         return [function(*row) for row in rows]
-    # Forking a process that has started JAX can lock up; spawned ones start afresh.
-    context = multiprocessing.get_context("spawn")
+    context = _context()
     with ProcessPoolExecutor(workers, context, initializer=_prepare_worker) as pool:
         return list(pool.map(function, *zip(*rows, strict=True), chunksize=4))
+
+
+def prepare_workers(calls: int) -> None:
+    """Starts the process that workers are forked from, if so many calls will need any: its imports take seconds."""
+    if _workers(calls):
+        _context()
+        forkserver.ensure_running()
+
+
+def _workers(calls: int) -> int:
+    """Processes for so many calls; 0 where they would cost more than they save."""
+    workers = min(len(os.sched_getaffinity(0)), _MOST_WORKERS, calls // (_WORTH_IT // 4))
+    return workers if calls >= _WORTH_IT and workers > 1 else 0
+
+
+def _context() -> multiprocessing.context.ForkServerContext:
+    """Where workers come from: forking this process could lock up, because it may have started JAX."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(_PRELOADED)
+    return context
 
 
 def _prepare_worker() -> None:

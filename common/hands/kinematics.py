@@ -15,8 +15,6 @@ from common import rotations
 from common.hands.spec import Hand, link_origin
 from common.task.types import Array
 
-_EXACT = jax.lax.Precision.HIGHEST
-
 
 class _Chain(NamedTuple):
     """Joints grouped by depth: `levels[d]` holds joint indices whose parents (-1: the palm) are one level up."""
@@ -80,7 +78,7 @@ def link_transforms(hand: Hand, q: Array) -> tuple[Array, Array]:
         above = np.array([place[chain.parents[j]] for j in level])
         parent_r, parent_t = done_r[..., above, :, :], done_t[..., above, :]
         here = np.array(level)
-        r = jnp.matmul(parent_r, local[..., here, :, :], precision=_EXACT)
+        r = rotations.apply(local[..., here, :, :].mT, parent_r)
         t = parent_t + rotations.apply(parent_r, offset[..., here, None, :])[..., 0, :]
         place.update({j: done_t.shape[-2] + k for k, j in enumerate(level)})
         done_r = jnp.concatenate([done_r, r], -3)

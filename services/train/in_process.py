@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from actors.process import run_actor
 from common.config import MetricWriter, RunConfig
 from common.engines import PhysicsName
+from common.parallel import prepare_workers
 from common.transport import urls
 from common.transport.base import Transport
 from common.transport.pair import PairTransport
@@ -52,6 +53,7 @@ def train_in_process(
       writers: which metric writers get its metrics.
       metrics_port: port of a Prometheus endpoint on the loopback interface; 0 for none.
     """
+    prepare_workers(config.objects.count)
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, max_staleness=0))
     rank, url = 0 if ranks is None else ranks.rank, f"memory/{run_dir}"
     with urls.listen(url, "learner") as memory:
