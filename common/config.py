@@ -91,7 +91,8 @@ class TaskConfig(_Shares):
     end_when_fallen: bool = True
     """Holds longer than `hold_steps` end as soon as the object has fallen."""
     dynamic_center: bool = True
-    """Hand centre from the live fingertips; false is the paper's ablation with a centre fixed in the wrist frame."""
+    """Hand centre from the live fingertips; false is the paper's ablation: from the fingertips at the episode's start,
+    fixed in the wrist frame."""
     hand_table_collision: bool = False
     """Whether the hand collides with the table."""
     hand_self_collision: bool = False
@@ -109,6 +110,9 @@ class TaskConfig(_Shares):
     own_references: bool = True
     """Reference poses and trajectories are remade from the policy's own grasps as it learns; otherwise they stay those
     that closing the hand around the objects gave."""
+    aligned_references: bool = False
+    """An episode with a reference pose and a wrist trajectory gets the trajectory to that pose; otherwise the two are
+    drawn independently, as in the paper, and the trajectory may end elsewhere."""
     mass_range: tuple[float, float] = (1.0, 1.0)
     """Factors of the object's mass, uniform at every reset."""
     friction_range: tuple[float, float] = (1.0, 1.0)

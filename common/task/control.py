@@ -51,9 +51,12 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     )
     u_guidance = wrist_to_joints(state, *guidance_pose(scene, control))
     ahead = u_guidance - state.u
-    turn = jnp.mod(ahead[..., 3:] + jnp.pi, 2 * jnp.pi) - jnp.pi
     limited = jnp.concatenate(
-        [_limit(ahead[..., :3], control.guidance_position_limit), _limit(turn, control.guidance_rotation_limit)], -1
+        [
+            _limit(ahead[..., :3], control.guidance_position_limit),
+            _limit(ahead[..., 3:], control.guidance_rotation_limit),
+        ],
+        -1,
     )
     residual = jnp.concatenate(
         [
