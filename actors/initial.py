@@ -2,6 +2,7 @@
 Initialization) or given."""
 
 import zlib
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -59,18 +60,17 @@ def sample(
       batch: B.
       stationary: () bool, holds the objects in place (the paper's first phase).
     """
-    keys = iter(jax.random.split(key, 7))
+    keys = iter(jax.random.split(key, 5))
     uniform = lambda: jax.random.uniform(next(keys), (batch,))  # noqa: E731
     objects = jax.random.randint(next(keys), (batch,), 0, bank.points.shape[0])
     rests = jax.random.randint(next(keys), (batch,), 0, bank.rest.shape[1])
-    draw = Draw(bank, objects, rests, jnp.zeros(batch, jnp.int32), jnp.zeros(batch, jnp.int32))
+    draw = Draw(bank, objects, rests, jnp.zeros(batch, jnp.int32), {})
     asked: dict[str, Array] = {}
     for constraint in optional(task):
         wanted = jax.random.uniform(own_key(key, constraint.name, 0), (batch,)) < getattr(task, f"p_{constraint.name}")
         asked[constraint.name] = wanted & constraint.available(draw)
         draw = draw._replace(region=jnp.maximum(draw.region, constraint.region * asked[constraint.name]))
-    order = jax.random.uniform(next(keys), draw.allowed.shape)
-    draw = draw._replace(reference=jnp.argmax(jnp.where(draw.allowed, order, -1.0), -1))
+    draw = draw._replace(reference=_references(task, draw, asked, key))
     values = {c.name: c.sample(hand, draw, own_key(key, c.name, 1)) for c in known(task)}
     surface = Surface(bank.points[objects], bank.avoid[objects])
     goal = resolve(hand, surface, Goal(values, {}), asked).goal
@@ -92,8 +92,27 @@ def sample(
     return InitialConditions(reset_state, goal, surface, draw.region, hold)
 
 
+def _references(task: TaskConfig, draw: Draw, asked: Mapping[str, Array], key: Array) -> dict[str, Array]:
+    """Index (B,) of the reference of each constraint that is drawn from them.
+
+    Each draws its own (the paper's potentially misaligned pairs). With `aligned_references` all take one that every
+    constraint which is asked for allows; where there is none, each its own.
+    """
+    allowed = {c.name: c.allowed(draw) for c in optional(task) if c.from_reference}
+    together = jnp.ones_like(draw.allowed)
+    for name, own in allowed.items():
+        together &= own | ~asked[name][:, None]
+    found = {}
+    for name, own in allowed.items():
+        if task.aligned_references:
+            own = jnp.where(jnp.any(together, -1, keepdims=True), together, own)
+        order = jax.random.uniform(own_key(key, "reference" if task.aligned_references else name, 2), own.shape)
+        found[name] = jnp.argmax(jnp.where(own, order, -1.0), -1)
+    return found
+
+
 def own_key(key: Array, name: str, stage: int) -> Array:
-    """The random key of one stage of a constraint's draws."""
+    """The random key of one stage of a constraint's draws: whether it is asked for, its goal arrays, its reference."""
     return jax.random.fold_in(jax.random.fold_in(key, zlib.crc32(name.encode())), stage)
 
 

@@ -68,6 +68,9 @@ class ControlConfig:
     """Waypoints ahead of the nearest one that the guidance aims at (0 is the paper's ablation without feed-forward)."""
     follow_object: bool = False
     """Guidance on the object's current pose instead of its pose at the start of the episode."""
+    finger_guidance: float = 0.0
+    """rad per control step by which finger targets close from the middle of the approach on, when the wrist has come;
+    0 leaves them to the action (the paper's method)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +79,8 @@ class TaskConfig(_Shares):
 
     hand: str = "human"
     """Name of the hand, or a hand file (`congrasp hands list` and `import`)."""
+    method: str = "ours"
+    """Name of the method that its policy is of (`common.task.methods`): `congrasp train --method` makes its changes."""
     object_scale: float = 0.0
     """Factor on the objects' lengths, at the same density; 0 takes the hand's own (1.4 for Allegro, 1.1 for Sharpa)."""
     control_dt: float = 0.01
@@ -91,7 +96,8 @@ class TaskConfig(_Shares):
     end_when_fallen: bool = True
     """Holds longer than `hold_steps` end as soon as the object has fallen."""
     dynamic_center: bool = True
-    """Hand centre from the live fingertips; false is the paper's ablation with a centre fixed in the wrist frame."""
+    """Hand centre from the live fingertips; false is the paper's ablation: from the fingertips at the episode's start,
+    fixed in the wrist frame."""
     hand_table_collision: bool = False
     """Whether the hand collides with the table."""
     hand_self_collision: bool = False
@@ -109,6 +115,9 @@ class TaskConfig(_Shares):
     own_references: bool = True
     """Reference poses and trajectories are remade from the policy's own grasps as it learns; otherwise they stay those
     that closing the hand around the objects gave."""
+    aligned_references: bool = False
+    """An episode with a reference pose and a wrist trajectory gets the trajectory to that pose; otherwise the two are
+    drawn independently, as in the paper, and the trajectory may end elsewhere."""
     mass_range: tuple[float, float] = (1.0, 1.0)
     """Factors of the object's mass, uniform at every reset."""
     friction_range: tuple[float, float] = (1.0, 1.0)
@@ -199,15 +208,20 @@ class CurriculumConfig:
     reward: RewardWeights = RewardWeights()
     """The reward's weights at the end of the ramp."""
 
+    @property
+    def ramped(self) -> bool:
+        """Whether the weights change at all."""
+        return self.ramp[0] < self.ramp[1]
+
     def stationary(self, version: int) -> bool:
         """Whether objects are held in place under the policy of this version."""
         return version < self.stationary_updates
 
     def weights(self, first: RewardWeights, version: int) -> RewardWeights:
         """The reward's weights under the policy of this version; `first` are those of the task."""
-        begin, end = self.ramp
-        if end <= begin:
+        if not self.ramped:
             return first
+        begin, end = self.ramp
         share = min(max((version - begin) / (end - begin), 0.0), 1.0)
         return RewardWeights(
             **{

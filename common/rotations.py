@@ -4,6 +4,9 @@ import jax.numpy as jnp
 
 from common.task.types import Array
 
+_UNDECIDED = 1e-5
+"""Cosine of the y angle from which on the x angle is left where it was (`quaternion_to_euler`)."""
+
 
 def multiply(a: Array, b: Array) -> Array:
     """Hamilton product of quaternions (..., 4): first `b`, then `a`."""
@@ -103,13 +106,55 @@ def euler_to_quaternion(angles: Array) -> Array:
     return multiply(multiply(qx, qy), qz)
 
 
-def quaternion_to_euler(q: Array) -> Array:
-    """Intrinsic x-y-z angles (..., 3) of quaternions (..., 4); singular where the y angle is +-90 degrees."""
+def quaternion_to_euler(q: Array, near: Array) -> Array:
+    """Intrinsic x-y-z angles (..., 3) of quaternions (..., 4): those nearest to given ones.
+
+    (x, y, z) and (x + pi, pi - y, z + pi) are one rotation, to which any whole turns may be added: of all these the
+    angles with the least sum of squared differences are taken, each within pi of `near`, so that a path that is
+    followed step by step does not jump where y passes +-90 degrees. There only x + z or x - z is determined, and x
+    stays near.
+
+    Args:
+      q: unit quaternions.
+      near: (..., 3) rad, such as the present angles.
+    """
     m = to_matrix(q)
-    x = jnp.arctan2(-m[..., 1, 2], m[..., 2, 2])
-    y = jnp.arcsin(jnp.clip(m[..., 0, 2], -1.0, 1.0))
-    z = jnp.arctan2(-m[..., 0, 1], m[..., 0, 0])
+    # A weight on the present x decides where the matrix does not: it moves x by less than 0.1 degrees while y is more
+    # than a third of a degree from 90. y and z are exact for whatever x is taken.
+    sine, cosine = _UNDECIDED * jnp.sin(near[..., 0]), _UNDECIDED * jnp.cos(near[..., 0])
+    branches = [
+        _euler_given_x(m, jnp.arctan2(sine - side * m[..., 1, 2], cosine + side * m[..., 2, 2])) for side in (1.0, -1.0)
+    ]
+    first, second = (wrapped(angles - near) for angles in branches)
+    nearer = jnp.sum(first**2, -1, keepdims=True) <= jnp.sum(second**2, -1, keepdims=True)
+    return near + jnp.where(nearer, first, second)
+
+
+def _euler_given_x(m: Array, x: Array) -> Array:
+    """Angles (..., 3) of matrices (..., 3, 3) whose x (...,) is known: those of Rx(-x) R = Ry Rz."""
+    s, c = jnp.sin(x), jnp.cos(x)
+    y = jnp.arctan2(m[..., 0, 2], c * m[..., 2, 2] - s * m[..., 1, 2])
+    z = jnp.arctan2(c * m[..., 1, 0] + s * m[..., 2, 0], c * m[..., 1, 1] + s * m[..., 2, 1])
     return jnp.stack([x, y, z], -1)
+
+
+def wrapped(angle: Array) -> Array:
+    """Angles, or differences of angles, in [-pi, pi), rad."""
+    return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
+
+
+def shortest(a: Array, b: Array, axis: Array) -> Array:
+    """Quaternions (..., 4) of the least rotations from unit vectors a (..., 3) to b (..., 3).
+
+    Args:
+      a: from.
+      b: to.
+      axis: (..., 3) unit, orthogonal to a: the axis where b is -a, and every axis would do.
+    """
+    q = jnp.concatenate([1.0 + jnp.sum(a * b, -1, keepdims=True), jnp.cross(a, b)], -1)
+    length = jnp.linalg.norm(q, axis=-1, keepdims=True)
+    half_turn = jnp.concatenate([jnp.zeros_like(length), axis], -1)
+    return jnp.where(length < 1e-3, half_turn, q / jnp.maximum(length, 1e-3))
 
 
 def frame_from_axes(primary: Array, secondary: Array) -> Array:

@@ -11,8 +11,7 @@ from common.task.constraints import CONSTRAINTS
 from common.wire.codec import Message
 
 _EPISODE = ("episode/", "term/")
-_BLOCKS = {constraint.name: constraint.blocks for constraint in CONSTRAINTS if constraint.optional}
-"""Bits of the mask, all of which say that an episode had the constraint and nothing overrode a part of it."""
+_OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional)
 
 
 def summary(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str, Any]:
@@ -32,9 +31,10 @@ def summary(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str,
 def overall(summaries: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Means over all episodes that ended in the batches of all ranks, their number, and the transitions' lag.
 
-    `episode/…` metrics and `term/…` sums over all of them, but errors of a constraint over those that had it; and
-    `success/heading` over episodes with the heading alone, `success/pose` and so on over those with that constraint,
-    whatever others they had. A rollout in which no episode ended contributes nothing; what no episode has is absent.
+    `episode/…` metrics and `term/…` sums over all of them, but errors of a constraint over those in which it was active
+    (`Constraint.among`, or the block without which an error says nothing); and `success/heading` over episodes with the
+    heading alone, `success/pose` and so on over those with that constraint active, whatever others they had. A rollout
+    in which no episode ended contributes nothing; what no episode has is absent.
     """
     totals: dict[str, list[float]] = {}
     for part in summaries:
@@ -60,17 +60,16 @@ def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], 
     joined = {name: np.concatenate(parts) for name, parts in columns.items()}
     count = max((len(values) for values in joined.values()), default=0)
     none = np.zeros(count)
-    active = {
-        name: np.all([joined.get(f"episode/mask_{block}", none) > 0 for block in blocks], 0)
-        for name, blocks in _BLOCKS.items()
-    }
+    blocks = {block: joined.get(f"episode/mask_{block}", none) > 0 for c in _OPTIONAL for block in c.blocks}
+    active = {constraint.name: constraint.among(blocks) for constraint in _OPTIONAL}
     active["heading"] = ~np.any(list(active.values()), 0)
     success = joined.get("episode/success", np.full(count, np.nan))
     joined |= {f"success/{name}": np.where(rows, success, np.nan) for name, rows in active.items()}
-    for name, values in joined.items():
-        constraint = name.removeprefix("episode/").partition("_")[0]
-        if constraint in active:
-            joined[name] = np.where(active[constraint], values, np.nan)
+    for constraint in CONSTRAINTS:
+        for spec in constraint.errors:
+            if (name := f"episode/{spec.name}") in joined:
+                rows = blocks[spec.block] if spec.block else active[constraint.name]
+                joined[name] = np.where(rows, joined[name], np.nan)
     return {
         name: [float(np.nansum(values)), float(np.sum(~np.isnan(values)))]
         for name, values in joined.items()

@@ -32,7 +32,7 @@ class GraspFrame(NamedTuple):
     cross: np.ndarray
     """(3,) w, unit: from the thumb's tip to the mean of the other tips."""
     center: np.ndarray
-    """(3,) the hand centre p of the open hand, m (the fixed centre of the paper's ablation)."""
+    """(3,) the hand centre p of the open hand, m."""
     opening: float
     """Distance between the thumb's tip and the mean of the others, m."""
 

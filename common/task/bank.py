@@ -1,5 +1,6 @@
 """The constraint bank: what the constraints of episodes are drawn from, stacked over a pool of objects."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from common.task.types import Array
@@ -54,8 +55,8 @@ class Draw(NamedTuple):
     """(B,) int, resting pose."""
     region: Array
     """(B,) int, the axis V: that of the constraints which are asked for so far."""
-    reference: Array
-    """(B,) int, reference pose; one that the table leaves room for, if there is any."""
+    reference: Mapping[str, Array]
+    """(B,) int by the name of each constraint that is drawn from references: one that it allows, if there is any."""
 
     @property
     def allowed(self) -> Array:

@@ -18,7 +18,7 @@ jax.tree_util.register_dataclass(
         "guidance_position_limit",
         "guidance_rotation_limit",
     ],
-    meta_fields=["lookahead", "follow_object"],
+    meta_fields=["lookahead", "follow_object", "finger_guidance"],
 )
 
 
@@ -46,14 +46,18 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     """
     hand, state = scene.hand, scene.state
     fingers = len(hand.joints)
-    q_target = jnp.clip(
-        state.q_target + control.finger_scale * action[..., :fingers], jnp.array(hand.lower), jnp.array(hand.upper)
-    )
+    q_target = state.q_target + control.finger_scale * action[..., :fingers]
+    if control.finger_guidance:
+        q_target += _finger_guidance(scene, control.finger_guidance)
+    q_target = jnp.clip(q_target, jnp.array(hand.lower), jnp.array(hand.upper))
     u_guidance = wrist_to_joints(state, *guidance_pose(scene, control))
     ahead = u_guidance - state.u
-    turn = jnp.mod(ahead[..., 3:] + jnp.pi, 2 * jnp.pi) - jnp.pi
     limited = jnp.concatenate(
-        [_limit(ahead[..., :3], control.guidance_position_limit), _limit(turn, control.guidance_rotation_limit)], -1
+        [
+            _limit(ahead[..., :3], control.guidance_position_limit),
+            _limit(ahead[..., 3:], control.guidance_rotation_limit),
+        ],
+        -1,
     )
     residual = jnp.concatenate(
         [
@@ -63,6 +67,12 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
         -1,
     )
     return Action(q_target, state.u + limited + residual)
+
+
+def _finger_guidance(scene: Scene, rate: float) -> Array:
+    """(B, F) rad by which finger targets go on to the closed hand, at most `rate`, once half the approach is over."""
+    begun = 2.0 * scene.state.time >= scene.task.approach_steps
+    return begun[:, None] * jnp.clip(jnp.array(scene.hand.q_closed) - scene.state.q_target, -rate, rate)
 
 
 def _limit(vector: Array, length: float) -> Array:

@@ -31,7 +31,7 @@ class Features(NamedTuple):
     keypoints: Array
     """(B, P, 3) link origins and fingertips."""
     center: Array
-    """(B, 3) hand centre p."""
+    """(B, 3) hand centre p: of the present fingers, or in the ablation of those with which the episode began."""
     nearest: Array
     """(B, P, 3) d: from each keypoint to the nearest surface point."""
     force: Array
@@ -66,10 +66,9 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
         wrist_position, wrist_quaternion, state.object_position, state.object_quaternion
     )
     keypoints = kinematics.keypoints(hand, kinematics.link_transforms(hand, state.q))
-    if task.dynamic_center:
-        center = kinematics.hand_center(hand, keypoints)
-    else:
-        center = jnp.broadcast_to(jnp.array(kinematics.grasp_frame(hand).center), keypoints[..., 0, :].shape)
+    fingers = keypoints
+    if not task.dynamic_center:
+        fingers = kinematics.keypoints(hand, kinematics.link_transforms(hand, state.q_initial))
 
     # Distances in the object frame, where coordinates are small and the surface does not move.
     contact_shape = state.contact_found.shape
@@ -94,7 +93,7 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
         object_position=object_position,
         object_quaternion=object_quaternion,
         keypoints=keypoints,
-        center=center,
+        center=kinematics.hand_center(hand, fingers),
         nearest=rotations.apply(rotations.to_matrix(object_quaternion), nearest),
         force=jnp.sum(forces, -2),
         touching=jnp.any(found, -1),

@@ -23,14 +23,18 @@ def wrist_pose(state: SceneState) -> tuple[Array, Array]:
 
 
 def wrist_to_joints(state: SceneState, position: Array, quaternion: Array) -> Array:
-    """Virtual wrist joints (B, ..., 6) that put the wrist at world poses (B, ..., 3), (B, ..., 4)."""
+    """Virtual wrist joints (B, ..., 6) that put the wrist at world poses (B, ..., 3), (B, ..., 4).
+
+    Of the angles that do, those nearest to the present ones: no hinge differs from the state's by more than pi.
+    """
     extra = position.ndim - 2
     base_position = state.base_position.reshape(-1, *([1] * extra), 3)
     base_quaternion = state.base_quaternion.reshape(-1, *([1] * extra), 4)
     local, turned = rotations.relative_pose(
         base_position, jnp.broadcast_to(base_quaternion, quaternion.shape), position, quaternion
     )
-    return jnp.concatenate([local, rotations.quaternion_to_euler(turned)], -1)
+    present = state.u[..., 3:].reshape(-1, *([1] * extra), 3)
+    return jnp.concatenate([local, rotations.quaternion_to_euler(turned, present)], -1)
 
 
 def in_world(object_position: Array, object_quaternion: Array, position: Array, quaternion: Array) -> tuple[Array, ...]:

@@ -29,7 +29,7 @@ def accumulate(
 
     Args:
       task: names the errors.
-      sums: (B,) so far; a ratio has another sum, of its denominators.
+      sums: (B,) so far, of numerators and of denominators.
       step: `errors` of the step.
       approach: (B,) bool, the step belongs to the approach.
       hold: (B,) bool, it belongs to the paper's hold.
@@ -37,25 +37,20 @@ def accumulate(
     total = {}
     for spec in specs(task):
         counts = (approach if spec.window == "approach" else hold).astype(jnp.float32)
-        numerator, denominator = step[spec.name]
-        total[spec.name] = sums[spec.name] + numerator * counts
-        if spec.ratio:
-            total[f"{spec.name}/of"] = sums[f"{spec.name}/of"] + denominator * counts
+        for name, value in zip((spec.name, f"{spec.name}/of"), step[spec.name], strict=True):
+            total[name] = sums[name] + value * counts
     return total
 
 
 def empty_sums(task: TaskConfig, batch: int) -> dict[str, Array]:
     """Sums before the first step."""
     zero = jnp.zeros(batch)
-    return {
-        name: zero for spec in specs(task) for name in ((spec.name, f"{spec.name}/of") if spec.ratio else (spec.name,))
-    }
+    return {name: zero for spec in specs(task) for name in (spec.name, f"{spec.name}/of")}
 
 
 def episode_errors(task: TaskConfig, sums: Mapping[str, Array]) -> dict[str, Array]:
-    """(B,) error of an episode by name: the mean over the steps of its window, or the ratio of its sums."""
-    windows = {"approach": task.approach_steps, "hold": max(task.hold_steps, 1)}
-    return {
-        spec.name: sums[spec.name] / (jnp.maximum(sums[f"{spec.name}/of"], 1.0) if spec.ratio else windows[spec.window])
-        for spec in specs(task)
-    }
+    """(B,) error of an episode by name: the mean over the steps that were summed, or the ratio of two sums.
+
+    Zero where there were none, such as errors of the hold where the table stays.
+    """
+    return {spec.name: sums[spec.name] / jnp.maximum(sums[f"{spec.name}/of"], 1.0) for spec in specs(task)}

@@ -1,5 +1,6 @@
 """`congrasp evaluate`: a policy by the paper's protocol."""
 
+import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -36,6 +37,7 @@ def evaluate(
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
     pictures: pathlib.Path | None = None,
     hand: str = "human",
+    method: str | None = None,
     friction: float = 1.0,
 ) -> int:
     """Evaluate a policy by the paper's protocol, beside the paper's figures.
@@ -63,12 +65,16 @@ def evaluate(
       json: Also write the rows to this file.
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
       hand: Whose pretrained policy.
+      method: Which method this is: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp,
+        no-dynamic-center, no-feedforward, two-phase or single-stage. A policy of another is refused; by default the
+        policy says.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.
     """
     from actors.physics import resolve_physics
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
+    from common.task.methods import evaluated_as, get_method
     from services.assets.objects.named import objects_of
     from services.cli.console import tracked
     from services.evaluate.scores import write_json
@@ -77,6 +83,8 @@ def evaluate(
     _check(friction, episodes=(episodes, 1), pool=(pool, 0), batch=(batch, 0), seed=(seed, 0))
     policy = policy_file(policy, hand)
     loaded = bundles.load(policy)
+    if method is not None:
+        loaded = dataclasses.replace(loaded, task=evaluated_as(loaded.task, method, policy.name))
     engine = resolve_physics(physics)
     settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
     with tracked() as track:
@@ -85,9 +93,13 @@ def evaluate(
             given, bank = _captured(constraints, split, given, objects)
         found = _evaluate(loaded, given, bank, table, episodes, pool, settings, track, keep=pictures is not None)
     source = objects_label(loaded, objects)
-    _show(found, f"{policy.name}, version {loaded.version}, on {source}, {engine}, friction {friction:g}")
+    rows = [dataclasses.replace(row, method=loaded.task.method) for row in found.rows]
+    what = f"{policy.name}, version {loaded.version}"
+    if loaded.task.method != "ours":
+        what = f"method {loaded.task.method}" + (f", {what}" if get_method(loaded.task.method).learns else "")
+    _show(found, f"{what}, on {source}, {engine}, friction {friction:g}")
     if json is not None:
-        write_json(found.rows, json, _about(policy, loaded, objects, source, constraints, split) | settings)
+        write_json(rows, json, _about(policy, loaded, objects, source, constraints, split) | settings)
     if pictures is not None:
         _draw(found, loaded, episodes, pictures)
     return 0
@@ -130,11 +142,18 @@ def _evaluate(
     keep: bool,
 ) -> _Found:
     """The rows of the named tables; see `evaluate`."""
+    from common.task.methods import takes
     from services.evaluate.noise import LEVELS
     from services.evaluate.scores import TABLES, known_rows
 
     wanted = {*TABLES, "noise", "objects"} if "all" in table else set(table)
-    names = known_rows((key for key in TABLES if key in wanted), loaded.task)
+    rows_of = known_rows((key for key in TABLES if key in wanted), loaded.task)
+    method = loaded.task.method
+    names = [name for name in rows_of if takes(method, name)]
+    if not takes(method, "heading"):
+        wanted -= {"objects"}
+    if not names and not wanted & {"noise", "objects"}:
+        raise CongraspError(f"The method '{method}' has no row in these tables.", "Name another --table.")
     rows: list[Any] = []
     noisy: list[Any] = []
     left_out: list[CongraspError] = []

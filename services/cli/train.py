@@ -8,6 +8,7 @@ import tyro
 
 import actors.physics  # noqa: F401 - registers the engines that --physics offers
 from common.config import MetricWriter, RunConfig
+from common.task.methods import with_method
 from learner.run_directory import CONFIG_FILE, open_run
 from services.train.presets import get_preset, with_hand
 
@@ -15,6 +16,7 @@ from services.train.presets import get_preset, with_hand
 def train(
     config: Annotated[RunConfig, tyro.conf.arg(name="")],
     preset: str = "quickstart",
+    method: str | None = None,
     hand: str | None = None,
     run_dir: pathlib.Path | None = None,
     actors: int | None = None,
@@ -36,6 +38,8 @@ def train(
     Args:
       config: The run.
       preset: Named configuration to start from.
+      method: What of it is trained: ours, or a baseline or ablation of the paper (graspxl, dgrasp, no-dynamic-center,
+        no-feedforward, two-phase, single-stage), whose settings then hold. By default the preset's, ours.
       hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by default the
         preset's.
       run_dir: Where the run is kept; runs/NAME-DATE by default.
@@ -57,7 +61,7 @@ def train(
     """
     from services.train.command import run_training
 
-    config = with_hand(config, hand)
+    config = with_hand(config if method is None else with_method(config, method), hand)
     return run_training(
         config,
         run_dir or pathlib.Path("runs") / f"{config.name}-{time.strftime('%Y%m%d-%H%M%S')}",

@@ -141,7 +141,7 @@ class Evaluator:
         require_known(constraint.split("+"), self.task)
         bank, found = self._bank, active_mask(constraint, self.task)
         objects, rests = (axis.ravel() for axis in np.indices(bank.has_affordance.shape))
-        draw = Draw(bank, objects, rests, np.zeros_like(objects), np.zeros_like(objects))
+        draw = Draw(bank, objects, rests, np.zeros_like(objects), {})
         allowed = np.ones(objects.shape, bool)
         for part in optional(self.task):
             if any(found[block] for block in part.blocks):

@@ -103,7 +103,7 @@ def test_error_is_the_share_of_other_fingers_links():
 
 def test_draws_are_the_thumb_with_one_or_more_of_the_others():
     count, zero = 4000, np.zeros(4000, int)
-    allowed = np.asarray(FINGERS.sample(HAND, Draw(None, zero, zero, zero, zero), jax.random.key(0)).allowed)
+    allowed = np.asarray(FINGERS.sample(HAND, Draw(None, zero, zero, zero, {}), jax.random.key(0)).allowed)
     number = allowed.sum(-1)
     np.testing.assert_array_equal(allowed, np.arange(5) < number[:, None])
     shares = np.bincount(number, minlength=6) / count

@@ -76,6 +76,42 @@ def test_affordance_turns_a_heading_that_comes_nearer_to_the_avoid_region(at_avo
     assert not np.any(resolve(HAND, surface, asked, _flags()).redirected)
 
 
+def test_a_redirected_heading_turns_the_hand_by_the_least_rotation():
+    """By hand: v = -z and w = x from 15 cm above the avoid region, at which the graspable one lies 20 cm aside.
+
+    v turns by atan2(0.2, 0.15) about y, away from -z; w with it: (0.6, 0, 0.8).
+    """
+    surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)
+    surface = surface._replace(points=surface.points * np.array([1, 0, 0], np.float32))
+    rows = lambda *v: np.tile(np.array(v, np.float32), (4, 1))  # noqa: E731
+    asked = asked.replace("heading", position=rows(-0.1, 0, 0), direction=rows(0, 0, -1), cross=rows(1, 0, 0))
+    heading = resolve(HAND, surface, asked, _flags(affordance=True)).goal["heading"]
+    np.testing.assert_allclose(heading.direction, rows(0.8, 0, -0.6), atol=1e-6)
+    np.testing.assert_allclose(heading.cross, rows(0.6, 0, 0.8), atol=1e-6)
+
+
+@pytest.mark.parametrize("wobble", [0.0, 1e-7, -1e-7])
+def test_rounding_does_not_decide_on_the_roll_of_a_redirected_heading(wobble):
+    """The heading turns by a right angle, to where its cross-finger direction w pointed: w turns with it, whatever the
+    last bits of w were."""
+    surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)
+    surface = surface._replace(points=surface.points * np.array([1, 0, 0], np.float32) + np.float32([0, 0, 0.15]))
+    rows = lambda *v: np.tile(np.array(v, np.float32), (4, 1))  # noqa: E731
+    asked = asked.replace("heading", position=rows(-0.1, 0, 0), direction=rows(0, 0, -1), cross=rows(1, wobble, 0))
+    heading = resolve(HAND, surface, asked, _flags(affordance=True)).goal["heading"]
+    np.testing.assert_allclose(heading.direction, rows(1, 0, 0), atol=1e-6)
+    np.testing.assert_allclose(heading.cross, rows(0, 0, 1), atol=1e-5)
+
+
+def test_a_cross_finger_direction_along_the_heading_is_replaced_by_an_orthogonal_one():
+    _, surface, asked = scene(3)
+    for wobble in (0.0, 1e-7):
+        cross = asked["heading"].direction + np.float32([wobble, 0, 0])
+        heading = resolve(HAND, surface, asked.replace("heading", cross=cross), _flags()).goal["heading"]
+        np.testing.assert_allclose(np.sum(heading.cross * heading.direction, -1), 0.0, atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(heading.cross, axis=-1), 1.0, atol=1e-6)
+
+
 @pytest.mark.parametrize(("end_x", "aligned"), [(0.1, True), (-0.1, False)])
 def test_trajectory_and_affordance_must_agree(end_x, aligned):
     surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)

@@ -47,11 +47,53 @@ def test_matrix_to_quaternion_and_back(seed):
 @settings(max_examples=30, deadline=None)
 @given(seeds)
 def test_euler_angles_are_intrinsic_xyz(seed):
-    angles = np.random.default_rng(seed).uniform(-1.4, 1.4, (8, 3)).astype(np.float32)
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(-1.4, 1.4, (8, 3)).astype(np.float32)
     expected = Rotation.from_euler("XYZ", angles)
     quaternion = rotations.euler_to_quaternion(jnp.array(angles))
     np.testing.assert_allclose(np.abs(np.sum(quaternion * _wxyz(expected), -1)), 1.0, atol=1e-5)
-    np.testing.assert_allclose(rotations.quaternion_to_euler(quaternion), angles, atol=2e-4)
+    near = angles + rng.uniform(-0.4, 0.4, (8, 3)).astype(np.float32)
+    np.testing.assert_allclose(rotations.quaternion_to_euler(quaternion, near), angles, atol=2e-4)
+    far = rng.uniform(-9.0, 9.0, (8, 3)).astype(np.float32)
+    other = rotations.quaternion_to_euler(quaternion, far)
+    np.testing.assert_allclose(rotations.angle(rotations.euler_to_quaternion(other), quaternion), 0.0, atol=1e-3)
+    assert np.abs(other - far).max() <= np.pi + 1e-5
+
+
+def test_euler_angles_go_on_where_y_passes_ninety_degrees():
+    """By hand: 95 degrees about y from a wrist at 89 stays (0, 95, 0), and is not (180, 85, 180)."""
+    turned = rotations.from_rotation_vector(jnp.radians(jnp.array([0.0, 95.0, 0.0])))
+    near = np.radians([0.0, 89.0, 0.0]).astype(np.float32)
+    np.testing.assert_allclose(np.degrees(rotations.quaternion_to_euler(turned, near)), [0.0, 95.0, 0.0], atol=1e-3)
+    # At 90 degrees only x + z is determined, here 20 degrees: x stays where it is.
+    singular = jnp.array(Rotation.from_euler("XYZ", [5.0, 90.0, 15.0], True).as_quat(scalar_first=True), jnp.float32)
+    near = np.radians([12.0, 88.0, 9.0]).astype(np.float32)
+    np.testing.assert_allclose(np.degrees(rotations.quaternion_to_euler(singular, near)), [12.0, 90.0, 8.0], atol=0.5)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(-0.5, 0.5), st.sampled_from((1.0, -1.0)))
+def test_a_path_of_two_and_a_half_radians_about_y_is_followed_without_a_jump(x, sign):
+    """Every angle of the steps is worked out by hand: x stays, y grows."""
+    wanted = np.stack([np.full(51, x), sign * np.linspace(0.0, 2.5, 51), np.zeros(51)], -1).astype(np.float32)
+    near = wanted[0]
+    for quaternion, expected in zip(rotations.euler_to_quaternion(jnp.array(wanted)), wanted, strict=True):
+        near = rotations.quaternion_to_euler(quaternion, near)
+        np.testing.assert_allclose(near, expected, atol=5e-3)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds)
+def test_the_shortest_rotation_carries_one_vector_to_the_other(seed):
+    rng = np.random.default_rng(seed)
+    a, b, c = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in rng.normal(size=(3, 8, 3)).astype(np.float32))
+    axis = np.cross(a, c) / np.linalg.norm(np.cross(a, c), axis=-1, keepdims=True)
+    b[0], b[1] = -a[0], a[1]
+    turn = np.asarray(rotations.shortest(a, b, axis))
+    np.testing.assert_allclose(rotations.rotate(turn, a), b, atol=2e-5)
+    expected = np.arccos(np.clip(np.sum(a * b, -1), -1.0, 1.0))
+    np.testing.assert_allclose(Rotation.from_quat(turn, scalar_first=True).magnitude(), expected, atol=2e-3)
+    np.testing.assert_allclose(turn[0], [0.0, *axis[0]], atol=1e-6)
 
 
 def test_axis_rotation_by_hand():

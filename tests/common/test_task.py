@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from common.config import RewardWeights, TaskConfig
 from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
+from common.task import metrics
 from common.task.constraints import blocks
 from common.task.constraints.heading import heading_wrist_pose
 from common.task.constraints.pose import pose_gate
@@ -47,6 +48,14 @@ def _blocks(observation: np.ndarray) -> dict[str, np.ndarray]:
         start += size
     assert start == observation.shape[1]
     return out
+
+
+def _joint_differences(turn: Rotation, present: np.ndarray) -> np.ndarray:
+    """(3,) what the hinges x, y, z must turn by from their present angles: the less of the two ways, in SciPy."""
+    x, y, z = turn.as_euler("XYZ")
+    ways = np.array([[x, y, z], [x + np.pi, np.pi - y, z + np.pi]]) - present
+    ways = (ways + np.pi) % (2 * np.pi) - np.pi
+    return ways[(ways**2).sum(-1).argmin()]
 
 
 def _rotation(q: np.ndarray) -> Rotation:
@@ -147,8 +156,12 @@ def test_observation_blocks_by_hand():
     base = _rotation(state.base_quaternion[b])
     u = base.inv().apply(target - state.base_position[b])
     np.testing.assert_allclose(parts["pose_wrist"][b, :3], u - state.u[b, :3], atol=1e-4)
-    turn = (base.inv() * body * _rotation(goal["pose"].quaternion[b])).as_euler("XYZ")
-    np.testing.assert_allclose(parts["pose_wrist"][b, 3:], turn - state.u[b, 3:], atol=2e-3)
+    for quaternion, seen in (
+        (goal["pose"].quaternion[b], parts["pose_wrist"][b]),
+        *zip(goal["trajectory"].quaternion[b], parts["trajectory"][b].reshape(K, 6), strict=True),
+    ):
+        turn = base.inv() * body * _rotation(quaternion)
+        np.testing.assert_allclose(seen[3:], _joint_differences(turn, state.u[b, 3:]), atol=5e-3)
     assert parts["trajectory"].shape == (4, 6 * K)
     np.testing.assert_allclose(squash(np.array([[5.0, 0.0, 0.0]])), [[0.5, 0.0, 0.0]])
 
@@ -203,7 +216,9 @@ def test_reward_terms_against_numpy(near):
         paid["pose_wrist_rotation"][b], -(min((wrist.inv() * pose_turn).magnitude(), 0.5) ** 2), rtol=1e-3, atol=1e-4
     )
     way = body.apply(goal["trajectory"].position[b]) + state.object_position[b]
-    k = min(np.linalg.norm(way - wrist_position, axis=-1).argmin() + 1, K - 1)
+    guiding = _rotation(state.object_quaternion_initial[b]).apply(goal["trajectory"].position[b])
+    guiding += state.object_position_initial[b]
+    k = min(np.linalg.norm(guiding - wrist_position, axis=-1).argmin() + 1, K - 1)
     np.testing.assert_allclose(
         paid["trajectory_position"][b], -min(((way[k] - wrist_position) ** 2).sum(), 0.15**2), rtol=1e-3
     )
@@ -326,8 +341,8 @@ def test_metrics_against_numpy():
     pose = body.apply(goal["pose"].position[b]) + state.object_position[b]
     np.testing.assert_allclose(found["pose_m"][b], np.linalg.norm(wrist_position - pose), atol=1e-4)
     base = _rotation(state.base_quaternion[b])
-    hinges = (base.inv() * body * _rotation(goal["pose"].quaternion[b])).as_euler("XYZ") - state.u[b, 3:]
-    hinges = (hinges + np.pi) % (2 * np.pi) - np.pi
+    turn = base.inv() * body * _rotation(goal["pose"].quaternion[b])
+    hinges = _joint_differences(turn, state.u[b, 3:])
     expected = np.abs(np.concatenate([state.q[b] - goal["pose"].q[b], hinges])).mean()
     np.testing.assert_allclose(found["pose_rad"][b], expected, atol=1e-3)
     links = np.sum(np.asarray(geometry.of["affordance"].touching)[b])
@@ -336,7 +351,53 @@ def test_metrics_against_numpy():
     assert all((weight == 1.0).all() for weight in weights.values())
 
 
-def test_fixed_center_is_the_open_hands_whatever_the_fingers_do():
+def test_fixed_center_is_that_of_the_first_fingers_whatever_they_do():
+    fixed = dataclasses.replace(TASK, dynamic_center=False)
     state, surface, goal = scene(19)
-    geometry = features(HAND, dataclasses.replace(TASK, dynamic_center=False), state, surface, goal)
-    np.testing.assert_allclose(geometry.center, np.tile(grasp_frame(HAND).center, (4, 1)))
+    geometry = features(HAND, fixed, state, surface, goal)
+    np.testing.assert_allclose(geometry.center, np.tile(grasp_frame(HAND).center, (4, 1)), atol=1e-6)
+    began = state._replace(q_initial=state.q_target)
+    expected = hand_center(HAND, keypoints(HAND, link_transforms(HAND, state.q_target)))
+    np.testing.assert_allclose(features(HAND, fixed, began, surface, goal).center, expected, atol=1e-6)
+    assert np.abs(expected - geometry.center).max() > 0.01
+
+
+def test_guidance_reward_and_errors_speak_of_one_waypoint():
+    """By hand: waypoints every 2 cm along x, the wrist at 4.4 cm, the object pushed by 3 cm along x.
+
+    The guidance counts on the object as it lay: nearest is waypoint 2 at 4 cm, active is 3. On the object as it lies
+    now the waypoints begin at 3 cm, and the nearest would be number 1.
+    """
+    state, surface, goal = scene(22)
+    x = np.array([1, 0, 0], np.float32)
+    none = np.tile(np.array([1, 0, 0, 0], np.float32), (4, 1))
+    state = state._replace(
+        u=np.zeros((4, 6), np.float32),
+        base_position=np.tile(0.044 * x, (4, 1)),
+        base_quaternion=none,
+        object_position=np.tile(0.03 * x, (4, 1)),
+        object_position_initial=np.zeros((4, 3), np.float32),
+        object_quaternion=none,
+        object_quaternion_initial=none,
+    )
+    path = np.tile(0.02 * np.arange(K, dtype=np.float32)[:, None] * x, (4, 1, 1))
+    goal = goal.replace("trajectory", position=path, quaternion=np.tile(none[:, None], (1, K, 1)))
+    position, _ = GUIDANCE(state, surface, goal, TASK.control)
+    np.testing.assert_allclose(position, np.tile(0.06 * x, (4, 1)), atol=1e-6)
+    # The same waypoint, carried by the object: 9 cm, which is 4.6 cm from the wrist.
+    np.testing.assert_allclose(ERRORS(state, surface, goal)["trajectory_m"][0], 0.046, atol=1e-6)
+    np.testing.assert_allclose(REWARD(state, surface, goal, UNIT)["trajectory_position"], -(0.046**2), atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [50, 75, 100])
+def test_an_error_is_divided_by_the_steps_that_were_summed(steps):
+    """Where the object is held in place the table never goes, and the approach is as long as the episode."""
+    one = np.ones(1)
+    step = {spec.name: (0.2 * one, one) for spec in metrics.specs(TASK)}
+    sums = metrics.empty_sums(TASK, 1)
+    for _ in range(steps):
+        sums = metrics.accumulate(TASK, sums, step, approach=one > 0, hold=one < 0)
+    found = metrics.episode_errors(TASK, sums)
+    np.testing.assert_allclose(found["trajectory_m"], 0.2, rtol=1e-5)
+    np.testing.assert_allclose(found["trajectory_rad"], 0.2, rtol=1e-5)
+    np.testing.assert_allclose(found["heading_m"], 0.0)

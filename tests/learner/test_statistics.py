@@ -58,12 +58,14 @@ def test_errors_and_success_count_where_their_constraint_was_active():
     assert "success/affordance" not in means
 
 
-def test_a_pose_whose_wrist_a_trajectory_decides_on_counts_for_the_trajectory_alone():
+def test_a_pose_whose_wrist_a_trajectory_decides_on_counts_for_both():
+    """The fingers follow the pose; the distance of its wrist says nothing there."""
     means = episode_means(
         [
             rollout(
                 episode_success=[1, 0],
-                episode_pose_rad=[0.2, 9.0],
+                episode_pose_rad=[0.2, 0.4],
+                episode_pose_m=[0.01, 9.0],
                 episode_trajectory_m=[9.0, 0.5],
                 episode_mask_pose_finger=[1, 1],
                 episode_mask_pose_wrist=[1, 0],
@@ -71,8 +73,8 @@ def test_a_pose_whose_wrist_a_trajectory_decides_on_counts_for_the_trajectory_al
             )
         ]
     )
-    expected = {"success/pose": 1.0, "success/trajectory": 0.0}
-    expected |= {"episode/pose_rad": 0.2, "episode/trajectory_m": 0.5}
+    expected = {"success/pose": 0.5, "success/trajectory": 0.0}
+    expected |= {"episode/pose_rad": 0.3, "episode/pose_m": 0.01, "episode/trajectory_m": 0.5}
     assert {name: means[name] for name in expected} == pytest.approx(expected)
     assert "success/heading" not in means
 

@@ -60,9 +60,7 @@ class Affordance(Constraint):
             "w_f of the affordance term: per newton on the non-grasping region (clipped at 10 N per link).",
         ),
     )
-    errors = (
-        ErrorSpec("affordance_ratio", "", "hold", 0.0, 0.05, "share of touching links on the avoid region", ratio=True),
-    )
+    errors = (ErrorSpec("affordance_ratio", "", "hold", 0.0, 0.05, "share of touching links on the avoid region"),)
     options = (
         Option(
             "affordance",
@@ -94,14 +92,19 @@ class Affordance(Constraint):
         return AffordanceGoal()
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
-        """Redirects a heading that comes nearer to the avoid region than to the graspable one."""
+        """Redirects a heading that comes nearer to the avoid region than to the graspable one.
+
+        It then leads from its start to the middle of the graspable region, and the hand turns with it by the least
+        rotation, so that the cross-finger direction stays orthogonal however far the heading turns.
+        """
         heading = goal["heading"]
         weights = (~surface.avoid)[..., None].astype(jnp.float32)
         middle = jnp.sum(surface.points * weights, 1) / jnp.maximum(jnp.sum(weights, 1), 1.0)
         towards = middle - (heading.position - REACH * heading.direction)
         towards = towards / jnp.linalg.norm(towards, axis=-1, keepdims=True)
         turned = asked["affordance"] & _contradicts_heading(_apart_from_heading(hand, surface, goal))
-        return goal.where(turned, "heading", position=middle, direction=towards)
+        cross = rotations.rotate(rotations.shortest(heading.direction, towards, heading.cross), heading.cross)
+        return goal.where(turned, "heading", position=middle, direction=towards, cross=cross)
 
     def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> AffordanceFeatures:
         """Distances, contacts and forces by region: each contact has the label of the nearest surface point."""

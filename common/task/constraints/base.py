@@ -5,6 +5,8 @@ All methods are pure functions of batched arrays (leading axis B) that may be tr
 """
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_type_hints
 
@@ -66,8 +68,6 @@ class ErrorSpec(NamedTuple):
     """What is met up to the tolerance, for people."""
     column: str = ""
     """Name in tables and their JSON; the same as `name` if empty."""
-    ratio: bool = False
-    """Sums of two numbers over the window are divided, instead of a mean over its steps."""
     block: str = ""
     """Block of the constraint without which it says nothing, where others of its blocks can be active alone."""
 
@@ -163,8 +163,18 @@ class Constraint:
     # Sampling and the start of an episode.
 
     def available(self, draw: "Draw") -> Array:
-        """(B,) bool: whether the drawn objects, in their resting poses and regions, allow it."""
-        return jnp.ones(draw.objects.shape, bool)
+        """(B,) bool: whether the drawn objects, in their resting poses and regions, allow it.
+
+        By default where one of the references does, if it is drawn from them, and else everywhere.
+        """
+        return jnp.any(self.allowed(draw), -1) if self.from_reference else jnp.ones(draw.objects.shape, bool)
+
+    def allowed(self, draw: "Draw") -> Array:
+        """(B, M) bool: references of the drawn objects from which it may be drawn: by default those clear of the table.
+
+        Nothing is drawn of them yet: `draw` has no `reference`.
+        """
+        return draw.allowed
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> Any:
         """Its goal arrays for the drawn episodes, whether or not they ask for it."""
@@ -230,7 +240,10 @@ class Constraint:
         return {}
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
-        """Errors (B,) of one step by the names of `errors`, active or not; numerator and denominator of a ratio."""
+        """Errors (B,) of one step by the names of `errors`, active or not.
+
+        A pair is numerator and denominator of a ratio, whose sums over the window are divided.
+        """
         return {}
 
     # What people see.
@@ -298,8 +311,15 @@ class Constraint:
         return self.goal(**made)
 
     def active(self, goal: Goal) -> Array:
-        """(B,) bool: whether any block of it is active; only optional constraints have any."""
-        return jnp.any(jnp.stack([goal.active[block] for block in self.blocks]), 0)
+        """(B,) bool: whether it is active, see `among`."""
+        return self.among(goal.active)
+
+    def among(self, blocks: Mapping[str, Array]) -> Array:
+        """(B,) bool by which blocks are active: any of its own is, and only optional constraints have any.
+
+        So a reference pose of which a trajectory leaves only the fingers is active.
+        """
+        return functools.reduce(operator.or_, (blocks[block] for block in self.blocks))
 
 
 def symbol_sizes(hand: Hand, task: "TaskConfig") -> dict[str, int]:

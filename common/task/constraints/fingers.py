@@ -38,7 +38,7 @@ class Fingers(Constraint):
         Weight("fingers_distance", 0.02, "For each unit of softplus((margin - d)/sharpness), finger by finger."),
         Weight("fingers_contact", 0.3, "For each link of another finger that touches the object."),
     )
-    errors = (ErrorSpec("fingers_ratio", "", "hold", 0.0, 0.1, "share of touching links of other fingers", ratio=True),)
+    errors = (ErrorSpec("fingers_ratio", "", "hold", 0.0, 0.1, "share of touching links of other fingers"),)
     options = (
         Option("fingers", "Which fingers may touch the object, such as: thumb index. All by default.", many=True),
     )

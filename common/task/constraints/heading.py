@@ -186,8 +186,16 @@ def heading_turn(hand: Hand, heading: HeadingGoal, quaternion: Array) -> Array:
 
 
 def orthogonal_cross(heading: HeadingGoal) -> HeadingGoal:
-    """The heading with its cross-finger direction made unit and orthogonal to its direction."""
-    cross = heading.cross - jnp.sum(heading.cross * heading.direction, -1, keepdims=True) * heading.direction
+    """The heading with its cross-finger direction made unit and orthogonal to its direction.
+
+    Where the two are parallel any orthogonal one is taken: of what remains rounding would decide.
+    """
+    axis = jnp.eye(3)[jnp.argmin(jnp.abs(heading.direction), -1)]
+    cross, other = (
+        vector - jnp.sum(vector * heading.direction, -1, keepdims=True) * heading.direction
+        for vector in (heading.cross, axis)
+    )
+    cross = jnp.where(jnp.linalg.norm(cross, axis=-1, keepdims=True) < 1e-3, other, cross)
     return heading._replace(cross=cross / jnp.linalg.norm(cross, axis=-1, keepdims=True))
 
 

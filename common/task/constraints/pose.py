@@ -92,13 +92,9 @@ class Pose(Constraint):
         )
         return fingers, (wrist,)
 
-    def available(self, draw: "Draw") -> Array:
-        """Where the object has a reference that the table leaves room for."""
-        return jnp.any(draw.allowed, -1)
-
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> PoseGoal:
         """One of the object's reference poses."""
-        index = draw.objects, draw.region, draw.reference
+        index = draw.objects, draw.region, draw.reference["pose"]
         return PoseGoal(draw.bank.pose_q[index], draw.bank.pose_position[index], draw.bank.pose_quaternion[index])
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
@@ -152,7 +148,6 @@ class Pose(Constraint):
         own, state = scene.goal["pose"], scene.state
         position, quaternion = in_world(state.object_position, state.object_quaternion, own.position, own.quaternion)
         hinges = wrist_to_joints(state, position, quaternion)[..., 3:] - state.u[..., 3:]
-        hinges = jnp.mod(hinges + jnp.pi, 2 * jnp.pi) - jnp.pi
         angles = jnp.concatenate([state.q - own.q, hinges], -1)
         return {
             "pose_rad": jnp.mean(jnp.abs(angles), -1),

@@ -99,12 +99,11 @@ def resolve(hand: Hand, surface: Surface, goal: Goal, asked: Mapping[str, Array]
             if relation.weaker in asked:
                 both = both & asked[relation.weaker]
             found[relation.settled].append(both & relation.contradicts(relation.measure(hand, surface, goal)))
-    resolved = Goal(goal.values, active_blocks(asked))
+    cross = orthogonal_cross(goal["heading"]).cross
+    resolved = Goal(goal.values, active_blocks(asked)).replace("heading", cross=cross)
     for constraint in CONSTRAINTS:
         if constraint.name in asked:
             resolved = constraint.override(hand, surface, asked, resolved)
-    heading = orthogonal_cross(resolved["heading"])
-    resolved = resolved.replace("heading", cross=heading.cross)
     none = jnp.zeros(goal["heading"].position.shape[0], bool)
     return Resolution(resolved, _any(found["redirected"], none), ~_any(found["refused"], none))
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -72,13 +73,17 @@ class Trajectory(Constraint):
         size, meaning = 6 * task.trajectory_points, "m and rad, wrist joints of every waypoint, less the present ones"
         return ((ObservationField("waypoint_u - u", size, meaning),),)
 
-    def available(self, draw: "Draw") -> Array:
-        """Where the object has a reference that the table leaves room for."""
-        return jnp.any(draw.allowed, -1)
+    def allowed(self, draw: "Draw") -> Array:
+        """Those clear of the table that agree with an affordance, where one is asked for (region 1)."""
+        bank, objects = draw.bank, draw.objects
+        ends = bank.trajectory_position[objects, draw.region, :, -1]
+        surface = Surface(bank.points[objects], bank.avoid[objects])
+        apart = jax.vmap(_apart_from_regions, (None, 1), 1)(surface, ends)
+        return draw.allowed & ((draw.region == 0)[:, None] | ~_contradicts_affordance(apart))
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> TrajectoryGoal:
         """The trajectory to one of the object's reference poses."""
-        index = draw.objects, draw.region, draw.reference
+        index = draw.objects, draw.region, draw.reference["trajectory"]
         return TrajectoryGoal(draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index])
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
@@ -143,14 +148,15 @@ def active_waypoint(wrist_position: Array, waypoints: Array, lookahead: int) -> 
 
 
 def tracked_waypoint(scene: Scene, *, current: bool) -> tuple[Array, Array]:
-    """World pose (B, 3), (B, 4) of the active waypoint, on the object's current or initial pose."""
-    own = scene.goal["trajectory"]
-    points, turns = in_world(*object_pose(scene, current=current), own.position, own.quaternion)
-    index = active_waypoint(scene.features.wrist_position, points, scene.task.control.lookahead)[..., None, None]
-    return (
-        jnp.take_along_axis(points, index, -2)[..., 0, :],
-        jnp.take_along_axis(turns, index, -2)[..., 0, :],
-    )
+    """World pose (B, 3), (B, 4) of the active waypoint, on the object's current or initial pose.
+
+    Guidance, reward and errors speak of one waypoint: which it is, the object's pose under the guidance decides.
+    """
+    own, control = scene.goal["trajectory"], scene.task.control
+    guiding, _ = in_world(*object_pose(scene, current=control.follow_object), own.position, own.quaternion)
+    index = active_waypoint(scene.features.wrist_position, guiding, control.lookahead)[..., None, None]
+    position, quaternion = (jnp.take_along_axis(array, index, -2)[..., 0, :] for array in own)
+    return in_world(*object_pose(scene, current=current), position, quaternion)
 
 
 def _apart_from_pose(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
@@ -170,13 +176,17 @@ def _pose_message(hand: Hand, apart: Mapping[str, Any]) -> str:
     )
 
 
-def _apart_from_regions(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
-    """Metres from the trajectory's end to either region."""
-    position, _ = last_waypoint(goal)
+def _apart_from_regions(surface: Surface, end: Array) -> dict[str, Array]:
+    """Metres from a trajectory's end (B, 3) to either region."""
     return {
-        "avoid": least_distance(surface.points, surface.avoid, position),
-        "graspable": least_distance(surface.points, ~surface.avoid, position),
+        "avoid": least_distance(surface.points, surface.avoid, end),
+        "graspable": least_distance(surface.points, ~surface.avoid, end),
     }
+
+
+def _contradicts_affordance(apart: Mapping[str, Array]) -> Array:
+    """Whether the trajectory ends as near to the avoid region as to the graspable one, or nearer."""
+    return apart["avoid"] <= apart["graspable"]
 
 
 def _affordance_message(hand: Hand, apart: Mapping[str, Any]) -> str:
@@ -202,8 +212,8 @@ Trajectory.relations = (
     Relation(
         "affordance",
         "refused",
-        _apart_from_regions,
-        lambda apart: apart["avoid"] <= apart["graspable"],
+        lambda hand, surface, goal: _apart_from_regions(surface, last_waypoint(goal)[0]),
+        _contradicts_affordance,
         _affordance_message,
     ),
     Relation(

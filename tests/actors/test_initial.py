@@ -1,0 +1,161 @@
+"""What episodes start from: references that are drawn, and a hand that begins where its constraints let it."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from actors.initial import initial_hand, sample
+from common.config import TaskConfig
+from common.hands.kinematics import hand_center, keypoints, link_transforms
+from common.task.bank import ConstraintBank
+from common.task.constraints.heading import heading_wrist_pose
+from common.task.constraints.priority import resolve
+from common.task.features import scene_of
+from common.task.geometry import in_world
+from common.task.metrics import errors
+from common.task.reward import reward_terms
+from common.task.types import Goal, Surface
+from tests.scenes import HAND, F, K, quaternions, scene, units
+
+TASK = TaskConfig(p_affordance=0.5, p_pose=0.5, p_trajectory=0.5)
+BATCH, M = 2000, 6
+
+
+def _bank(valid: np.ndarray) -> ConstraintBank:
+    """Two objects with a graspable point at x = 10 cm and one to avoid at -10 cm, in one resting pose.
+
+    Pose m has the angle m in all its joints, and trajectory m ends at x = m - 2.5 cm: nearer to the graspable point
+    from m = 3 on.
+
+    Args:
+      valid: (M,) bool, the references that the table leaves room for.
+    """
+    rng = np.random.default_rng(0)
+    points = np.zeros((2, TASK.surface_points, 3), np.float32)
+    points[..., 0] = np.where(np.arange(TASK.surface_points) % 2, -0.1, 0.1)
+    number = np.broadcast_to(np.arange(M, dtype=np.float32)[:, None], (2, 2, M, 1))
+    path = np.zeros((2, 2, M, K, 3), np.float32)
+    path[..., 0] = 0.01 * (number - 2.5)
+    headings = (2, 2, 8)
+    return ConstraintBank(
+        points=points,
+        avoid=points[..., 0] < 0,
+        rest=np.tile(np.array([0, 0, 0.1, 1, 0, 0, 0], np.float32), (2, 1, 1)),
+        heading_position=np.zeros((*headings, 3), np.float32),
+        heading_direction=units(rng, *headings),
+        heading_cross=units(rng, *headings),
+        heading_index=np.tile(np.arange(8, dtype=np.int32), (2, 2, 1, 1)),
+        heading_back=np.zeros((2, 2, 1, 8), np.float32),
+        pose_q=np.tile(number, F),
+        pose_position=np.zeros((2, 2, M, 3), np.float32),
+        pose_quaternion=quaternions(rng, 2, 2, M),
+        trajectory_position=path,
+        trajectory_quaternion=quaternions(rng, 2, 2, M, K),
+        pose_valid=np.broadcast_to(valid, (2, 2, 1, M)),
+        has_affordance=np.ones((2, 1), bool),
+    )
+
+
+@functools.cache
+def _sampler(task: TaskConfig) -> Callable:
+    """Initial conditions of many episodes, from a bank and a key."""
+    return jax.jit(lambda bank, key: sample(HAND, task, bank, key, BATCH))
+
+
+@jax.jit
+def _begun(surface: Surface, asked: Goal, constraints: dict[str, np.ndarray]) -> tuple[Goal, jax.Array]:
+    """The goal after the priority rules, and the fingers at the start."""
+    goal = resolve(HAND, surface, asked, constraints).goal
+    return goal, initial_hand(HAND, TASK, goal, jnp.tile(jnp.array([0, 0, 0.1, 1.0, 0, 0, 0]), (4, 1)))[0]
+
+
+@functools.cache
+def _heading(task: TaskConfig) -> Callable:
+    """Reward and error of the heading's position, from state, surface and goal."""
+
+    def found(*step: Any) -> tuple[jax.Array, jax.Array]:
+        here = scene_of(HAND, task, *step)
+        return reward_terms(here, task.reward)["heading_position"], errors(here)["heading_m"][0]
+
+    return jax.jit(found)
+
+
+def _drawn(task: TaskConfig, valid: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """Which blocks are active, and numbers of pose and trajectory, in many episodes; an affordance that a pose
+    overrides is not active, but is told by the region."""
+    drawn = _sampler(task)(_bank(valid), jax.random.key(3))
+    active = {name: np.asarray(block) for name, block in drawn.goal.active.items()} | {
+        "region": np.asarray(drawn.region) == 1
+    }
+    trajectory = np.asarray(drawn.goal["trajectory"].position)[:, -1, 0] / 0.01 + 2.5
+    return active, np.asarray(drawn.goal["pose"].q)[:, 0].round().astype(int), trajectory.round().astype(int)
+
+
+def test_a_trajectory_that_ends_nearer_to_the_avoid_region_is_never_drawn_beside_an_affordance():
+    active, _, trajectory = _drawn(TASK, np.ones(M, bool))
+    both, alone = active["trajectory"] & active["region"], active["trajectory"] & ~active["region"]
+    assert set(trajectory[both]) == {3, 4, 5}
+    assert set(trajectory[alone]) == set(range(M))
+    assert 0.2 < both.mean() < 0.3
+
+
+def test_where_no_trajectory_agrees_with_the_affordance_none_is_drawn():
+    active, pose, trajectory = _drawn(TASK, np.arange(M) < 3)
+    assert not (active["trajectory"] & active["region"]).any()
+    assert set(pose[active["pose_finger"] & active["region"]]) == {0, 1, 2}
+    assert set(trajectory[active["trajectory"]]) == {0, 1, 2}
+
+
+def test_pose_and_trajectory_are_drawn_independently():
+    active, pose, trajectory = _drawn(TASK, np.ones(M, bool))
+    both = active["pose_finger"] & active["trajectory"] & ~active["region"]
+    pairs = np.histogram2d(pose[both], trajectory[both], bins=np.arange(M + 1) - 0.5)[0]
+    assert pairs.min() > 0
+    expected = pairs.sum() / M**2  # 36 cells of some seven each: chi squared with 35 degrees of freedom
+    assert ((pairs - expected) ** 2 / expected).sum() < 80
+
+
+@pytest.mark.parametrize("few", [False, True])
+def test_aligned_pairs_are_drawn_where_they_are_asked_for(few):
+    active, pose, trajectory = _drawn(
+        dataclasses.replace(TASK, aligned_references=True), np.arange(M) != 4 if few else np.ones(M, bool)
+    )
+    both = active["pose_finger"] & active["trajectory"]
+    np.testing.assert_array_equal(pose[both], trajectory[both])
+    assert set(pose[both & active["region"]]) == ({3, 5} if few else {3, 4, 5})
+    assert set(pose[both & ~active["region"]]) == ({0, 1, 2, 3, 5} if few else set(range(M)))
+    alone = active["pose_finger"] & ~active["trajectory"] & active["region"]
+    assert set(pose[alone]) == ({0, 1, 2, 3, 5} if few else set(range(M)))
+
+
+@pytest.mark.parametrize("on", [{"pose"}, {"pose", "trajectory"}, {"trajectory"}, set()])
+@pytest.mark.parametrize("dynamic", [True, False])
+def test_heading_guidance_and_reward_know_one_center(dynamic, on):
+    """Where the hand is at its target with the fingers of its start, the heading that the rules made is met to 0 m."""
+    task = dataclasses.replace(TASK, dynamic_center=dynamic)
+    state, surface, goal = scene(21)
+    goal, q = _begun(surface, goal, {name: np.full(4, name in on) for name in ("affordance", "pose", "trajectory")})
+    wrist = goal["trajectory"] if "trajectory" in on else goal["pose"] if on else None
+    if wrist is None:
+        center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, q)))
+        here = heading_wrist_pose(HAND, goal["heading"], center)
+    else:
+        here = tuple(array.reshape(4, -1, array.shape[-1])[:, -1] for array in wrist[-2:])
+    position, quaternion = in_world(state.object_position, state.object_quaternion, *here)
+    there = state._replace(
+        q=np.asarray(q),
+        q_initial=np.asarray(q),
+        u=np.zeros((4, 6), np.float32),
+        base_position=np.asarray(position),
+        base_quaternion=np.asarray(quaternion),
+    )
+    for value in _heading(task)(there, surface, goal):
+        np.testing.assert_allclose(value, 0.0, atol=1e-5)
+    still = _heading(task)(there._replace(q=state.q_target), surface, goal)[1]
+    assert (np.asarray(still) < 1e-5).all() != dynamic
