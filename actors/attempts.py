@@ -11,15 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors import initial
+from actors import initial, protocols
 from actors.env import metric_names
 from actors.initial import RequestedEpisodes
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker, Trace
 from common.config import TaskConfig
 from common.hands.spec import Hand
+from common.objects.distance import distance_field
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, mean_action
+from common.task import plausibility
 from common.task.types import Array, Goal
 
 
@@ -33,7 +35,7 @@ class Outcome(NamedTuple):
     aligned: np.ndarray
     """(B,) bool."""
     metrics: dict[str, np.ndarray]
-    """(B,) each, by the names in `actors.env.metric_names`."""
+    """(B,) each, by the names in `actors.env.metric_names` and those of `actors.protocols.assess`."""
     trace: Trace
     """(T, B, ...)."""
 
@@ -41,7 +43,9 @@ class Outcome(NamedTuple):
 class Attempts:
     """A policy that grasps one object after another, each in several ways at once, by its mean action."""
 
-    def __init__(self, hand: Hand, task: TaskConfig, bundle: PolicyBundle, *, hold: int, threads: int):
+    def __init__(
+        self, hand: Hand, task: TaskConfig, bundle: PolicyBundle, *, hold: int, threads: int, lift: float = 0.0
+    ):
         """Compiles nothing yet.
 
         Args:
@@ -50,7 +54,9 @@ class Attempts:
           bundle: the policy.
           hold: control steps without the table.
           threads: threads of the physics.
+          lift: metres by which the hand goes up after the hold, as part of the episode.
         """
+        self._lift = lift
         self._hand, self._task, self._bundle = hand, task, bundle
         self._hold, self._threads = hold, threads
         self._worker: RolloutWorker | None = None
@@ -59,7 +65,8 @@ class Attempts:
     @property
     def steps(self) -> int:
         """T, control steps of an episode."""
-        return self._task.approach_steps + self._hold
+        lift = protocols.lift_steps(self._task, self._lift) if self._lift else 0
+        return self._task.approach_steps + self._hold + lift
 
     def run(
         self, obj: GraspObject, request: RequestedEpisodes, progress: Callable[[int], None] = lambda step: None
@@ -76,13 +83,20 @@ class Attempts:
         if self._worker is None or self._worker.batch != batch:
             self.close()
             self._worker = self._new_worker(obj, batch)
+        task, hold, height = self._task, self._hold, self._lift or protocols.LIFT_HEIGHT
         self._worker.replace_objects([obj], None)
+        self._worker.adjust(protocol=protocols.stress(task, [obj], hold, height), probe_data=distance_field([obj]))
         self._worker.begin(conditions)
-        rollout = self._worker.collect(self._bundle.inference_parameters, self.steps, progress)
-        names = metric_names(self._task)
-        values = np.asarray(rollout.episodes)[:, : len(names)].T
+        parameters = self._bundle.inference_parameters
+        rollout = self._worker.collect(parameters, task.approach_steps + hold, progress)
+        after = self._worker.collect(parameters, protocols.stress_steps(task, height))
+        parts = ((part.trace, part.probed) for part in (rollout, after))
+        trace, samples = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+        names = metric_names(task)
+        metrics = dict(zip(names, np.asarray(rollout.episodes)[:, : len(names)].T, strict=True))
+        metrics |= protocols.assess(samples, metrics["held"] > 0, task, hold, height)
         flags = (np.asarray(resolution.redirected), np.asarray(resolution.aligned))
-        return Outcome(resolution.goal, *flags, dict(zip(names, values, strict=True)), rollout.trace)
+        return Outcome(resolution.goal, *flags, metrics, Trace(*(field[: self.steps] for field in trace)))
 
     def renew(self, bundle: PolicyBundle) -> None:
         """Newer weights of the same policy; nothing is compiled anew."""
@@ -103,5 +117,14 @@ class Attempts:
 
         physics = NativePhysics(self._hand, self._task, [obj], self._threads)
         return RolloutWorker(
-            self._hand, self._task, physics, None, policy, batch=batch, seed=0, half_precision=False, traced=slice(None)
+            self._hand,
+            self._task,
+            physics,
+            None,
+            policy,
+            batch=batch,
+            seed=0,
+            half_precision=False,
+            probe=plausibility.sample,
+            traced=slice(None),
         )

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from actors import harvest, success
+from actors import harvest, protocols, success
 from actors.harvest import Grasps
 from actors.initial import InitialConditions
 from actors.physics.engine import Physics, PhysicsState, ResetState, where_environments
+from actors.protocols import Frame, Protocol
 from actors.success import Success
 from common.config import ControlConfig, RewardWeights, TaskConfig
 from common.hands.spec import Hand
@@ -54,6 +55,10 @@ class Settings(NamedTuple):
 
     weights: RewardWeights
     control: ControlConfig
+    protocol: Protocol | None = None
+    """What is done to hand and object after the table's removal; nothing by default."""
+    probe_data: Any = None
+    """Arrays that the probe of a rollout reads beside the scene."""
 
 
 class EnvState(NamedTuple):
@@ -72,7 +77,11 @@ class EnvState(NamedTuple):
     region: Array
     """(B,) int: the region of the constraint bank that the episodes were drawn from."""
     hold: Array
-    """(B,) control steps without the table before the episode ends."""
+    """(B,) control steps without the table that the episode's metrics are of."""
+    after: Array
+    """(B,) control steps that follow them before the episode ends."""
+    frame: Frame
+    """The carried frame in which the episode is seen; the world's where there is no protocol."""
     time: Array
     """(B,) control steps since the episode began."""
     q_target: Array
@@ -140,6 +149,8 @@ class GraspEnv:
             surface=initial.surface,
             region=initial.region,
             hold=initial.hold,
+            after=index,
+            frame=Frame(zero, zero),
             time=index,
             q_target=reset_state.q,
             u_target=jnp.zeros((batch, 6)),
@@ -174,14 +185,20 @@ class GraspEnv:
           settings: reward weights and control, may be traced; those of the task by default.
         """
         settings = settings or self.settings
-        target, joints, table = self.targets(state, action, settings)
-        physics, physics_state = self.physics.step(state.physics, joints, table)
+        target, command = self.targets(state, action, settings)
+        physics, physics_state = self.physics.step(state.physics, *command)
         return self.advance(state._replace(physics=physics), target, physics_state, settings)
 
-    def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, Array, Array]:
-        """Joint targets of an action; in the order of the engine (B, 6 + F); and (B,) bool where the table stands."""
-        target = decode(self.scene_of(state), settings.control, action)
-        return target, jnp.concatenate([target.u_target, target.q_target], -1), self.table_present(state)
+    def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, tuple[Array, ...]]:
+        """Joint targets of an action, and what the engine's step takes (`Physics.step`)."""
+        target, table = decode(self.scene_of(state), settings.control, action), self.table_present(state)
+        if settings.protocol is None:
+            return target, (jnp.concatenate([target.u_target, target.q_target], -1), table)
+        start, time = state.reset_state, state.time
+        frame = protocols.frame(settings.protocol, self.task, time + 1)
+        u_target = protocols.carried_targets(target.u_target, self.hand, start.base_quaternion, frame)
+        force = protocols.push(settings.protocol, self.task, time, start.object_index, start.mass_scale)
+        return target, (jnp.concatenate([u_target, target.q_target], -1), table, force)
 
     def advance(
         self, state: EnvState, target: Action, physics_state: PhysicsState, settings: Settings
@@ -200,6 +217,8 @@ class GraspEnv:
             q_target=jnp.where(physics_state.diverged[:, None], state.reset_state.q, target.q_target),
             u_target=jnp.where(physics_state.diverged[:, None], 0.0, target.u_target),
         )
+        if settings.protocol is not None:
+            state = state._replace(frame=protocols.frame(settings.protocol, task, state.time))
         state = self.with_scene(state, physics_state)
         scene = self.scene_of(state)
         tracked, up = success.track(task, state.success, scene, physics_state.diverged)
@@ -222,16 +241,19 @@ class GraspEnv:
             },
             terms=state.terms + stacked,
         )
-        terminal = state.time >= task.approach_steps + state.hold
+        over = state.time - state.hold - task.approach_steps
+        counts, terminal = over == 0, over >= state.after
         if task.end_when_fallen:
-            terminal |= (state.time >= task.approach_steps + task.hold_steps) & ~up
-        finished = jnp.where(terminal[:, None], self._episode(state, up), state.finished)
-        state = state._replace(finished=finished, has_finished=state.has_finished | terminal)
+            fell = (state.time >= task.approach_steps + task.hold_steps) & ~up & (over < 0)
+            counts, terminal = counts | fell, terminal | fell
+        finished = jnp.where(counts[:, None], self._episode(state, up), state.finished)
+        state = state._replace(finished=finished, has_finished=state.has_finished | counts)
         return state, Transition(reward, terminal, stacked, error, physics_state.occupancy)
 
     def with_scene(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
-        """The environments with the scene that the engine shows."""
+        """The environments with the scene that the engine shows, as the carried frame sees it."""
         reset_state = state.reset_state
+        physics_state = protocols.carried(physics_state, reset_state.base_quaternion, state.frame)
         scene = SceneState(
             q=physics_state.q,
             u=physics_state.u,

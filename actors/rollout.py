@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors import harvest, initial
+from actors import harvest, initial, protocols
 from actors.env import EnvState, GraspEnv, Settings, Transition, episode_fields
 from actors.initial import InitialConditions
 from actors.physics.engine import Physics, PhysicsState
@@ -26,12 +26,16 @@ from common.task.types import Action, Array
 
 Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
 """(parameters, observation (B, D) float32, random key) -> action (B, A), log-probability (B,)."""
-Probe = Callable[[Scene], Any]
-"""The scene after a control step -> a pytree of arrays that someone wants of every environment and step."""
+Probe = Callable[[Scene, Array, Any], Any]
+"""(the scene after a control step, the objects' indices (B,), `Settings.probe_data`) -> a pytree of arrays that someone
+wants of every environment and step."""
 
 
 class Trace(NamedTuple):
-    """What is kept of one environment, or of several, at every step, for logs and pictures (T leads)."""
+    """What is kept of one environment, or of several, at every step, for logs and pictures (T leads).
+
+    Poses are the world's, also where the policy sees a carried frame (`actors.protocols`).
+    """
 
     q: Array
     u: Array
@@ -85,8 +89,8 @@ class _Decision(NamedTuple):
     action: Array
     log_probability: Array
     target: Action
-    joints: Array
-    table: Array
+    command: tuple[Array, ...]
+    """What the engine's step takes."""
 
 
 class RolloutWorker:
@@ -103,7 +107,7 @@ class RolloutWorker:
         batch: int,
         seed: int,
         half_precision: bool,
-        probe: Probe = lambda scene: None,
+        probe: Probe = lambda scene, index, data: None,
         traced: int | slice = 0,
     ):
         """Starts fresh episodes, if there is a bank.
@@ -136,6 +140,10 @@ class RolloutWorker:
         self.state: EnvState | None = None
         if bank is not None:
             self.restart()
+
+    def adjust(self, **settings: Any) -> None:
+        """Other `Settings` by name, from the next control step on; what is new in kind or shape is compiled anew."""
+        self._settings = self._settings._replace(**settings)
 
     def configure(self, weights: RewardWeights, *, stationary: bool) -> None:
         """Sets the reward's weights, and whether the objects of episodes that start from now on are held in place."""
@@ -224,9 +232,10 @@ class RolloutWorker:
         action, log_probability = self._policy(parameters, observation.astype(jnp.float32), key)
         return _Decision(observation, action, log_probability, *self.env.targets(state, action, settings))
 
-    def _kept(self, state: EnvState, action: Array, transition: Transition) -> tuple[Trace, Any]:
+    def _kept(self, state: EnvState, action: Array, transition: Transition, settings: Settings) -> tuple[Trace, Any]:
         """What trace and probe keep of a step."""
-        return _traced(state, action, transition, self._task, self._traced), self._probe(self.env.scene_of(state))
+        probed = self._probe(self.env.scene_of(state), state.reset_state.object_index, settings.probe_data)
+        return _traced(state, action, transition, self._task, self._traced), probed
 
     def _advance(
         self,
@@ -243,7 +252,7 @@ class RolloutWorker:
         Of the state only what changed is returned, because every array that passes through a call has its price.
         """
         after, transition = self.env.advance(state, decision.target, physics_state, settings)
-        kept = self._kept(after, decision.action, transition)
+        kept = self._kept(after, decision.action, transition, settings)
         following = self._decide(parameters, settings, after, jax.random.wrap_key_data(keys[step]))
         changed = {name: new for name, new in after._asdict().items() if new is not getattr(state, name)}
         changed.pop("scene")
@@ -260,7 +269,7 @@ class RolloutWorker:
         state = self.state._replace(scene=())
         rows, extras = [], []
         for step in range(1, steps + 1):
-            _, physics_state = self.physics.step(None, np.asarray(decision.joints), np.asarray(decision.table))
+            _, physics_state = self.physics.step(None, *map(np.asarray, decision.command))
             row = decision[:3]
             changed, transition, kept, decision = self._advance_jit(
                 parameters, settings, state, physics_state, decision, key_data, step
@@ -318,7 +327,7 @@ class RolloutWorker:
             observation = self._observe(state)
             action, log_probability = self._policy(parameters, observation.astype(jnp.float32), step_key)
             state, transition = self.env.step(state, action, settings)
-            kept = self._kept(state, action, transition)
+            kept = self._kept(state, action, transition, settings)
             carry = state, episode_key
             if bank is not None:
                 ended = jnp.any(transition.terminal)
@@ -339,14 +348,15 @@ def _traced(state: EnvState, action: Array, transition: Transition, task: TaskCo
     errors = [
         a[where] / jnp.maximum(b[where], 1.0) for a, b in (transition.errors[s.name] for s in metrics.specs(task))
     ]
+    way, slid = protocols.up(state.frame.height), protocols.slides(scene.base_quaternion, state.frame.height)
     return Trace(
         q=scene.q[where],
-        u=scene.u[where],
+        u=(scene.u + slid)[where],
         q_target=scene.q_target[where],
-        u_target=scene.u_target[where],
-        wrist_position=features.wrist_position[where],
+        u_target=(scene.u_target + slid)[where],
+        wrist_position=(features.wrist_position + way)[where],
         wrist_quaternion=features.wrist_quaternion[where],
-        object_position=scene.object_position[where],
+        object_position=(scene.object_position + way)[where],
         object_quaternion=scene.object_quaternion[where],
         contact_force=force,
         action=action[where],

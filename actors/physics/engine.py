@@ -71,8 +71,15 @@ class Physics(Protocol):
     def reset(self, state: Any, mask: Array, reset_state: ResetState) -> Any:
         """Environments where mask (B,) is true start anew from `reset_state`; the others go on."""
 
-    def step(self, state: Any, target: Array, table: Array) -> tuple[Any, PhysicsState]:
-        """One control step with joint targets (B, 6 + F), wrist first; table (B,) says where the table stands."""
+    def step(self, state: Any, target: Array, table: Array, force: Array | None = None) -> tuple[Any, PhysicsState]:
+        """One control step.
+
+        Args:
+          state: the environments.
+          target: (B, 6 + F) joint targets, wrist first.
+          table: (B,) bool, where the table stands.
+          force: (B, 3) on the object's centre of mass throughout the step, world frame, N; none by default.
+        """
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> Any:
         """Other objects, as many as before, for the environments that start anew from now on; present ones go on."""

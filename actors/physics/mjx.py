@@ -103,11 +103,15 @@ class MjxPhysics:
         merged, leaves, qpos_start = where_environments(mask, started, going)
         return MjxState(state.data.replace(**merged), leaves, qpos_start, state.pool)
 
-    def step(self, state: MjxState, target: Array, table: Array) -> tuple[MjxState, PhysicsState]:
+    def step(
+        self, state: MjxState, target: Array, table: Array, force: Array | None = None
+    ) -> tuple[MjxState, PhysicsState]:
         """One control step; see `Physics.step`."""
         where = self._where
         height = jnp.where(table, 0.0, TABLE_AWAY[2])
         data = state.data.replace(ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height))
+        if force is not None:
+            data = data.replace(xfrc_applied=data.xfrc_applied.at[:, where.object_body, :3].set(force))
 
         model = self._model.replace(**state.leaves)
 

@@ -94,10 +94,15 @@ class NativePhysics:
             self._start_instance(int(i), reset_state)
         return self
 
-    def step(self, state: Any, target: Any, table: Any) -> tuple["NativePhysics", PhysicsState]:
+    def step(
+        self, state: Any, target: Any, table: Any, force: Any | None = None
+    ) -> tuple["NativePhysics", PhysicsState]:
         """One control step; see `Physics.step`. Diverged environments are put back to their start and marked."""
         target, table = np.asarray(target), np.asarray(table)
         self.place_tables(table)
+        if force is not None:
+            for instance, push in zip(self.instances, np.asarray(force), strict=True):
+                instance.data.xfrc_applied[self._where.object_body, :3] = push
         # Threads take one after another from one iterator: contacts make some environments slower than others.
         environments = iter(range(len(self.instances)))
         list(self._pool.map(self._step_instances, [environments] * self.threads, [target] * self.threads))

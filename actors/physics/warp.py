@@ -89,9 +89,12 @@ class WarpPhysics:
         """Starts the masked environments anew; see `Physics.reset`."""
         return where_environments(mask, self._fresh(reset_state), state)
 
-    def step(self, state: WarpState, target: Array, table: Array) -> tuple[WarpState, PhysicsState]:
+    def step(
+        self, state: WarpState, target: Array, table: Array, force: Array | None = None
+    ) -> tuple[WarpState, PhysicsState]:
         """One control step; see `Physics.step`."""
         reset_state, batch = state.reset_state, state.qpos.shape[0]
+        force = jnp.zeros((batch, 3)) if force is None else force.astype(jnp.float32)
         handle, buffers = self._buffers[batch]
         qpos, qvel, warmstart, sensors, counts = control_step(
             handle,
@@ -100,6 +103,7 @@ class WarpPhysics:
             state.qacc_warmstart,
             target.astype(jnp.float32),
             table,
+            force,
             reset_state.object_index,
             reset_state.mass_scale,
             reset_state.friction,

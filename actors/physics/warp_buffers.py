@@ -159,6 +159,7 @@ def _control_step(
     qacc_warmstart: wp.array2d[float],
     ctrl: wp.array2d[float],
     table: wp.array[bool],
+    force: wp.array[wp.vec3],
     row: wp.array[int],
     mass_scale: wp.array[float],
     friction: wp.array[float],
@@ -171,7 +172,7 @@ def _control_step(
     occupancy: wp.array[int],
 ) -> None:
     """What JAX calls: finds the buffers by their handle and steps them; arrays as in `WarpPhysics.step`."""
-    placed = [table, row, mass_scale, friction, base_position, base_quaternion]
+    placed = [table, force, row, mass_scale, friction, base_position, base_quaternion]
     placed += [anchor_position, anchor_quaternion, stationary]
     _buffers[handle].control_step(qpos, qvel, qacc_warmstart, ctrl, placed, sensordata, occupancy)
 

@@ -46,6 +46,7 @@ class Leaves:
     mocap_pos: wp.array2d[wp.vec3]
     mocap_quat: wp.array2d[wp.quat]
     eq_active: wp.array2d[bool]
+    xfrc_applied: wp.array2d[wp.spatial_vector]
     geoms: wp.array[int]
     object_body: int
     object_dof: int
@@ -59,12 +60,13 @@ class Leaves:
 OBJECT_FIELDS = {name: field.type.dtype for name, field in Objects.vars.items()}
 """Fields of `Objects` and the types of their elements."""
 MODEL_LEAVES = [name for name in Leaves.vars if name.startswith(("geom_", "body_", "dof_"))]
-DATA_LEAVES = [name for name in Leaves.vars if name.startswith(("mocap_", "eq_"))]
+DATA_LEAVES = [name for name in Leaves.vars if name.startswith(("mocap_", "eq_", "xfrc_"))]
 
 
 @wp.kernel
 def place(
     table: wp.array[bool],
+    force: wp.array[wp.vec3],
     row: wp.array[int],
     mass_scale: wp.array[float],
     friction: wp.array[float],
@@ -107,6 +109,7 @@ def place(
     leaves.mocap_quat[env, leaves.anchor] = anchor_quaternion[env]
     leaves.mocap_pos[env, leaves.table] = wp.vec3(0.0, 0.0, wp.where(table[env], 0.0, leaves.table_away))
     leaves.eq_active[env, leaves.weld] = stationary[env]
+    leaves.xfrc_applied[env, body] = wp.spatial_vector(force[env], wp.vec3(0.0, 0.0, 0.0))
     if env == 0:
         occupancy[0] = 0
         occupancy[1] = 0

@@ -49,10 +49,10 @@ class Recorder(NativePhysics):
         self.commands: list[tuple[np.ndarray, np.ndarray]] = []
         """Targets (B, 6 + F) and tables (B,) of every control step."""
 
-    def step(self, state: Any, target: Any, table: Any) -> tuple[NativePhysics, PhysicsState]:
+    def step(self, state: Any, target: Any, table: Any, force: Any | None = None) -> tuple[NativePhysics, PhysicsState]:
         """One control step, written down."""
         self.commands.append((np.array(target), np.array(table)))
-        return super().step(state, target, table)
+        return super().step(state, target, table, force)
 
 
 def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> None:

@@ -7,9 +7,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from actors import protocols
 from actors.bank import build_bank
 from actors.env import EnvState, metric_names
 from actors.episode import episode_message
@@ -27,8 +29,17 @@ from common.task.types import Surface
 from common.wire.codec import Message
 from services.evaluate.noise import LEVELS, Noise, with_noise
 from services.evaluate.scores import Row, Sample, active_mask, joined, matching, summarise
-from services.evaluate.worlds import NOMINAL_FRICTION, evaluation_worker, protocol, sampling_config, two_seconds
+from services.evaluate.worlds import (
+    NOMINAL_FRICTION,
+    evaluation_worker,
+    measure,
+    protocol,
+    sampling_config,
+    two_seconds,
+)
 
+STRESSED = 200
+"""Episodes of a row that go on after the hold, lifted and pushed."""
 _PATIENCE = 100
 _ATTEMPTS = 40
 _REFERENCES = 4
@@ -105,7 +116,7 @@ class Evaluator:
             self._harvest_references(worker, constraints)
             if keep:
                 self._kept |= {constraint: {False: [], True: []} for constraint in constraints}
-            return self._gather(worker, constraints, episodes, progress, keep)
+            return self._gather(worker, constraints, episodes, progress, keep, min(episodes, STRESSED))
 
     def samples_of_pools(
         self,
@@ -129,6 +140,7 @@ class Evaluator:
                 self._bank = build_bank(self._hand, self.task, self.objects, self._seed + number)
                 self._harvested = False
                 worker.replace_objects(self.objects, self._bank)
+                measure(worker, self.task, self.objects)
                 worker.restart()
                 yield self._gather(worker, [constraint], episodes, progress)[constraint]
 
@@ -247,8 +259,9 @@ class Evaluator:
         episodes: int,
         progress: Callable[[int], None],
         keep: bool = False,
+        stressed: int = 0,
     ) -> dict[str, Sample]:
-        """Collects episodes until every row has enough; see `samples`.
+        """Collects episodes until every row has enough; the first `stressed` go on after the hold. See `samples`.
 
         Raises:
           CongraspError: a row's constraints are not allowed, or hardly ever drawn.
@@ -265,7 +278,7 @@ class Evaluator:
                     f"Of {seen} episodes only {counts[scarce]} had the constraints '{scarce}'.",
                     "Ask for fewer --episodes, or add objects that allow these constraints.",
                 )
-            batch, message = self._batch_of_episodes(worker)
+            batch, message = self._batch_of_episodes(worker, min(counts.values()) < stressed)
             seen += len(batch.values["success"])
             for name in constraints:
                 fits = matching(batch.values, name, self.task)
@@ -366,33 +379,39 @@ class Evaluator:
             traced=slice(None) if traced else slice(0),
         )
 
-    def _begin(self, worker: RolloutWorker) -> EnvState:
-        """Gives the episodes that begin now the full hold, whatever was drawn for them."""
+    def _begin(self, worker: RolloutWorker, after: int) -> EnvState:
+        """Gives the episodes that begin now the full hold and `after` steps more, whatever was drawn for them."""
         assert worker.state is not None
-        worker.state = worker.state._replace(hold=jnp.full_like(worker.state.hold, self._hold))
+        hold = jnp.full_like(worker.state.hold, self._hold)
+        worker.state = worker.state._replace(hold=hold, after=jnp.full_like(hold, after))
         return worker.state
 
-    def _batch_of_episodes(self, worker: RolloutWorker) -> tuple[Sample, Callable[[int], Message]]:
+    def _batch_of_episodes(
+        self, worker: RolloutWorker, stressed: bool = False
+    ) -> tuple[Sample, Callable[[int], Message]]:
         """One episode of every world, and what gives the recording of one; all of them begin and end together.
 
-        It is collected in pieces, so that a large batch's observations need not be in memory for all steps.
+        It is collected in pieces, so that a large batch's observations need not be in memory for all steps. If it is
+        `stressed`, what grasps survive after the hold is simulated too.
         """
         start, window = self.task.approach_steps, self.task.hold_steps
         length = start + self._hold
         piece = math.gcd(start, self._hold)
         piece = piece if piece >= 10 else length
-        probed: list[Any] = []
+        after = -(-protocols.stress_steps(self.task) // piece) * piece if stressed else 0
+        begun = self._begin(worker, after)
         traces: list[Trace] = []
-        begun = self._begin(worker)
-        for step in range(0, length, piece):
+        probed: list[Any] = []
+        for step in range(0, length + after, piece):
             rollout = worker.collect(self.bundle.inference_parameters, piece)
-            traces.append(rollout.trace)
-            if step + piece > start and step < start + window:
-                rows = slice(max(0, start - step), start + window - step)
-                probed.append([np.asarray(values)[rows].swapaxes(0, 1) for values in rollout.probed])
-        force, torque = (np.concatenate(parts, 1) for parts in zip(*probed, strict=True))
-        finished = finished_episodes(rollout, self.task)
+            probed.append(jax.tree.map(np.asarray, rollout.probed))
+            if step < length:
+                traces.append(rollout.trace)
+                finished = finished_episodes(rollout, self.task)
+        samples = jax.tree.map(lambda *parts: np.concatenate(parts), *probed)
+        force, torque = (x[start : start + window].swapaxes(0, 1) for x in (samples.link_force, samples.torque_share))
         values = {name: finished[f"episode/{name}"] for name in metric_names(self.task)}
+        values |= protocols.assess(samples, values["held"] > 0, self.task, self._hold)
 
         def message(world: int) -> Message:
             """The recording of one world's episode."""

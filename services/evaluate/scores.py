@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from actors.protocols import ASSESSED, SURVIVAL
 from common.config import TaskConfig
 from common.files import write_atomically
 from common.task.constraints import CONSTRAINTS, optional
 from common.task.constraints.priority import active_blocks
+from common.task.plausibility import CLEAN_MM
 
 TABLES = {
     "single": tuple(constraint.name for constraint in CONSTRAINTS),
@@ -130,6 +132,8 @@ class Row:
     diverged: float
     """Rate of episodes in which the physics failed."""
     paper: PaperRow | None
+    plausibility: dict[str, float | None] = dataclasses.field(default_factory=dict)
+    """Over all episodes: means of the measures, `_p95` of the deepest penetrations, and rates (`actors.protocols`)."""
     quantiles: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     """Of each error in successful episodes: least, every further hundredth, and greatest; 101 numbers."""
 
@@ -137,7 +141,7 @@ class Row:
         """The row as it is written to `--json`."""
         row = dataclasses.asdict(self)
         errors, forces, total = row.pop("errors"), row.pop("forces"), row.pop("episode_return")
-        return {**row, **errors, **forces, "return": total}
+        return {**row, **errors, **forces, **row.pop("plausibility"), "return": total}
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
@@ -208,8 +212,22 @@ def summarise(constraint: str, hand: str, sample: Sample, *, held_2s: bool, grou
         links_at_removal=float(values["links_at_removal"].mean()),
         diverged=float((values["bad"] > 0).mean()),
         paper=PAPER.get(hand, {}).get(f"{constraint}, {group.split(' ')[0]}" if group else constraint),
+        plausibility=_plausibility(values, held_2s),
         quantiles=quantiles,
     )
+
+
+def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, float | None]:
+    """Measures of a row's episodes; None where none was measured, and without the two seconds that rates speak of."""
+    row: dict[str, float | None] = {}
+    for name in ASSESSED:
+        column = values.get(name, np.zeros(0))
+        column = column[~np.isnan(column)]
+        rate = name == "clean" or name in SURVIVAL
+        row[name] = float(column.mean()) if len(column) and (held_2s or not rate) else None
+        if name in CLEAN_MM:
+            row[f"{name}_p95"] = float(np.percentile(column, 95)) if len(column) else None
+    return row
 
 
 def _forces(sample: Sample) -> dict[str, float | None]:
@@ -262,6 +280,19 @@ def write_json(rows: Sequence[Row], path: pathlib.Path, about: dict[str, Any]) -
 
 RATES = ("constraint", "episodes", "success", "held 2 s", "error", "paper")
 """Columns of the table that compares with the paper; `rate_cells` fills them."""
+PLAUSIBILITY = (
+    "constraint",
+    "hand in hand, mm",
+    "in table, mm",
+    "in object, mm",
+    "wrist m/s",
+    "m/s²",
+    "clean",
+    "lifted",
+    "pushed",
+)
+"""Columns of the table of plausibility (`plausibility_cells`): deepest penetration (mean, 95th percentile), peak speed
+and acceleration of the wrist, rates."""
 FORCES = ("constraint", "link, N", "sum, N", "torque, % of limit", "links in contact at table removal", "diverged")
 """Columns of the table of forces after the removal (mean, 95th percentile); `force_cells` fills them."""
 
@@ -295,13 +326,28 @@ def force_cells(row: Row) -> tuple[str, ...]:
     )
 
 
+def plausibility_cells(row: Row) -> tuple[str, ...]:
+    """A row's cells under `PLAUSIBILITY`."""
+    found = row.plausibility
+    depths = (_pair(found.get(name), found.get(f"{name}_p95"), 1.0) for name in CLEAN_MM)
+    peaks = (found.get(name) for name in ("wrist_speed", "wrist_acceleration"))
+    rates = (found.get(name) for name in ("clean", "lift_survival", "push_survival"))
+    return (
+        _name(row),
+        *depths,
+        *("-" if peak is None else f"{peak:.3g}" for peak in peaks),
+        *("-" if rate is None else _percent(rate) for rate in rates),
+    )
+
+
 def tables_of(rows: Sequence[Row], title: str) -> list[Any]:
-    """Rows as rich tables: rates and errors beside the paper's, then forces."""
+    """Rows as rich tables: rates and errors beside the paper's, plausibility, then forces."""
     from rich.table import Table
 
     tables = []
     for heading, columns, cells in (
         (title, RATES, rate_cells),
+        ("Plausibility of all episodes", PLAUSIBILITY, plausibility_cells),
         ("Forces after the removal: mean, 95th percentile", FORCES, force_cells),
     ):
         table = Table(title=heading, title_justify="left")

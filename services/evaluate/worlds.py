@@ -6,21 +6,20 @@ import pathlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
-
+from actors import protocols
 from actors.physics import make_physics
 from actors.rollout import RolloutWorker
 from common.config import TaskConfig
 from common.engines import PhysicsName
 from common.hands import get_hand
+from common.objects.distance import distance_field
 from common.objects.mjcf import CONTACT
 from common.objects.pool import object_scale
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, mean_action
+from common.task import plausibility
 from common.task.bank import ConstraintBank
 from common.task.constraints import optional
-from common.task.constraints.base import Scene
 from common.task.types import Array
 
 HOLD_SECONDS = 2.0
@@ -82,9 +81,9 @@ def evaluation_worker(
     seed: int,
     traced: slice,
 ) -> Iterator[RolloutWorker]:
-    """A worker whose worlds act by the policy's mean.
+    """A worker whose worlds act by the policy's mean, and whose probe is `common.task.plausibility.sample`.
 
-    Each step's probe holds forces of the links (B, L), N, and finger torques (B, F) as shares of their limits.
+    `measure` gives it the objects that it measures against.
 
     Args:
       bundle: the policy.
@@ -103,22 +102,27 @@ def evaluation_worker(
         """Mean action (B, A), and a log probability (B,) that nobody reads."""
         return mean_action(layout, parameters, observation), observation[..., 0] * 0.0
 
-    def probe(scene: Scene) -> tuple[Array, Array]:
-        """Forces and torques of one step."""
-        force = jnp.linalg.norm(scene.features.force, axis=-1)
-        return force.astype(jnp.float16), torque_share(scene).astype(jnp.float16)
-
     engine = make_physics(physics, hand, task, objects, threads=threads)
     try:
-        yield RolloutWorker(
-            hand, task, engine, bank, policy, batch=batch, seed=seed, half_precision=False, probe=probe, traced=traced
+        worker = RolloutWorker(
+            hand,
+            task,
+            engine,
+            bank,
+            policy,
+            batch=batch,
+            seed=seed,
+            half_precision=False,
+            probe=plausibility.sample,
+            traced=traced,
         )
+        measure(worker, task, objects)
+        yield worker
     finally:
         engine.close()
 
 
-def torque_share(scene: Scene) -> Array:
-    """(B, F) |clip(kp (q_target - q) - kv q_velocity, limit)| / limit: finger torques by the hand's position servos."""
-    gains = np.array([(joint.kp, joint.kv, joint.torque_limit) for joint in scene.hand.joints], np.float32)
-    torque = gains[:, 0] * (scene.state.q_target - scene.state.q) - gains[:, 1] * scene.state.q_velocity
-    return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)
+def measure(worker: RolloutWorker, task: TaskConfig, objects: Sequence[GraspObject]) -> None:
+    """Measures against these objects from now on; episodes that go on after their hold are under `protocols.stress`."""
+    protocol = protocols.stress(task, objects, task.hold_steps_max)
+    worker.adjust(protocol=protocol, probe_data=distance_field(objects))

@@ -13,6 +13,7 @@ import numpy as np
 from actors.attempts import Attempts, Outcome
 from actors.episode import episode_message
 from actors.initial import RequestedEpisodes
+from actors.protocols import ASSESSED
 from actors.rollout import Trace
 from common.errors import ContradictionError
 from common.hands import get_hand
@@ -84,6 +85,7 @@ class Grasp:
             "rest": self.rest,
             "constraints": list(self.motion.constraints),
             "links_at_removal": self.motion.metrics["links_at_removal"],
+            **{name: self.motion.metrics[name] for name in ASSESSED},
             **{name: self.motion.metrics[name] for name in _errors_of(self.motion.constraints)},
         }
 

@@ -1,0 +1,216 @@
+"""What is done to a grasp after the table is gone: the hand is carried upwards, and the object is pushed.
+
+The lift is a frame that moves: the policy sees hand and object as they are in it, so that its features and goals know
+nothing of the lift, and the wrist's joint targets get the way of the frame. Pushes are forces on the object. Both
+follow from the control steps since the table's removal, so that the episode goes on as it does everywhere else.
+"""
+
+import itertools
+import math
+import operator
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from actors.physics.engine import PhysicsState
+from common import rotations
+from common.config import TaskConfig
+from common.hands.spec import Hand
+from common.objects.spec import GraspObject
+from common.task import plausibility
+from common.task.plausibility import Sample
+from common.task.types import Array
+
+GRAVITY = 9.81
+"""m/s^2."""
+LIFT_HEIGHT, LIFT_SPEED, LIFT_ACCELERATION = 0.15, 0.3, 3.0
+"""m, m/s and m/s^2 of the lift that a grasp should survive."""
+PUSH_SECONDS = 0.25
+"""How long each push lasts."""
+PUSH_FORCE = 1.0
+"""N of the second six pushes; the first six are half of the object's weight."""
+FARTHEST, MOST_TURNED = 0.05, float(np.radians(15.0))
+"""m and rad from where the object was in the wrist's frame, beyond which it has not survived (DexGraspBench's)."""
+SURVIVAL = ("lift_survival", "push_survival_weight", "push_survival")
+"""Names of what a grasp survives."""
+ASSESSED = (*plausibility.MEASURES, "clean", *SURVIVAL)
+"""Names of all that `assess` returns."""
+_STILL_SECONDS = 0.1  # after the lift
+_DIRECTIONS = np.concatenate([np.stack([axis, -axis]) for axis in np.eye(3, dtype=np.float32)])
+
+
+class Protocol(NamedTuple):
+    """A lift, then six pushes with half of the object's weight and six with 1 N; times count from the table's removal.
+
+    The pushes are DexGraspBench's (one along each axis of the world and one against it), but follow one another in the
+    same grasp, last 0.25 s instead of 2 s, and act beside gravity; its force of ten times the mass is the 1 N of its
+    objects of 100 g.
+    """
+
+    lift_start: Array
+    """() control steps."""
+    lift_height: Array
+    """() m."""
+    push_start: Array
+    """() control steps."""
+    masses: Array
+    """(N,) kg, of the engine's objects."""
+
+
+class Frame(NamedTuple):
+    """How far and how fast the carried frame is above the world's, in B environments."""
+
+    height: Array
+    """(B,) m."""
+    speed: Array
+    """(B,) m/s."""
+
+
+def stress(task: TaskConfig, objects: Sequence[GraspObject], start: int, height: float = LIFT_HEIGHT) -> Protocol:
+    """The lift by `height` metres, then all pushes, from `start` control steps after the table's removal on."""
+    push_start = np.float32(start + lift_steps(task, height))
+    masses = np.array([obj.mass for obj in objects], np.float32)
+    return Protocol(np.float32(start), np.float32(height), push_start, masses)
+
+
+def lift_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
+    """Control steps of a lift and of the moment after it in which the hand comes to rest."""
+    seconds = height / LIFT_SPEED + LIFT_SPEED / LIFT_ACCELERATION + _STILL_SECONDS
+    return math.ceil(round(seconds / task.control_dt, 6))
+
+
+def push_steps(task: TaskConfig) -> int:
+    """Control steps of one push."""
+    return round(PUSH_SECONDS / task.control_dt)
+
+
+def stress_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
+    """Control steps of `stress`."""
+    return lift_steps(task, height) + 2 * len(_DIRECTIONS) * push_steps(task)
+
+
+def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
+    """The carried frame after `time` (B,) control steps of the episode.
+
+    Its speed rises and falls with at most `LIFT_ACCELERATION` and is at most `LIFT_SPEED`: a ramp, less the same ramp
+    by height / speed later.
+    """
+    since = (time - task.approach_steps - protocol.lift_start) * task.control_dt
+    rise = LIFT_SPEED / LIFT_ACCELERATION
+
+    def ramp(seconds: Array) -> tuple[Array, Array]:
+        """Way and speed of one that speeds up to `LIFT_SPEED` and goes on."""
+        speeding = jnp.clip(seconds, 0.0, rise)
+        way = 0.5 * LIFT_ACCELERATION * speeding**2 + LIFT_SPEED * jnp.maximum(seconds - rise, 0.0)
+        return way, LIFT_ACCELERATION * speeding
+
+    (up, rising), (down, falling) = ramp(since), ramp(since - protocol.lift_height / LIFT_SPEED)
+    return Frame(up - down, rising - falling)
+
+
+def push(protocol: Protocol, task: TaskConfig, time: Array, index: Array, mass_scale: Array) -> Array:
+    """(B, 3) force on the objects in the control step that begins `time` (B,) steps into the episode, world frame, N.
+
+    Args:
+      protocol: when.
+      task: length of a control step.
+      time: control steps since the episode began.
+      index: (B,) int, the objects.
+      mass_scale: (B,) factors of their masses.
+    """
+    number = jnp.floor((time - task.approach_steps - protocol.push_start) / push_steps(task)).astype(jnp.int32)
+    weight = GRAVITY * jnp.asarray(protocol.masses)[index] * mass_scale
+    newtons = jnp.where(number < len(_DIRECTIONS), 0.5 * weight, PUSH_FORCE)
+    newtons = jnp.where((number >= 0) & (number < 2 * len(_DIRECTIONS)), newtons, 0.0)
+    return newtons[:, None] * jnp.asarray(_DIRECTIONS)[number % len(_DIRECTIONS)]
+
+
+def carried(state: PhysicsState, base_quaternion: Array, frame: Frame) -> PhysicsState:
+    """Hand and object as the carried frame sees them.
+
+    Args:
+      state: in the world.
+      base_quaternion: (B, 4) of the wrist's base, whose axes the slides follow.
+      frame: the carried frame.
+    """
+    way, speed = up(frame.height), up(frame.speed)
+    return state._replace(
+        u=state.u - slides(base_quaternion, frame.height),
+        u_velocity=state.u_velocity - slides(base_quaternion, frame.speed),
+        object_position=state.object_position - way,
+        object_velocity=state.object_velocity - speed,
+        contact_position=state.contact_position - way[:, None, None],
+    )
+
+
+def carried_targets(u_target: Array, hand: Hand, base_quaternion: Array, frame: Frame) -> Array:
+    """Wrist targets (B, 6) of the carried frame in the world.
+
+    The servo's damping acts against the frame's speed; its targets lead by as much as makes up for that.
+    """
+    lead = hand.wrist.slide_kv / hand.wrist.slide_kp
+    return u_target + slides(base_quaternion, frame.height + lead * frame.speed)
+
+
+def slides(base_quaternion: Array, height: Array) -> Array:
+    """(B, 6) wrist joints that go up by `height` (B,)."""
+    return jnp.pad(rotations.rotate(rotations.conjugate(base_quaternion), up(height)), ((0, 0), (0, 3)))
+
+
+def up(length: Array) -> Array:
+    """Vectors (B, 3) upwards of these lengths (B,)."""
+    return jnp.pad(length[:, None], ((0, 0), (2, 0)))
+
+
+def assess(
+    samples: Sample, held: np.ndarray, task: TaskConfig, hold: int, height: float = LIFT_HEIGHT
+) -> dict[str, np.ndarray]:
+    """Measures (B,) of episodes and what their grasps survive.
+
+    Args:
+      samples: of the approach, the hold, and if it was simulated `stress`; NumPy arrays (T, B, ...).
+      held: (B,) bool, whether the object was held until the hold's end.
+      task: the task.
+      hold: control steps without the table.
+      height: of the lift, m.
+
+    Returns:
+      Those of `common.task.plausibility.measures`, of the time until the hold's end; `clean`, 0 or 1, which means what
+      it says where the hold is of two seconds; and those of `survival`, NaN where there was no `stress`.
+    """
+    end = task.approach_steps + hold
+    until, after = (jax.tree.map(operator.itemgetter(part), samples) for part in (slice(end), slice(end - 1, None)))
+    found = plausibility.measures(until, task.control_dt)
+    found |= {"clean": plausibility.is_clean(held, found), **survival(after, held, task, height)}
+    return {name: np.asarray(value, np.float32) for name, value in found.items()}
+
+
+def survival(samples: Sample, held: np.ndarray, task: TaskConfig, height: float = LIFT_HEIGHT) -> dict[str, np.ndarray]:
+    """Which grasps survived the parts of `stress`: (B,) 1 or 0 each, NaN where it was not simulated.
+
+    Every control step counts, and each part begins from where the object is then; what is lost in one part is lost in
+    the next ones too.
+
+    Args:
+      samples: of the last control step of the hold and of the `stress_steps` after it, NumPy arrays (1 + T, B, ...).
+      held: (B,) bool, whether the object was held until then.
+      task: length of a control step.
+      height: of the lift, m.
+
+    Returns:
+      `lift_survival`, `push_survival_weight` (six pushes with half of the object's weight), and `push_survival` (these
+      and six with 1 N).
+    """
+    six = len(_DIRECTIONS) * push_steps(task)
+    ends = np.cumsum([0, lift_steps(task, height), six, six])
+    kept = [np.asarray(held, bool)]
+    for first, last in itertools.pairwise(ends):
+        position, quaternion = samples.object_position[first : last + 1], samples.object_quaternion[first : last + 1]
+        way = np.linalg.norm(position - position[:1], axis=-1)
+        turn = 2 * np.arccos(np.minimum(np.abs((quaternion * quaternion[:1]).sum(-1)), 1.0))
+        kept.append(kept[-1] & ((way < FARTHEST) & (turn < MOST_TURNED)).all(0))
+    simulated = 1.0 if len(samples.object_position) > ends[-1] else np.nan
+    return {name: simulated * survived for name, survived in zip(SURVIVAL, kept[1:], strict=True)}

@@ -1,0 +1,240 @@
+"""Signed distance from an object's real surface, on grids that compiled functions sample.
+
+The surface is that of the primitives, or where an object has mesh pieces the mesh that pictures show, not the convex
+pieces that stand for it in the physics. Grids hold the distance exactly for primitives outside of them (the least over
+the pieces; inside of several pieces at once the distance is understated), and for meshes up to the sampling that finds
+the nearest triangle. Between grid points values are interpolated linearly. Measured against exact queries 2 to 22 mm
+outside of the surface, where the axes of fingers are: mean error 0.02 to 0.05 mm, 99th percentile below 0.3 mm
+(`tests/common/test_distance.py`).
+"""
+
+import contextlib
+import functools
+import hashlib
+import math
+import os
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.inputs import read_file
+from common.objects import shapes
+from common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
+from common.task.types import Array
+from common.wire.codec import Message, decode, encode
+
+CELLS = 1 << 17
+"""Grid points of an object: cells of 1.5 to 3 mm, in a quarter of a megabyte."""
+MARGIN = 0.024
+"""Metres around the object that its grid covers: the radius of the thickest capsule of a hand, and more."""
+_MOST = 1 << 28  # grid points of all objects together
+_SPACING, _SAMPLES = 1e-3, (4000, 120_000)  # of points on a mesh: m, and fewest and most
+_NEWTON = 12  # iterations to the nearest point of an ellipsoid
+
+
+class DistanceField(NamedTuple):
+    """Grids of N objects, each with M grid points of which the first ones are used; in the objects' frames."""
+
+    values: Array
+    """(N, M) float16: signed distance in metres, negative inside; the last axis of the grid runs fastest."""
+    origin: Array
+    """(N, 3) the first grid point, m."""
+    cell: Array
+    """(N,) spacing, m."""
+    shape: Array
+    """(N, 3) int: grid points along each axis."""
+
+    def at(self, index: Array, points: Array) -> Array:
+        """Signed distances (B, P) in metres; beyond a grid its border's plus the distance from it, which is too much.
+
+        Args:
+          index: (B,) int, the objects.
+          points: (B, P, 3) in their frames, m.
+        """
+        shape = self.shape[index][:, None]
+        place = (points - self.origin[index][:, None]) / self.cell[index][:, None, None]
+        inside = jnp.clip(place, 0.0, shape - 1.0)
+        low = jnp.minimum(inside.astype(jnp.int32), shape - 2)
+        share = inside - low
+        strides = jnp.stack([shape[..., 1] * shape[..., 2], shape[..., 2], jnp.ones_like(shape[..., 0])], -1)
+        first = index[:, None] * self.values.shape[-1] + jnp.sum(low * strides, -1)
+        flat = self.values.reshape(-1)
+        total = jnp.zeros(points.shape[:-1])
+        for corner in np.ndindex(2, 2, 2):
+            weight = jnp.prod(jnp.where(np.array(corner) == 1, share, 1.0 - share), -1)
+            found = flat.at[first + jnp.sum(np.array(corner) * strides, -1)].get(mode="promise_in_bounds")
+            total += weight * found.astype(jnp.float32)
+        return total + jnp.linalg.norm(place - inside, axis=-1) * self.cell[index][:, None]
+
+
+def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
+    """The grids of objects, on JAX's device; those of meshes are kept in the user's cache folder.
+
+    Args:
+      objects: N objects; beyond 2,048 of them grids become coarser, so that all need half a gigabyte.
+    """
+    cells = min(CELLS, _MOST // len(objects))
+    lattices = [_lattice(obj, cells) for obj in objects]
+    values = [
+        _mesh_values(obj, *lattice, cells)
+        if any(piece.kind == "mesh" for piece in obj.pieces)
+        else _primitive_values(_slots(obj.pieces), *lattice, cells)
+        for obj, lattice in zip(objects, lattices, strict=True)
+    ]
+    origin, cell, shape = (np.array(column) for column in zip(*lattices, strict=True))
+    return DistanceField(jnp.stack(values), jnp.asarray(origin), jnp.asarray(cell, jnp.float32), jnp.asarray(shape))
+
+
+def primitive_distance(pieces: Sequence[Piece], points: Array) -> Array:
+    """(n,) exact signed distance in metres of points (n, 3) of the object frame from primitive pieces.
+
+    That of the nearest piece: inside of several pieces at once it is understated.
+    """
+    return _least(_slots(pieces), jnp.asarray(points, jnp.float32))
+
+
+class _Slots(NamedTuple):
+    """Primitive pieces of one kind, S slots of which the first ones are used."""
+
+    used: np.ndarray  # (S,) bool
+    size: np.ndarray  # (S, 3)
+    position: np.ndarray  # (S, 3)
+    rotation: np.ndarray  # (S, 3, 3) from the piece's frame to the object frame
+
+
+def _slots(pieces: Sequence[Piece]) -> dict[str, _Slots]:
+    """Pieces by their kind, in as many slots as there are at most, so that one program serves all objects."""
+    found = {}
+    for kind, count in PRIMITIVE_SLOTS.items():
+        own = [piece for piece in pieces if piece.kind == kind]
+        filled = [*own, *[Piece(kind, (1.0, 1.0, 1.0))] * (count - len(own))]  # type: ignore[arg-type]
+        found[kind] = _Slots(
+            np.arange(len(filled)) < len(own),
+            np.array([piece.size for piece in filled], np.float32),
+            np.array([piece.pos for piece in filled], np.float32),
+            np.array([shapes.rotation(piece) for piece in filled], np.float32),
+        )
+    return found
+
+
+def _least(pieces: dict[str, _Slots], points: Array) -> Array:
+    """(n,) least distance of points (n, 3) from the pieces in use; traced."""
+    distance = {"box": _box, "cylinder": _cylinder, "capsule": _capsule, "ellipsoid": _ellipsoid}
+    least = jnp.full(len(points), jnp.inf)
+    for kind, slots in pieces.items():
+
+        def nearer(least: Array, slot: _Slots, of: Callable[[Array, Array], Array] = distance[kind]) -> Array:
+            # In the piece's frame; all of them are symmetric.
+            return jnp.minimum(least, of(jnp.abs((points - slot.position) @ slot.rotation), slot.size))
+
+        for i in range(len(slots.used)):
+            slot = _Slots(*(field[i] for field in slots))
+            least = jax.lax.cond(slot.used, nearer, lambda least, slot: least, least, slot)
+    return least
+
+
+def _box(x: Array, half: Array) -> Array:
+    """(n,) signed distance of points (n, k) whose coordinates are not negative from a box of half extents (k,)."""
+    beyond = x - half
+    return jnp.linalg.norm(jnp.maximum(beyond, 0.0), axis=-1) + jnp.minimum(jnp.max(beyond, -1), 0.0)
+
+
+def _cylinder(x: Array, size: Array) -> Array:
+    """The same from a cylinder of this radius and half length along z: a box in two dimensions."""
+    return _box(jnp.stack([jnp.hypot(x[:, 0], x[:, 1]), x[:, 2]], -1), size[:2])
+
+
+def _capsule(x: Array, size: Array) -> Array:
+    """The same from a capsule of this radius and half length along z."""
+    return jnp.linalg.norm(x.at[:, 2].set(jnp.maximum(x[:, 2] - size[1], 0.0)), axis=-1) - size[0]
+
+
+def _ellipsoid(x: Array, radii: Array) -> Array:
+    """The same from an ellipsoid.
+
+    The nearest point is r^2 x / (r^2 + t), with t the largest root of sum (r x / (r^2 + t))^2 = 1 (Eberly, "Distance
+    from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid", 2013). The left side falls and is convex, so that
+    Newton's method from below the root never overshoots.
+    """
+    squares, x = radii**2, jnp.maximum(x, 1e-3 * radii)  # in a plane of symmetry the root would be a pole
+
+    def newton(_: int, t: Array) -> Array:
+        share = (radii * x / (squares + t)) ** 2
+        slope = 2 * jnp.sum(share / (squares + t), -1, keepdims=True)
+        return t + (jnp.sum(share, -1, keepdims=True) - 1) / slope
+
+    t = jax.lax.fori_loop(0, _NEWTON, newton, jnp.max(radii * x - squares, -1, keepdims=True))
+    return jnp.sign(t[:, 0]) * jnp.linalg.norm(x * t / (squares + t), axis=-1)
+
+
+@functools.partial(jax.jit, static_argnames="cells")
+def _primitive_values(pieces: dict[str, _Slots], origin: Array, cell: Array, shape: Array, cells: int) -> Array:
+    """(cells,) float16 distances from primitive pieces at the points of a grid, and anything behind its last one."""
+    number = jnp.arange(cells)
+    place = jnp.stack([number // (shape[1] * shape[2]), number // shape[2] % shape[1], number % shape[2]], -1)
+    return _least(pieces, origin + cell * place).astype(jnp.float16)
+
+
+def _lattice(obj: GraspObject, cells: int) -> tuple[np.ndarray, float, np.ndarray]:
+    """First point (3,), spacing and size (3,) of a grid of at most `cells` points around an object."""
+    low, high = obj.visual_vertices.min(0) - MARGIN, obj.visual_vertices.max(0) + MARGIN
+    cell = float(np.prod(high - low) / cells) ** (1 / 3)
+    while np.prod(shape := np.ceil((high - low) / cell).astype(np.int32) + 1) > cells:
+        cell *= 1.01
+    return low.astype(np.float32), cell, shape
+
+
+def _mesh_values(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray, cells: int) -> np.ndarray:
+    """(cells,) float16 distances from a visual mesh at the points of a grid, and zeros; from the cache if possible."""
+    parts = [obj.visual_vertices.astype(np.float32), obj.visual_faces.astype(np.int32), origin, shape]
+    key = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:32]
+    file = _folder() / f"{key}.safetensors"
+    with contextlib.suppress(CongraspError, OSError, KeyError):
+        kept = decode(read_file(file, 4 * CELLS)).arrays["distance"]
+        if kept.shape == (cells,) and np.isfinite(kept).all():
+            return kept
+    found = _mesh_distance(obj, origin, cell, shape).astype(np.float16)
+    found = np.pad(found, (0, cells - len(found)))
+    with contextlib.suppress(CongraspError, OSError):  # without room on a disk it is made anew the next time
+        write_atomically(file, encode(Message({"distance": found}, {})))
+    return found
+
+
+def _folder() -> pathlib.Path:
+    """Where grids of meshes are kept."""
+    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "distances"
+
+
+def _mesh_distance(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
+    """(n,) signed distances from an object's visual mesh at the points of a grid.
+
+    The distance is that from the triangle on which the nearest of many samples lies. Inside is what the grid's border
+    cannot reach without coming within half a cell's diagonal of the surface; so neither the faces' winding nor small
+    holes matter, and walls thinner than two cells have no inside.
+    """
+    points = origin + cell * np.indices(shape.tolist()).reshape(3, -1).T
+    triangles = obj.visual_vertices[obj.visual_faces].astype(float)
+    mesh = trimesh.Trimesh(obj.visual_vertices, obj.visual_faces, process=False)
+    count = int(np.clip(mesh.area / _SPACING**2, *_SAMPLES))
+    samples, face = trimesh.sample.sample_surface(mesh, count, seed=0)
+    # Triangles too small to be sampled have their centres.
+    samples, face = np.concatenate([samples, triangles.mean(1)]), np.concatenate([face, np.arange(len(triangles))])
+    distance, nearest = cKDTree(samples).query(points, workers=-1)
+    on_triangle = trimesh.triangles.closest_point(triangles[face[nearest]], points)
+    distance = np.minimum(distance, np.linalg.norm(points - on_triangle, axis=-1))
+    free = (distance > 0.5 * math.sqrt(3.0) * cell).reshape(shape)
+    regions, _ = ndimage.label(free)
+    inside = free & (regions != regions[0, 0, 0])
+    if free.any():  # near the surface the side is that of the nearest point away from it
+        nearest_free = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
+        inside = inside[tuple(nearest_free)]
+    return np.where(inside.ravel(), -distance, distance)

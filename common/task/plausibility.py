@@ -1,0 +1,267 @@
+"""Whether a motion could be one of a real hand: penetration, speed, jerk and effort, from samples of control steps.
+
+All of it is computed from joint angles, poses and contact forces, so that it means the same in every engine. The hand's
+links are capsules. What is sampled in a control step is the state after it.
+"""
+
+import functools
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from common import rotations
+from common.hands import kinematics
+from common.hands.mjcf import overlapping
+from common.hands.spec import Hand
+from common.objects.distance import DistanceField
+from common.task.constraints.base import Scene
+from common.task.types import Array
+
+CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0}
+"""Deepest penetrations below which an episode is clean."""
+MEASURES = (
+    *CLEAN_MM,
+    *(f"wrist_{of}{which}" for of in ("speed", "acceleration") for which in ("", "_mean", "_p95")),
+    *("finger_jerk", "link_force", "link_force_peak", "torque_share", "torque_share_peak"),
+)
+"""Names of the `measures` of an episode."""
+_SPACING = 0.004
+"""Metres between points on a capsule's axis: a sharp edge 7 mm from the axis seems at most 0.3 mm further away."""
+
+
+class Sample(NamedTuple):
+    """What is kept of a control step of B environments."""
+
+    hand_hand: Array
+    """(B,) deepest penetration of two links that are not neighbours, m; 0 where there is none, as below."""
+    hand_table: Array
+    """(B,) deepest point of the hand below the table's top, m; 0 where the table is gone."""
+    hand_object: Array
+    """(B,) deepest penetration of a link and the object's real surface, m."""
+    wrist_velocity: Array
+    """(B, 3) of the wrist's origin, m/s."""
+    finger_velocity: Array
+    """(B, F) rad/s."""
+    link_force: Array
+    """(B, L) net contact force of the object on each link, N."""
+    torque_share: Array
+    """(B, F) finger torques as shares of their limits."""
+    object_position: Array
+    """(B, 3) of the object, wrist frame, m."""
+    object_quaternion: Array
+    """(B, 4) object frame to wrist frame."""
+
+
+class _Capsules(NamedTuple):
+    """A hand's capsules, in the wrist frame at zero."""
+
+    links: np.ndarray  # (C,) the link of each
+    ends: np.ndarray  # (C, 2, 3)
+    radii: np.ndarray  # (C,)
+    pairs: np.ndarray  # (2, Q) capsules that must not overlap
+    axis_links: np.ndarray  # (P,) the link of each point on the axes
+    axis_points: np.ndarray  # (P, 3)
+    axis_radii: np.ndarray  # (P,)
+
+
+def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
+    """What is kept of a control step.
+
+    Args:
+      scene: the scene after it.
+      index: (B,) int, the objects' rows in `field`.
+      field: signed distances from the objects' surfaces.
+    """
+    hand, state, features = scene.hand, scene.state, scene.features
+    transforms = kinematics.link_transforms(hand, state.q)
+    wrist = features.wrist_position, features.wrist_quaternion
+    half = jnp.float16  # of what is averaged
+    return Sample(
+        hand_hand=hand_hand(hand, transforms),
+        hand_table=jnp.where(state.table, hand_table(hand, transforms, *wrist), 0.0),
+        hand_object=hand_object(hand, transforms, features.object_position, features.object_quaternion, index, field),
+        wrist_velocity=state.u_velocity[..., :3],
+        finger_velocity=state.q_velocity,
+        link_force=jnp.linalg.norm(features.force, axis=-1).astype(half),
+        torque_share=torque_share(scene).astype(half),
+        object_position=features.object_position,
+        object_quaternion=features.object_quaternion,
+    )
+
+
+def hand_hand(hand: Hand, transforms: tuple[Array, Array]) -> Array:
+    """(B,) deepest overlap in metres of two links.
+
+    Pairs are those that collide in the hand's model with `hand_self_collision`: not a link with its parent, nor those
+    whose capsules nest in one another while the hand is open or at zero (`common.hands.mjcf.overlapping`).
+
+    Args:
+      hand: the hand.
+      transforms: of `common.hands.kinematics.link_transforms`.
+    """
+    capsules = _capsules(hand)
+    first, second = capsules.pairs
+    ends = _moved(transforms, np.repeat(capsules.links, 2), capsules.ends.reshape(-1, 3))
+    ends = ends.reshape(*ends.shape[:-2], -1, 2, 3)
+    apart = segment_distance(
+        ends[..., first, 0, :], ends[..., first, 1, :], ends[..., second, 0, :], ends[..., second, 1, :]
+    )
+    return jnp.maximum(jnp.max(capsules.radii[first] + capsules.radii[second] - apart, -1), 0.0)
+
+
+def hand_table(hand: Hand, transforms: tuple[Array, Array], wrist_position: Array, wrist_quaternion: Array) -> Array:
+    """(B,) how far in metres the hand's lowest point is below the plane z = 0.
+
+    Args:
+      hand: the hand.
+      transforms: of `common.hands.kinematics.link_transforms`.
+      wrist_position: (B, 3) world.
+      wrist_quaternion: (B, 4) world.
+    """
+    ends = (rotations.transform(wrist_position, wrist_quaternion, points) for points in _ends(hand, transforms))
+    lowest = jnp.minimum(*(points[..., 2] for points in ends))
+    return jnp.maximum(jnp.max(_capsules(hand).radii - lowest, -1), 0.0)
+
+
+def hand_object(
+    hand: Hand,
+    transforms: tuple[Array, Array],
+    object_position: Array,
+    object_quaternion: Array,
+    index: Array,
+    field: DistanceField,
+) -> Array:
+    """(B,) how deep in metres a link's capsule is in the object: its radius less the axis's distance from the surface.
+
+    So a finger that goes through a thin blade counts with its own thickness, not with the blade's.
+
+    Args:
+      hand: the hand.
+      transforms: of `common.hands.kinematics.link_transforms`.
+      object_position: (B, 3) wrist frame.
+      object_quaternion: (B, 4) object frame to wrist frame.
+      index: (B,) int, the objects' rows in `field`.
+      field: signed distances from the objects' surfaces.
+    """
+    capsules = _capsules(hand)
+    points = _moved(transforms, capsules.axis_links, capsules.axis_points)
+    local = rotations.inverse_transform(object_position, object_quaternion, points)
+    return jnp.maximum(jnp.max(capsules.axis_radii - field.at(index, local), -1), 0.0)
+
+
+def torque_share(scene: Scene) -> Array:
+    """(B, F) |clip(kp (q_target - q) - kv q_velocity, limit)| / limit: finger torques by the hand's position servos."""
+    gains = np.array([(joint.kp, joint.kv, joint.torque_limit) for joint in scene.hand.joints], np.float32)
+    torque = gains[:, 0] * (scene.state.q_target - scene.state.q) - gains[:, 1] * scene.state.q_velocity
+    return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)
+
+
+def segment_distance(a: Array, b: Array, c: Array, d: Array) -> Array:
+    """(...,) distance between the segments from a to b and from c to d (..., 3).
+
+    Ericson, "Real-Time Collision Detection" (2005), section 5.1.9.
+    """
+    u, v, w = b - a, d - c, a - c
+    uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
+    uw, vw = _dot(u, w), _dot(v, w)
+    across = uu * vv - uv * uv
+    s = jnp.where(across > 1e-14, jnp.clip((uv * vw - uw * vv) / jnp.maximum(across, 1e-14), 0.0, 1.0), 0.0)
+    t = jnp.clip((uv * s + vw) / jnp.maximum(vv, 1e-14), 0.0, 1.0)
+    s = jnp.clip((uv * t - uw) / jnp.maximum(uu, 1e-14), 0.0, 1.0)
+    return jnp.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
+
+
+def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
+    """Measures (B,) of episodes, over all of their control steps.
+
+    Accelerations are differences of successive velocities over the control step, the first from rest; jerks are second
+    differences, likewise.
+
+    Args:
+      samples: with leading axis T, NumPy arrays (T, B, ...).
+      control_dt: seconds of a control step.
+
+    Returns:
+      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm`: the deepest, mm. `wrist_speed` (m/s) and `wrist_acceleration`
+      (m/s^2): the peak, with `_mean` and `_p95` over the episode's steps. `finger_jerk`: root mean square over joints
+      and steps, rad/s^3. `link_force_peak` (N) of the hardest pressing link, `link_force` the mean of links that touch
+      (0 where none ever does). `torque_share` and `torque_share_peak`: over joints and steps.
+    """
+    wrist, fingers = (np.asarray(x, np.float32) for x in (samples.wrist_velocity, samples.finger_velocity))
+    force, torque = (np.asarray(x, np.float32) for x in (samples.link_force, samples.torque_share))
+    acceleration = np.diff(wrist, axis=0, prepend=0 * wrist[:1]) / control_dt
+    jerk = np.diff(fingers, n=2, axis=0, prepend=np.zeros_like(fingers[:2])) / control_dt**2
+    found = {
+        f"{name}_mm": 1e3 * np.max(getattr(samples, name), 0) for name in ("hand_hand", "hand_table", "hand_object")
+    }
+    for name, vectors in (("wrist_speed", wrist), ("wrist_acceleration", acceleration)):
+        size = np.linalg.norm(vectors, axis=-1)
+        found |= {name: size.max(0), f"{name}_mean": size.mean(0), f"{name}_p95": np.percentile(size, 95, axis=0)}
+    return found | {
+        "finger_jerk": np.sqrt((jerk**2).mean((0, 2))),
+        "link_force": force.sum((0, 2)) / np.maximum((force > 0).sum((0, 2)), 1),
+        "link_force_peak": force.max((0, 2)),
+        "torque_share": torque.mean((0, 2)),
+        "torque_share_peak": torque.max((0, 2)),
+    }
+
+
+def is_clean(held: np.ndarray, found: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(B,) bool: the object was held for two seconds without the table, and nothing penetrated deeper than `CLEAN_MM`.
+
+    Args:
+      held: (B,) bool.
+      found: the `measures`.
+    """
+    return np.all([held, *(found[name] < limit for name, limit in CLEAN_MM.items())], 0)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Dot products over the last axis."""
+    return jnp.sum(a * b, -1)
+
+
+def _ends(hand: Hand, transforms: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Both ends (..., C, 3) of the hand's capsules, wrist frame."""
+    capsules = _capsules(hand)
+    start, end = (_moved(transforms, capsules.links, capsules.ends[:, side]) for side in (0, 1))
+    return start, end
+
+
+def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarray) -> Array:
+    """Points (P, 3) of links (P,) at zero, (..., P, 3) where the links are now, wrist frame."""
+    rotation, translation = transforms
+    turned = rotations.apply(rotation[..., links, :, :], jnp.asarray(points)[:, None])[..., 0, :]
+    return turned + translation[..., links, :]
+
+
+@functools.cache
+def _capsules(hand: Hand) -> _Capsules:
+    """The hand's capsules, and which of them must not overlap."""
+    found = [(i, capsule) for i, link in enumerate(hand.links) for capsule in link.capsules]
+    links = np.array([i for i, _ in found])
+    ends = np.array([(capsule.start, capsule.end) for _, capsule in found], np.float32)
+    radii = np.array([capsule.radius for _, capsule in found], np.float32)
+    names = [link.name for link in hand.links]
+    nested = {frozenset(pair) for pair in (*overlapping(hand), *((link.name, link.parent) for link in hand.links))}
+    first, second = np.triu_indices(len(found), 1)
+    apart = [
+        a != b and frozenset((names[a], names[b])) not in nested
+        for a, b in zip(links[first], links[second], strict=True)
+    ]
+    axes = [
+        np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / _SPACING)).astype(np.float32)
+        for start, end in ends
+    ]
+    counts = [len(points) for points in axes]
+    return _Capsules(
+        links,
+        ends,
+        radii,
+        np.stack([first, second])[:, apart],
+        np.repeat(links, counts),
+        np.concatenate(axes).astype(np.float32),
+        np.repeat(radii, counts),
+    )
