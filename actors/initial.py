@@ -2,11 +2,12 @@
 Initialization) or given."""
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from actors.physics.engine import ResetState
 from common import rotations
@@ -60,19 +61,90 @@ def sample(
       batch: B.
       stationary: () bool, holds the objects in place (the paper's first phase).
     """
-    keys = iter(jax.random.split(key, 5))
-    uniform = lambda: jax.random.uniform(next(keys), (batch,))  # noqa: E731
+    keys = iter(jax.random.split(key, 3))
     objects = jax.random.randint(next(keys), (batch,), 0, bank.points.shape[0])
     rests = jax.random.randint(next(keys), (batch,), 0, bank.rest.shape[1])
-    draw = Draw(bank, objects, rests, jnp.zeros(batch, jnp.int32), {})
-    asked: dict[str, Array] = {}
+    wanted = {
+        c.name: jax.random.uniform(own_key(key, c.name, 0), (batch,)) < getattr(task, f"p_{c.name}")
+        for c in optional(task)
+    }
+    return _drawn(hand, task, Draw(bank, objects, rests), next(keys), wanted, stationary)
+
+
+class PlannedEpisodes(NamedTuple):
+    """B episodes whose objects and constraints are decided on, and what their draws depend on beside these."""
+
+    objects: np.ndarray
+    """(B,) int."""
+    rests: np.ndarray
+    """(B,) int, resting poses."""
+    names: np.ndarray
+    """(B,) uint32, of the objects: their place in the bank counts for nothing."""
+    numbers: np.ndarray
+    """(B,) int, of the episode among those of its object."""
+
+
+def planned(
+    hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, plan: PlannedEpisodes, asked: Sequence[str]
+) -> InitialConditions:
+    """Planned episodes under the constraints of these names; each draws from a key of its own.
+
+    So an episode is the same whichever others there are.
+
+    Args:
+      hand: the hand.
+      task: ranges.
+      bank: what is drawn from; it must allow the constraints (`allowing`).
+      key: random key of all episodes under these constraints.
+      plan: the episodes.
+      asked: names of the optional constraints that every episode has.
+    """
+
+    def one(episode: PlannedEpisodes) -> InitialConditions:
+        own = jax.random.fold_in(jax.random.fold_in(key, episode.names), episode.numbers)
+        draw = Draw(bank, episode.objects[None], episode.rests[None])
+        return _drawn(hand, task, draw, own, {c.name: jnp.array([c.name in asked]) for c in optional(task)}, False)
+
+    return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(one)(plan))
+
+
+def allowing(task: TaskConfig, bank: ConstraintBank, asked: Collection[str]) -> np.ndarray:
+    """(N, R) bool: objects and resting poses in which the constraints of these names can be drawn together."""
+    objects, rests = (jnp.asarray(axis.ravel()) for axis in np.indices(bank.has_affordance.shape))
+    wanted = {c.name: jnp.full(objects.shape, c.name in asked) for c in optional(task)}
+    draw, found = _available(task, Draw(bank, objects, rests), wanted)
+    fine = jnp.ones(objects.shape, bool)
+    for name, wish in wanted.items():
+        fine &= found[name] == wish
+    if task.aligned_references:
+        fine &= jnp.any(_allowed_together(task, draw, wanted), -1)
+    return np.asarray(fine).reshape(bank.has_affordance.shape)
+
+
+def _available(task: TaskConfig, draw: Draw, wanted: Mapping[str, Array]) -> tuple[Draw, dict[str, Array]]:
+    """The draw with its region, and which of the wanted constraints (B,) can be had, in the order of the tuple."""
+    asked, draw = {}, draw._replace(region=jnp.zeros_like(draw.objects))
     for constraint in optional(task):
-        wanted = jax.random.uniform(own_key(key, constraint.name, 0), (batch,)) < getattr(task, f"p_{constraint.name}")
-        asked[constraint.name] = wanted & constraint.available(draw)
+        asked[constraint.name] = wanted[constraint.name] & constraint.available(draw)
         draw = draw._replace(region=jnp.maximum(draw.region, constraint.region * asked[constraint.name]))
+    return draw, asked
+
+
+def _drawn(
+    hand: Hand,
+    task: TaskConfig,
+    draw: Draw,
+    key: Array,
+    wanted: Mapping[str, Array],
+    stationary: Array | bool,
+) -> InitialConditions:
+    """What is left to draw of B episodes of given objects, resting poses and (where they can be had) constraints."""
+    bank, batch = draw.bank, draw.objects.shape
+    mass, friction, length = (jax.random.uniform(part, batch) for part in jax.random.split(key, 3))
+    draw, asked = _available(task, draw, wanted)
     draw = draw._replace(reference=_references(task, draw, asked, key))
     values = {c.name: c.sample(hand, draw, own_key(key, c.name, 1)) for c in known(task)}
-    surface = Surface(bank.points[objects], bank.avoid[objects])
+    surface = Surface(bank.points[draw.objects], bank.avoid[draw.objects])
     goal = resolve(hand, surface, Goal(values, {}), asked).goal
     low, high = task.mass_range
     friction_low, friction_high = task.friction_range
@@ -80,14 +152,14 @@ def sample(
         hand,
         task,
         goal,
-        bank.rest[objects, rests],
-        objects=objects,
-        mass_scale=low + (high - low) * uniform(),
-        friction=friction_low + (friction_high - friction_low) * uniform(),
-        stationary=jnp.broadcast_to(stationary, (batch,)),
+        bank.rest[draw.objects, draw.rests],
+        objects=draw.objects,
+        mass_scale=low + (high - low) * mass,
+        friction=friction_low + (friction_high - friction_low) * friction,
+        stationary=jnp.broadcast_to(stationary, batch),
     )
     # Squared, so that short holds, whose beginning every episode shares, stay the rule.
-    longer = jnp.floor(uniform() ** 2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
+    longer = jnp.floor(length**2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
     hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
     return InitialConditions(reset_state, goal, surface, draw.region, hold)
 
@@ -98,17 +170,27 @@ def _references(task: TaskConfig, draw: Draw, asked: Mapping[str, Array], key: A
     Each draws its own (the paper's potentially misaligned pairs). With `aligned_references` all take one that every
     constraint which is asked for allows; where there is none, each its own.
     """
-    allowed = {c.name: c.allowed(draw) for c in optional(task) if c.from_reference}
-    together = jnp.ones_like(draw.allowed)
-    for name, own in allowed.items():
-        together &= own | ~asked[name][:, None]
+    together = _allowed_together(task, draw, asked)
     found = {}
-    for name, own in allowed.items():
+    for name, own in _allowed(task, draw).items():
         if task.aligned_references:
             own = jnp.where(jnp.any(together, -1, keepdims=True), together, own)
         order = jax.random.uniform(own_key(key, "reference" if task.aligned_references else name, 2), own.shape)
         found[name] = jnp.argmax(jnp.where(own, order, -1.0), -1)
     return found
+
+
+def _allowed(task: TaskConfig, draw: Draw) -> dict[str, Array]:
+    """References (B, M) bool that each constraint which is drawn from them allows."""
+    return {c.name: c.allowed(draw) for c in optional(task) if c.from_reference}
+
+
+def _allowed_together(task: TaskConfig, draw: Draw, asked: Mapping[str, Array]) -> Array:
+    """(B, M) bool: references that every constraint which is asked for allows."""
+    together = jnp.ones_like(draw.allowed)
+    for name, own in _allowed(task, draw).items():
+        together &= own | ~asked[name][:, None]
+    return together
 
 
 def own_key(key: Array, name: str, stage: int) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 
 from actors import harvest, initial, protocols
 from actors.env import EnvState, GraspEnv, Settings, Transition, episode_fields
+from actors.harvest import Grasps
 from actors.initial import InitialConditions
 from actors.physics.engine import Physics, PhysicsState
 from common.config import RewardWeights, TaskConfig
@@ -155,7 +156,7 @@ class RolloutWorker:
         self._bank = bank
         if self.state is not None:
             self.state = self.state._replace(physics=physics if self.physics.compiled else None)
-            self._forget_grasps()
+            self.take_grasps()
 
     def restart(self) -> None:
         """Fresh episodes in every environment."""
@@ -182,22 +183,17 @@ class RolloutWorker:
         assert self._bank is not None, "these episodes are given"
         return self._bank
 
-    def forget_references(self) -> None:
-        """Episodes that start from now on have no reference pose or trajectory, until there are renewed ones."""
-        self._bank = self.bank._replace(pose_valid=jnp.zeros_like(self.bank.pose_valid))
-
     def renew_references(self) -> None:
         """Puts the grasps that succeeded since the last call into the bank as reference poses."""
-        assert self.state is not None
         self._key, key = jax.random.split(self._key)
-        self._bank = harvest.renew(self._hand, self._task, self.bank, self.state.grasps, key)
-        self._forget_grasps()
+        self._bank = harvest.renew(self._hand, self._task, self.bank, self.take_grasps(), key)
 
-    def _forget_grasps(self) -> None:
-        """Marks the grasps as taken."""
-        assert self.state is not None
+    def take_grasps(self) -> Grasps:
+        """The grasps that succeeded since the last call."""
+        assert self.state is not None, "no episode was begun"
         grasps = self.state.grasps
         self.state = self.state._replace(grasps=grasps._replace(found=jnp.zeros_like(grasps.found)))
+        return grasps
 
     def collect(self, parameters: Any, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
         """The next `steps` control steps under these policy parameters.

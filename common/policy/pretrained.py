@@ -14,6 +14,12 @@ def pretrained_file(hand: str) -> pathlib.Path | None:
     return path if path.exists() else None
 
 
+def reference_file(hand: str) -> pathlib.Path | None:
+    """The file of a hand's reference policy, which knows no reference poses and no trajectories; None if none comes."""
+    path = _FOLDER / f"{get_hand(hand).name}-reference.safetensors"
+    return path if path.exists() else None
+
+
 def pretrained_hands() -> list[str]:
     """Names of the hands whose policies come with the package, in the package's order: the human hand is the first."""
     return [name for name in HANDS if (_FOLDER / f"{name}.safetensors").exists()]

@@ -1,6 +1,7 @@
 """The constraint bank: what the constraints of episodes are drawn from, stacked over a pool of objects."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from common.task.types import Array
@@ -53,9 +54,9 @@ class Draw(NamedTuple):
     """(B,) int."""
     rests: Array
     """(B,) int, resting pose."""
-    region: Array
+    region: Array = 0
     """(B,) int, the axis V: that of the constraints which are asked for so far."""
-    reference: Mapping[str, Array]
+    reference: Mapping[str, Array] = MappingProxyType({})
     """(B,) int by the name of each constraint that is drawn from references: one that it allows, if there is any."""
 
     @property

@@ -48,8 +48,8 @@ def generate(
       first_seed: Seed of the first of them; the others follow.
       hand: Name of the hand, or its file.
       references: closed: poses that close the hand around the object; policy: final states of a policy's grasps under
-        headings, as in the paper. Places that the policy does not fill are not allowed.
-      policy: Policy file for its references; by default the hand's pretrained one.
+        headings, as in the paper.
+      policy: Policy file for its references; by default the hand's reference policy, which never had any itself.
       folder: Folder of objects.
       out: Folder for the files.
       seed: Seed of the constraints.
@@ -87,27 +87,21 @@ def _references(
     import os
 
     from common.policy import bundle as bundles
-    from common.policy.pretrained import policy_file
+    from common.policy.pretrained import policy_file, reference_file
     from services.evaluate.evaluator import Evaluator
 
-    bundle = bundles.load(policy_file(policy, hand.name))
+    bundle = bundles.load(policy or reference_file(hand.name) or policy_file(None, hand.name))
     if bundle.spec.hand_name != hand.name:
         raise CongraspError(
             f"The policy is for the hand '{bundle.spec.hand_name}', not '{hand.name}'.",
             f"Set --hand {bundle.spec.hand_name}.",
         )
     evaluator = Evaluator(bundle, objects, threads=os.cpu_count() or 1, seed=seed)
-    advance, filled = track("Grasping: reference poses", None), (0, 0)
-
-    def progress(found: int, places: int) -> None:
-        """Remembers and shows how many places are filled."""
-        nonlocal filled
-        filled = found, places
-        advance(found)
-
-    constraints = evaluator.references(progress)
-    print(f"{filled[0]} of {filled[1]} places for reference poses are filled.")
-    return constraints
+    advance = track("Grasping: reference poses", None)
+    made = evaluator.references_of(bundle, lambda done, of: advance(done))
+    whole = made.grasps[:, 0]
+    print(f"Grasps for each object: {whole.min()} to {whole.max()}; where there is none, the hand is closed around it.")
+    return made.bank
 
 
 def import_captures(

@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 import tyro
 
 from actors.physics import PhysicsName
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from services.cli.console import Track
 
 Split = Literal["all", "training", "held-out"]
-Table = Literal["single", "composed", "objects", "noise", "all"]
+Table = Literal["single", "composed", "cross", "objects", "noise", "all"]
 _POOL = 64
 _PICTURED = 4
 _MOST = 50_000
@@ -38,24 +39,28 @@ def evaluate(
     pictures: pathlib.Path | None = None,
     hand: str = "human",
     method: str | None = None,
+    by: Literal["object"] | None = None,
     friction: float = 1.0,
 ) -> int:
     """Evaluate a policy by the paper's protocol, beside the paper's figures.
 
     An episode has 50 control steps with the table and 2 s without it. Success is counted after the paper's 25 steps
     without the table, and again after the 2 s (held). Rates come with 95 % Wilson intervals; errors and forces are
-    those of successful episodes in the paper's window of 25 steps. The policy acts by its mean. Reference poses and
-    trajectories are made from its own grasps under headings, as the paper makes them for its hands.
+    those of successful episodes in the paper's window of 25 steps. The policy acts by its mean. Every object has
+    the same number of episodes in a row, which is the same whatever other rows are asked for. Reference poses and
+    trajectories are grasps of a reference policy, which never had any, as the paper makes them for its hands: 20 an
+    object, of which the last fifth is evaluated. They are kept in ~/.cache/congrasp for the next evaluation.
 
     Args:
       policy: A policy file (policy.safetensors of a run); by default a pretrained one.
-      table: single: one constraint a row; composed: two; objects: the heading alone on many objects, by size, mass and
-        family; noise: poses and trajectories with errors, as captured ones have; all: everything. Several may be
+      table: single: one constraint a row; composed: two, pose and trajectory each for itself, then aligned pairs;
+        cross: the rows of the paper's cross-dataset table; objects: the heading alone on many objects, by size, mass
+        and family; noise: poses and trajectories with errors, as captured ones have; all: everything. Several may be
         named.
       objects: Objects to grasp: a folder as 'congrasp objects import' takes it, or one that it made. By default
         procedural objects of seeds that training never uses.
       constraints: Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import'; its
-        references are used instead of the policy's own grasps. Objects without a set are left out.
+        references are used instead of the reference policy's. Objects without a set are left out.
       split: Of these sets all constraints, the 80 % for training, or those that are held out.
       episodes: Episodes in each row; of the table 'objects', episodes in all.
       physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
@@ -68,6 +73,7 @@ def evaluate(
       method: Which method this is: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp,
         no-dynamic-center, no-feedforward, two-phase or single-stage. A policy of another is refused; by default the
         policy says.
+      by: object: also print the rates of each object; --json always has them.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.
     """
@@ -77,8 +83,8 @@ def evaluate(
     from common.task.methods import evaluated_as, get_method
     from services.assets.objects.named import objects_of
     from services.cli.console import tracked
+    from services.evaluate.protocol import objects_label
     from services.evaluate.scores import write_json
-    from services.evaluate.worlds import objects_label
 
     _check(friction, episodes=(episodes, 1), pool=(pool, 0), batch=(batch, 0), seed=(seed, 0))
     policy = policy_file(policy, hand)
@@ -90,16 +96,15 @@ def evaluate(
     with tracked() as track:
         given, bank = objects_of(objects, track=track) if objects else None, None
         if constraints is not None:
-            given, bank = _captured(constraints, split, given, objects)
+            given, bank, settings["paper"] = _captured(constraints, split, given, objects)
         found = _evaluate(loaded, given, bank, table, episodes, pool, settings, track, keep=pictures is not None)
     source = objects_label(loaded, objects)
-    rows = [dataclasses.replace(row, method=loaded.task.method) for row in found.rows]
     what = f"{policy.name}, version {loaded.version}"
     if loaded.task.method != "ours":
         what = f"method {loaded.task.method}" + (f", {what}" if get_method(loaded.task.method).learns else "")
-    _show(found, f"{what}, on {source}, {engine}, friction {friction:g}")
+    _show(found, f"{what}, on {source}, {engine}, friction {friction:g}", by == "object")
     if json is not None:
-        write_json(rows, json, _about(policy, loaded, objects, source, constraints, split) | settings)
+        write_json(found.rows, json, _about(policy, loaded, objects, source, constraints, split) | settings)
     if pictures is not None:
         _draw(found, loaded, episodes, pictures)
     return 0
@@ -118,6 +123,8 @@ class _Found(NamedTuple):
     """Rows under noise."""
     rows: list[Any]
     """All rows."""
+    references: str
+    """Where reference poses and trajectories come from; empty if no row has any."""
 
 
 def _check(friction: float, **counts: tuple[int, int]) -> None:
@@ -144,6 +151,7 @@ def _evaluate(
     """The rows of the named tables; see `evaluate`."""
     from common.task.methods import takes
     from services.evaluate.noise import LEVELS
+    from services.evaluate.plan import from_references
     from services.evaluate.scores import TABLES, known_rows
 
     wanted = {*TABLES, "noise", "objects"} if "all" in table else set(table)
@@ -160,6 +168,9 @@ def _evaluate(
     evaluator: Any = None
     if names or "noise" in wanted:
         evaluator = _evaluator(loaded, given, bank, pool or _POOL, settings, track)
+    source = ""
+    if "noise" in wanted or any(from_references(name) for name in names):
+        source = _references(evaluator, track)
     if names:
         names, left_out = evaluator.allowed(names)
         rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=keep)
@@ -168,7 +179,22 @@ def _evaluate(
     many = []
     if "objects" in wanted:
         many = _object_rows(loaded, given, pool or min(episodes, _MOST), episodes, settings, track)
-    return _Found(evaluator, names, left_out, noisy, [*rows, *noisy, *many])
+    return _Found(evaluator, names, left_out, noisy, [*rows, *noisy, *many], source)
+
+
+def _references(evaluator: Any, track: "Track") -> str:
+    """Makes the references, where none were given, and says where they come from."""
+    from services.evaluate.references import reference_policy
+
+    advance = track("Reference grasps", None)
+    made = evaluator.references(lambda done, of: advance(done))
+    if made is None:
+        return "References are those of the constraint sets."
+    _, who = reference_policy(evaluator.bundle)
+    whole = made.grasps[:, 0]
+    closed = [obj.name for obj, count in zip(evaluator.objects, whole, strict=True) if not count]
+    text = f"References: grasps of {who}, {np.median(whole):.0f} an object (median), the last fifth held out."
+    return text + (f" The hand closed around the object where it holds none: {', '.join(closed)}." if closed else "")
 
 
 def _console() -> "Console":
@@ -180,13 +206,15 @@ def _console() -> "Console":
     return Console(highlight=False, width=None if sys.stdout.isatty() else 160)
 
 
-def _show(found: _Found, title: str) -> None:
-    """Prints the tables, and why rows were left out."""
-    from services.evaluate.scores import tables_of
+def _show(found: _Found, title: str, by_object: bool) -> None:
+    """Prints the tables, where references come from, and why rows were left out."""
+    from services.evaluate.scores import object_table, tables_of
 
     console = _console()
-    for shown in tables_of(found.rows, title):
+    for shown in tables_of(found.rows, title) + ([object_table(found.rows)] if by_object else []):
         console.print(shown)
+    if found.references:
+        console.print(found.references, markup=False, soft_wrap=True)
     for error in found.left_out:
         console.print(f"Left out: {error}", markup=False, soft_wrap=True)
 
@@ -230,8 +258,10 @@ def _draw(found: _Found, loaded: Any, episodes: int, pictures: pathlib.Path) -> 
 
 def _captured(
     folder: pathlib.Path, split: Split, given: "list[GraspObject] | None", objects: pathlib.Path | None
-) -> "tuple[list[GraspObject], ConstraintBank]":
-    """The objects that have a constraint set in a folder, and the constraint bank of their sets."""
+) -> "tuple[list[GraspObject], ConstraintBank, str]":
+    """The objects that have a constraint set in a folder, the bank of their sets, and the paper's table of their data
+    set."""
+    from services.evaluate.paper import CAPTURED_SETS
     from services.grasp.constraint_sets import bank_of, load_for
 
     if given is None:
@@ -239,7 +269,9 @@ def _captured(
     chosen, sets = load_for(folder, given)
     if not sets:
         raise CongraspError(f"{folder} holds no constraint set of an object in {objects}.", "Name matching folders.")
-    return chosen, bank_of(sets, split)
+    sources = {made.meta.get("source", "") for made in sets}
+    table = CAPTURED_SETS.get(sources.pop(), "") if len(sources) == 1 else ""
+    return chosen, bank_of(sets, split), table
 
 
 def _evaluator(
@@ -256,7 +288,7 @@ def _evaluator(
     from common.config import ObjectsConfig
     from common.objects.pool import HELD_OUT_SEED, load_pool
     from services.evaluate.evaluator import Evaluator
-    from services.evaluate.worlds import two_seconds
+    from services.evaluate.protocol import two_seconds
 
     track("Making constraints", None)
     return Evaluator(

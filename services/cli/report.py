@@ -54,9 +54,9 @@ def report(
     from services.cli.console import tracked
     from services.evaluate.evaluator import Evaluator
     from services.evaluate.failures import failure_sheets
+    from services.evaluate.protocol import objects_label, two_seconds
     from services.evaluate.report import Commands, Picture, count_causes, template, write_report
     from services.evaluate.scores import TABLES, known_rows
-    from services.evaluate.worlds import objects_label, two_seconds
     from services.viz.sheets import png_of
 
     _check(out, episodes=episodes, pool=pool)

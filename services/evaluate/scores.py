@@ -11,15 +11,17 @@ import numpy as np
 from actors.protocols import ASSESSED, SURVIVAL
 from common.config import TaskConfig
 from common.files import write_atomically
-from common.task.constraints import CONSTRAINTS, optional
-from common.task.constraints.priority import active_blocks
+from common.task.constraints import CONSTRAINTS
 from common.task.plausibility import CLEAN_MM
+from services.evaluate.paper import PaperRow, paper_row
+from services.evaluate.plan import ALIGNED
 
 TABLES = {
     "single": tuple(constraint.name for constraint in CONSTRAINTS),
-    "composed": ("pose+trajectory", "trajectory+affordance"),
+    "composed": ("pose+trajectory", f"pose+trajectory{ALIGNED}", "trajectory+affordance"),
+    "cross": ("heading", "pose", "trajectory", "pose+trajectory"),
 }
-"""Rows of the paper's tables, by the constraints that are active."""
+"""Rows of the paper's tables, by the constraints that are active; the aligned pairs are none of the paper's."""
 ERRORS = {c.name: {spec.name: spec.column or spec.name for spec in c.errors} for c in CONSTRAINTS}
 """Of each constraint: names of its errors among the metrics of episodes and in the rows."""
 _UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
@@ -27,46 +29,6 @@ PROBED_EPISODES = 2000
 """Forces are read from this many episodes of a row at most."""
 _HUNDREDTHS = np.linspace(0, 1, 101)
 _SIZES = ("small", "medium", "large")
-
-
-@dataclasses.dataclass(frozen=True)
-class PaperRow:
-    """Figures of the paper's method: success, and errors by the names of the rows."""
-
-    success: float
-    errors: dict[str, float] = dataclasses.field(default_factory=dict)
-
-
-PAPER = {
-    "human": {
-        "heading": PaperRow(0.969, {"heading_rad": 0.137, "heading_m": 0.020}),
-        "pose": PaperRow(0.964, {"pose_rad": 0.253, "pose_m": 0.017}),
-        "trajectory": PaperRow(0.955, {"traj_rad": 0.162, "traj_m": 0.029}),
-        "affordance": PaperRow(0.982, {"affordance_ratio": 0.016}),
-        "pose+trajectory": PaperRow(0.865, {"pose_rad": 0.327, "pose_m": 0.046, "traj_rad": 0.156, "traj_m": 0.028}),
-        "trajectory+affordance": PaperRow(0.923, {"traj_rad": 0.185, "traj_m": 0.027, "affordance_ratio": 0.045}),
-        "heading, small": PaperRow(0.929),
-        "heading, medium": PaperRow(0.936),
-        "heading, large": PaperRow(0.917),
-    },
-    "allegro": {
-        "heading": PaperRow(0.904, {"heading_rad": 0.160, "heading_m": 0.016}),
-        "pose": PaperRow(0.957, {"pose_rad": 0.145, "pose_m": 0.019}),
-        "trajectory": PaperRow(0.944, {"traj_rad": 0.082, "traj_m": 0.026}),
-        "affordance": PaperRow(0.918, {"affordance_ratio": 0.006}),
-    },
-    "sharpa": {
-        "heading": PaperRow(0.967, {"heading_rad": 0.114, "heading_m": 0.013}),
-        "pose": PaperRow(0.992, {"pose_rad": 0.145, "pose_m": 0.014}),
-        "trajectory": PaperRow(0.987, {"traj_rad": 0.079, "traj_m": 0.022}),
-        "affordance": PaperRow(0.959, {"affordance_ratio": 0.010}),
-    },
-}
-"""The paper's rows for its human hand (single, composed and large-scale tables) and its robot hands (table of hands).
-
-The human reference pose is the one of the table of hands, whose poses are procedural as here, and which is harder to
-beat; on captured poses the paper has 87.4 %, 0.316 rad and 0.036 m.
-"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,10 +76,12 @@ class Row:
     hand: str
     method: str
     group: str
-    """Which objects: empty for all of them."""
+    """Which objects or pairs: empty for all of them."""
     episodes: int
-    objects: int
-    """Different objects among the episodes."""
+    covered: int
+    """Objects that allow the row's constraints."""
+    pool: int
+    """Objects that were asked for."""
     success: float
     success_low: float
     success_high: float
@@ -136,6 +100,8 @@ class Row:
     """Over all episodes: means of the measures, `_p95` of the deepest penetrations, and rates (`actors.protocols`)."""
     quantiles: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     """Of each error in successful episodes: least, every further hundredth, and greatest; 101 numbers."""
+    objects: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    """Of each object with episodes: its name, their number, and its rates."""
 
     def to_json(self) -> dict[str, Any]:
         """The row as it is written to `--json`."""
@@ -156,32 +122,35 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 
 def known_rows(tables: Iterable[str], task: TaskConfig) -> list[str]:
     """Rows of some of `TABLES` whose constraints the task's policy knows."""
-    return [row for table in tables for row in TABLES[table] if set(row.split("+")) <= set(task.constraints)]
+    rows = dict.fromkeys(row for table in tables for row in TABLES[table])
+    return [row for row in rows if set(row.removesuffix(ALIGNED).split("+")) <= set(task.constraints)]
 
 
-def active_mask(constraint: str, task: TaskConfig) -> dict[str, bool]:
-    """Which blocks of the observation are active in an episode that belongs to a row."""
-    parts = constraint.split("+")
-    found = active_blocks({c.name: np.bool_(c.name in parts) for c in optional(task)})
-    return {block: bool(active) for block, active in found.items()}
-
-
-def matching(values: dict[str, np.ndarray], constraint: str, task: TaskConfig) -> np.ndarray:
-    """(E,) bool: episodes in which exactly the row's constraints were active."""
-    wanted = active_mask(constraint, task)
-    return np.all([(values[f"mask_{block}"] > 0) == active for block, active in wanted.items()], 0)
-
-
-def summarise(constraint: str, hand: str, sample: Sample, *, held_2s: bool, group: str = "") -> Row:
-    """A row from the episodes that count for it.
+def summarise(
+    name: str,
+    hand: str,
+    sample: Sample,
+    *,
+    held_2s: bool,
+    objects: Sequence[str],
+    group: str = "",
+    method: str = "ours",
+    paper: str = "",
+) -> Row:
+    """A row from its episodes.
 
     Args:
-      constraint: name of the row.
+      name: of the row, see `services.evaluate.plan.plan_row`.
       hand: name of the hand.
       sample: its episodes.
       held_2s: whether the episodes lasted for two seconds without the table.
+      objects: names of the pool's objects, those without an episode too.
       group: which objects these are, such as "small (below 8 cm)".
+      method: `common.task.methods`.
+      paper: which of the paper's tables it stands beside, see `services.evaluate.paper`.
     """
+    constraint = name.removesuffix(ALIGNED)
+    group = group or ("aligned pairs" if name.endswith(ALIGNED) else "")
     values = sample.values
     success, held = values["success"] > 0, values["held"] > 0
     low, high = wilson(int(success.sum()), len(success))
@@ -196,10 +165,11 @@ def summarise(constraint: str, hand: str, sample: Sample, *, held_2s: bool, grou
     return Row(
         constraint=constraint,
         hand=hand,
-        method="ours",
+        method=method,
         group=group,
         episodes=len(success),
-        objects=len(np.unique(values["object_index"])),
+        covered=len(np.unique(values["object_index"])),
+        pool=len(objects),
         success=float(success.mean()),
         success_low=low,
         success_high=high,
@@ -211,10 +181,27 @@ def summarise(constraint: str, hand: str, sample: Sample, *, held_2s: bool, grou
         episode_return=float(values["return"].mean()),
         links_at_removal=float(values["links_at_removal"].mean()),
         diverged=float((values["bad"] > 0).mean()),
-        paper=PAPER.get(hand, {}).get(f"{constraint}, {group.split(' ')[0]}" if group else constraint),
+        paper=paper_row(paper, hand, method, constraint, group),
         plausibility=_plausibility(values, held_2s),
         quantiles=quantiles,
+        objects=_by_object(values, objects, held_2s),
     )
+
+
+def _by_object(values: dict[str, np.ndarray], objects: Sequence[str], held_2s: bool) -> list[dict[str, Any]]:
+    """Rates of each object that has episodes, in the pool's order."""
+    rows = []
+    for index in np.unique(values["object_index"]).astype(int):
+        own = values["object_index"] == index
+        rates = {"success": values["success"][own] > 0}
+        if held_2s:
+            rates["held_2s"] = values["held"][own] > 0
+            if "clean" in values:
+                rates["clean"] = values["clean"][own] > 0
+        rows.append(
+            {"name": objects[index], "episodes": int(own.sum())} | {key: float(x.mean()) for key, x in rates.items()}
+        )
+    return rows
 
 
 def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, float | None]:
@@ -278,7 +265,7 @@ def write_json(rows: Sequence[Row], path: pathlib.Path, about: dict[str, Any]) -
     write_atomically(path, json.dumps({**about, "rows": [row.to_json() for row in rows]}, indent=2).encode())
 
 
-RATES = ("constraint", "episodes", "success", "held 2 s", "error", "paper")
+RATES = ("constraint", "episodes", "objects", "success", "held 2 s", "error", "paper")
 """Columns of the table that compares with the paper; `rate_cells` fills them."""
 PLAUSIBILITY = (
     "constraint",
@@ -302,6 +289,7 @@ def rate_cells(row: Row) -> tuple[str, ...]:
     return (
         _name(row),
         str(row.episodes),
+        str(row.covered) if row.covered == row.pool else f"{row.covered} of {row.pool}",
         _rate(row.success, row.success_low, row.success_high),
         _rate(row.held_2s, row.held_2s_low, row.held_2s_high),
         _errors(row.errors),
@@ -357,6 +345,24 @@ def tables_of(rows: Sequence[Row], title: str) -> list[Any]:
             table.add_row(*cells(row))
         tables.append(table)
     return tables
+
+
+def object_table(rows: Sequence[Row]) -> Any:
+    """Success and held rate of each object (a line) in each row (a column), as a rich table."""
+    from rich.table import Table
+
+    table = Table(title="By object: success, held 2 s", title_justify="left")
+    table.add_column("object", no_wrap=True)
+    found = [{of["name"]: of for of in row.objects} for row in rows]
+    for row in rows:
+        table.add_column(_name(row))
+    for name in dict.fromkeys(name for of in found for name in of):
+        cells = []
+        for of in found:
+            rates = [of[name][key] for key in ("success", "held_2s") if key in of[name]] if name in of else []
+            cells.append(", ".join(_percent(rate) for rate in rates))
+        table.add_row(name, *cells)
+    return table
 
 
 def _name(row: Row) -> str:

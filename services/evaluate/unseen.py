@@ -11,8 +11,8 @@ from common.objects.spec import GraspObject
 from common.parallel import parallel_map
 from common.policy.bundle import PolicyBundle
 from services.evaluate.evaluator import Evaluator
+from services.evaluate.protocol import two_seconds
 from services.evaluate.scores import Row, Sample, joined, object_groups
-from services.evaluate.worlds import two_seconds
 
 POOL = 4096
 """Most objects that the worlds draw from at a time; then others take their place."""
@@ -74,6 +74,7 @@ def evaluate_objects(
         seed=seed,
         friction=friction,
         hold_steps=two_seconds(bundle.task),
+        paper="objects",
     )
     samples: list[Sample] = []
     traits: list[tuple[float, float, str]] = []

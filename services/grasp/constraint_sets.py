@@ -72,13 +72,20 @@ def make_sets(
             fitting[n],
             seed,
             {"object_scale": scale, "object_digest": store.digest(obj)},
+            shuffled=False,
         )
         for n, obj in enumerate(objects)
     ]
 
 
 def set_of(
-    hand: Hand, row: ConstraintBank, obj: GraspObject, seed: int, about: dict[str, Any] | None = None
+    hand: Hand,
+    row: ConstraintBank,
+    obj: GraspObject,
+    seed: int,
+    about: dict[str, Any] | None = None,
+    *,
+    shuffled: bool = True,
 ) -> Message:
     """The constraint set of one object.
 
@@ -88,6 +95,8 @@ def set_of(
       obj: the object.
       seed: of the constraints; the split into training and held-out is drawn from it.
       about: further facts for the file.
+      shuffled: whether any references may be held out; otherwise they are the last ones, as in evaluations
+        (`services.evaluate.references`).
     """
     # The bank fills an object's resting poses up to the most of any object by repeating them.
     again = np.flatnonzero((row.rest[1:] == row.rest[0]).all(-1))
@@ -114,7 +123,7 @@ def set_of(
         "trajectory/quaternion": row.trajectory_quaternion,
         "pose/allowed": row.pose_valid[:, :rests],
         "heading/training": _split(row.heading_position.shape[:2], seed),
-        "pose/training": _split(row.pose_q.shape[:2], seed),
+        "pose/training": _split(row.pose_q.shape[:2], seed if shuffled else None),
         "visual/vertices": np.asarray(obj.visual_vertices, np.float32),
         "visual/faces": np.asarray(obj.visual_faces, np.int32),
     }
@@ -137,9 +146,9 @@ def set_of(
     return Message(arrays, meta)
 
 
-def _split(shape: tuple[int, ...], seed: int) -> np.ndarray:
-    """(V, M) bool, true for 80 % of M (rounded up), the same in both regions."""
-    order = np.random.default_rng(seed).permutation(shape[1])
+def _split(shape: tuple[int, ...], seed: int | None) -> np.ndarray:
+    """(V, M) bool, true for 80 % of M (rounded up), the same in both regions; the first ones without a seed."""
+    order = np.arange(shape[1]) if seed is None else np.random.default_rng(seed).permutation(shape[1])
     return np.broadcast_to(order < np.ceil(_TRAINING * shape[1]), shape).copy()
 
 

@@ -17,9 +17,9 @@ from common.objects.store import Catalogue
 from common.policy import bundle as bundles
 from services.cli.main import load
 from services.evaluate.evaluator import Evaluator
+from services.evaluate.protocol import sampling_config
 from services.evaluate.scores import Sample, matching
 from services.evaluate.unseen import evaluate_objects, procedural_pools
-from services.evaluate.worlds import sampling_config
 from services.train.command import untrained
 
 CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))

@@ -1,0 +1,186 @@
+"""Episodes side by side under a policy's mean action: what evaluations and reference grasps are simulated with."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from actors import protocols
+from actors.env import EnvState, metric_names
+from actors.episode import episode_message
+from actors.harvest import Grasps
+from actors.initial import InitialConditions
+from actors.physics import make_physics
+from actors.rollout import RolloutWorker, Trace, finished_episodes
+from common.config import TaskConfig
+from common.engines import PhysicsName
+from common.hands import get_hand
+from common.objects.distance import distance_field
+from common.objects.spec import GraspObject
+from common.policy.bundle import PolicyBundle, mean_action
+from common.task import plausibility
+from common.task.types import Array, Surface
+from common.wire.codec import Message
+from services.evaluate.scores import Sample
+
+
+class Batch(NamedTuple):
+    """B episodes that were simulated together."""
+
+    sample: Sample
+    message: Callable[[int], Message]
+    """The recording of one of them, where traces are kept."""
+
+
+class Episodes:
+    """Batches of given episodes of one policy, each from its beginning to the end of the hold or beyond."""
+
+    def __init__(
+        self,
+        bundle: PolicyBundle,
+        task: TaskConfig,
+        objects: Sequence[GraspObject],
+        *,
+        hold: int,
+        batch: int,
+        physics: PhysicsName,
+        threads: int,
+        measured: bool = True,
+        traced: bool = False,
+    ):
+        """Starts the engine.
+
+        Args:
+          bundle: the policy.
+          task: the task, under `services.evaluate.protocol.protocol`.
+          objects: what is grasped, in the hand's size.
+          hold: control steps without the table.
+          batch: B.
+          physics: engine; not `auto`.
+          threads: threads of the `native` engine.
+          measured: whether plausibility is measured at every step (`common.task.plausibility`).
+          traced: whether every step of every episode is kept, for recordings.
+        """
+        self._bundle, self._task, self._hold, self.measured = bundle, task, hold, measured
+        self._hand, self.batch = get_hand(bundle.spec.hand), batch
+        layout = bundle.spec.layout
+
+        def policy(parameters: Any, observation: Array, key: Array) -> tuple[Array, Array]:
+            """Mean action (B, A), and a log probability (B,) that nobody reads."""
+            return mean_action(layout, parameters, observation), observation[..., 0] * 0.0
+
+        self._worker = RolloutWorker(
+            self._hand,
+            task,
+            make_physics(physics, self._hand, task, objects, threads=threads),
+            None,
+            policy,
+            batch=batch,
+            seed=0,
+            half_precision=False,
+            probe=plausibility.sample if measured else _effort,
+            traced=slice(None) if traced else slice(0),
+        )
+        self._measure(objects)
+
+    def __enter__(self) -> "Episodes":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._worker.physics.close()
+
+    def replace_objects(self, objects: Sequence[GraspObject]) -> None:
+        """Other objects, as many as before; nothing is compiled anew."""
+        self._worker.replace_objects(objects, None)
+        self._measure(objects)
+
+    def run(self, conditions: InitialConditions, *, stressed: bool = False) -> Batch:
+        """Simulates B episodes.
+
+        They are collected in pieces, so that a large batch's observations need not be in memory for all steps.
+
+        Args:
+          conditions: what they start from; their hold is that of these episodes.
+          stressed: whether what grasps survive after the hold is simulated too (`actors.protocols`).
+        """
+        task, worker = self._task, self._worker
+        start, window, length = task.approach_steps, task.hold_steps, task.approach_steps + self._hold
+        piece = math.gcd(start, self._hold)
+        piece = piece if piece >= 10 else length
+        after = -(-protocols.stress_steps(task) // piece) * piece if stressed else 0
+        begun = self._begin(conditions, after)
+        traces: list[Trace] = []
+        probed: list[Any] = []
+        for step in range(0, length + after, piece):
+            rollout = worker.collect(self._bundle.inference_parameters, piece)
+            probed.append(jax.tree.map(np.asarray, rollout.probed))
+            if step < length:
+                traces.append(rollout.trace)
+                finished = finished_episodes(rollout, task)
+        samples = jax.tree.map(lambda *parts: np.concatenate(parts), *probed)
+        values = {name: finished[f"episode/{name}"] for name in metric_names(task)}
+        if self.measured:
+            values |= protocols.assess(samples, values["held"] > 0, task, self._hold)
+        force, torque = (x[start : start + window].swapaxes(0, 1) for x in (samples.link_force, samples.torque_share))
+
+        def message(episode: int) -> Message:
+            """The recording of one episode."""
+            trace = Trace(
+                *(np.concatenate([np.asarray(x[:, episode]) for x in field]) for field in zip(*traces, strict=True))
+            )
+            return self._message(begun, trace, {name: float(x[episode]) for name, x in values.items()}, episode)
+
+        return Batch(Sample(values, force, torque), message)
+
+    def take_grasps(self) -> Grasps:
+        """Grasps of the last batch's episodes that may become references."""
+        return self._worker.take_grasps()
+
+    def _begin(self, conditions: InitialConditions, after: int) -> EnvState:
+        """Starts episodes with the full hold and `after` steps more, and returns how they begin."""
+        self._worker.begin(conditions._replace(hold=jnp.full_like(conditions.hold, self._hold)))
+        assert self._worker.state is not None
+        self._worker.state = self._worker.state._replace(after=jnp.full_like(conditions.hold, after))
+        return self._worker.state
+
+    def _measure(self, objects: Sequence[GraspObject]) -> None:
+        """Measures against these objects; episodes that go on after their hold are under `protocols.stress`."""
+        self._objects = objects
+        if self.measured:
+            stress = protocols.stress(self._task, objects, self._hold)
+            self._worker.adjust(protocol=stress, probe_data=distance_field(objects))
+
+    def _message(self, begun: EnvState, trace: Trace, metrics: dict[str, float], episode: int) -> Message:
+        """One episode, from how all of them began and what was recorded of it."""
+        return episode_message(
+            self._hand,
+            self._task,
+            trace,
+            begun.goal.row(episode),
+            Surface(*(np.asarray(field)[episode] for field in begun.surface)),
+            self._objects[int(np.asarray(begun.reset_state.object_index)[episode])],
+            {
+                "version": self._bundle.version,
+                "actor": "evaluation",
+                "success": metrics["success"] > 0,
+                "metrics": metrics,
+            },
+        )
+
+
+class _Effort(NamedTuple):
+    """What is kept of a control step where plausibility is not measured."""
+
+    link_force: Array
+    """(B, L) N."""
+    torque_share: Array
+    """(B, F)."""
+
+
+def _effort(scene: Any, index: Array, data: Any) -> _Effort:
+    """Forces of the links, and finger torques as shares of their limits."""
+    force = jnp.linalg.norm(scene.features.force, axis=-1)
+    return _Effort(force.astype(jnp.float16), plausibility.torque_share(scene).astype(jnp.float16))

@@ -1,0 +1,42 @@
+"""The task of an evaluation: which of a policy's settings count in it, and what its objects are called."""
+
+import dataclasses
+import pathlib
+
+from common.config import TaskConfig
+from common.hands import get_hand
+from common.objects.mjcf import CONTACT
+from common.objects.pool import object_scale
+from common.policy.bundle import PolicyBundle
+
+HOLD_SECONDS = 2.0
+"""How long a grasp should last without the table, beyond the paper's quarter of a second."""
+NOMINAL_FRICTION = CONTACT.friction[0]
+"""Sliding friction between hand and object, of evaluations that name no other."""
+
+
+def two_seconds(task: TaskConfig) -> int:
+    """Control steps in `HOLD_SECONDS`."""
+    return round(HOLD_SECONDS / task.control_dt)
+
+
+def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) -> TaskConfig:
+    """The task with `hold` control steps without the table, and objects of their own mass and of one sliding friction.
+
+    So rates compare between policies, whatever ranges they were trained with.
+    """
+    return dataclasses.replace(
+        task,
+        hold_steps=min(task.hold_steps, hold),
+        hold_steps_max=hold,
+        end_when_fallen=False,
+        mass_range=(1.0, 1.0),
+        friction_range=(friction, friction),
+    )
+
+
+def objects_label(bundle: PolicyBundle, folder: pathlib.Path | None) -> str:
+    """Name of the objects' source, with the factor on their lengths for the policy's hand."""
+    scale = object_scale(get_hand(bundle.spec.hand), bundle.task)
+    source = str(folder) if folder else "held-out procedural objects"
+    return source if scale == 1.0 else f"{source}, lengths x {scale:g} for the {bundle.spec.hand_name} hand"

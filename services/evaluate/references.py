@@ -1,0 +1,223 @@
+"""Reference poses and trajectories that no policy under test has made (paper, section Hand Morphology).
+
+A policy that never had poses or trajectories grasps every object under headings, on the whole surface and on the
+graspable region; final states of its successful episodes are the references, and approach paths to them the
+trajectories. The last fifth of each object's references is held out.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from actors import initial
+from actors.bank import POSES, make_references
+from actors.initial import PlannedEpisodes
+from common.config import TaskConfig
+from common.engines import ENGINES, PhysicsName
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.hands import get_hand
+from common.objects import store
+from common.objects.spec import GraspObject
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle
+from common.policy.pretrained import reference_file
+from common.task.bank import ConstraintBank
+from common.task.sampling.closed_poses import Poses
+from common.wire.codec import Message, decode, encode
+from services.evaluate.episodes import Episodes
+from services.evaluate.plan import RowPlan, batches
+from services.evaluate.protocol import protocol
+
+HELD_OUT = POSES // 5
+"""References of an object and region that tables are made with; the others are for training."""
+_ATTEMPTS = 3 * POSES
+"""Episodes of an object and region after which the grasps that there are must do."""
+_SPARE = 1.25
+"""Episodes for each reference that is still missing."""
+_SEED = 0
+
+
+class References(NamedTuple):
+    """A constraint bank with references, and where they come from."""
+
+    bank: ConstraintBank
+    grasps: np.ndarray
+    """(N, V) int: references of each object and region that are the reference policy's grasps; where there is none,
+    they are poses that close the hand around the object."""
+
+
+def reference_policy(bundle: PolicyBundle) -> tuple[PolicyBundle, str]:
+    """The reference policy of a policy's hand, and what to call it.
+
+    It comes with the package for the hands of its pretrained policies; for any other hand it is the policy itself,
+    which is asked for headings and affordances alone.
+    """
+    hand = get_hand(bundle.spec.hand)
+    if hand.reference == hand.name and (file := reference_file(hand.name)):
+        return bundles.load(file), f"the reference policy of the {hand.name} hand"
+    return bundle, "the policy itself, asked for headings and affordances"
+
+
+def make(
+    policy: PolicyBundle,
+    task: TaskConfig,
+    objects: Sequence[GraspObject],
+    bank: ConstraintBank,
+    *,
+    physics: PhysicsName,
+    threads: int,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> References:
+    """The bank with references of a reference policy; kept on disk, and found there by whoever asks again.
+
+    Args:
+      policy: the reference policy.
+      task: geometry of the approach, and which waypoints trajectories have.
+      objects: N objects, in the hand's size.
+      bank: of these objects (`actors.bank.build_bank`); its own references stand in where the policy makes none.
+      physics: engine; not `auto`.
+      threads: threads of the `native` engine.
+      progress: is told how many references there are, and how many at most.
+    """
+    kept = _folder() / f"{_key(policy, task, objects, physics)}.safetensors"
+    if found := _read(kept, bank):
+        return found
+    grasps = _grasp(policy, task, objects, bank, physics, threads, progress)
+    made = _filled(policy, task, bank, grasps)
+    arrays = {name: np.asarray(getattr(made.bank, name)) for name in _ARRAYS}
+    with contextlib.suppress(CongraspError):  # a full disk costs the next evaluation some time
+        write_atomically(kept, encode(Message({**arrays, "grasps": made.grasps}, {"kind": "references"})))
+    return made
+
+
+def held_out(bank: ConstraintBank) -> ConstraintBank:
+    """The bank with the references of tables alone."""
+    table = np.arange(bank.pose_valid.shape[-1]) >= bank.pose_valid.shape[-1] - HELD_OUT
+    return bank._replace(pose_valid=jnp.asarray(bank.pose_valid) & table)
+
+
+_ARRAYS = ("pose_q", "pose_position", "pose_quaternion", "trajectory_position", "trajectory_quaternion", "pose_valid")
+
+
+def _grasp(
+    policy: PolicyBundle,
+    task: TaskConfig,
+    objects: Sequence[GraspObject],
+    bank: ConstraintBank,
+    physics: PhysicsName,
+    threads: int,
+    progress: Callable[[int, int], None],
+) -> list[list[list[Poses]]]:
+    """At most `POSES` grasps of each object (N) and region (V)."""
+    own = protocol(policy.task, policy.task.hold_steps)
+    hand = get_hand(policy.spec.hand)
+    found: list[list[list[Poses]]] = [[[] for _ in range(2)] for _ in objects]
+    names = np.array([int(store.digest(obj)[:8], 16) for obj in objects], np.uint32)
+    regions = [initial.allowing(own, bank, asked) for asked in ((), ("affordance",))]
+    most = POSES * sum(int(allowed.any(1).sum()) for allowed in regions)
+    size = min(ENGINES[physics].batch, 1 << (most - 1).bit_length())
+    with Episodes(
+        policy, own, objects, hold=own.hold_steps, batch=size, physics=physics, threads=threads, measured=False
+    ) as episodes:
+        for region, constraint in enumerate(("heading", "affordance")):
+            rests = [np.flatnonzero(row) for row in regions[region]]
+            tried = np.zeros(len(objects), int)
+            while True:
+                missing = np.array([POSES - len(of[region]) for of in found]) * regions[region].any(1)
+                wanted = np.minimum(np.ceil(_SPARE * missing).astype(int), _ATTEMPTS - tried)
+                if not wanted.any():
+                    break
+                index = np.repeat(np.arange(len(objects)), wanted)
+                number = tried[index] + np.concatenate([np.arange(count) for count in wanted])
+                rest = np.array([rests[n][i % len(rests[n])] for n, i in zip(index, number, strict=True)], np.int32)
+                planned = PlannedEpisodes(index.astype(np.int32), rest, names[index], number.astype(np.int32))
+                plan = RowPlan(constraint, False, planned, wanted > 0)
+                for conditions, count in batches(hand, own, bank, plan, _SEED, size):
+                    episodes.run(conditions)
+                    grasps = jax.tree.map(np.asarray, episodes.take_grasps())
+                    for i in np.flatnonzero(grasps.found[:count]):
+                        taken = found[grasps.object_index[i]][region]
+                        if len(taken) < POSES:
+                            taken.append(Poses(grasps.q[i], grasps.position[i], grasps.quaternion[i]))
+                    progress(sum(len(taken) for of in found for taken in of), most)
+                tried += wanted
+    return found
+
+
+def _filled(
+    policy: PolicyBundle, task: TaskConfig, bank: ConstraintBank, grasps: list[list[list[Poses]]]
+) -> References:
+    """The bank with these grasps and trajectories to them, arranged so that tables and training share none.
+
+    A grasp counts if the table leaves room for it in some resting pose. Where there are fewer than there are places, a
+    fifth of them (at least one) is repeated in the places of tables, and the others are in those for training.
+    """
+    hand = get_hand(policy.spec.hand)
+    arrays = {name: np.array(getattr(bank, name)) for name in _ARRAYS}
+    counts = np.zeros((len(grasps), 2), int)
+    flat = [(n, v, pose) for n, of in enumerate(grasps) for v, poses in enumerate(of) for pose in poses]
+    if flat:
+        poses = Poses(*(jnp.asarray(np.stack(field)) for field in zip(*(pose for *_, pose in flat), strict=True)))
+        rest = jnp.asarray(bank.rest)[np.array([n for n, *_ in flat])]
+        path, turns, valid = make_references(hand, poses, rest, jax.random.key(_SEED), task.trajectory_points)
+        new = dict(zip(_ARRAYS, map(np.asarray, (*poses, path, turns, valid)), strict=True))
+        owners = np.array([(n, v) for n, v, _ in flat])
+    for n, v in np.ndindex(counts.shape):
+        usable = np.flatnonzero((owners == (n, v)).all(1) & new["pose_valid"].any(1)) if flat else np.zeros(0, int)
+        counts[n, v] = len(usable)
+        if len(usable):
+            order = usable[_arranged(len(usable))]
+            rows = {name: values[order] for name, values in new.items()}
+        else:
+            closed = np.flatnonzero(arrays["pose_valid"][n, v].any(0))
+            if not len(closed):
+                continue
+            order = closed[_arranged(len(closed))]
+            rows = {name: arrays[name][n, v][order] for name in _ARRAYS if name != "pose_valid"}
+            rows["pose_valid"] = arrays["pose_valid"][n, v].T[order]
+        for name, values in rows.items():
+            arrays[name][n, v] = values.T if name == "pose_valid" else values
+    return References(bank._replace(**{name: jnp.asarray(values) for name, values in arrays.items()}), counts)
+
+
+def _arranged(count: int) -> np.ndarray:
+    """(POSES,) which of `count` references is where; those of tables are the last ones."""
+    tables = max(1, round(count * HELD_OUT / POSES))
+    training = np.arange(max(count - tables, 1))
+    return np.concatenate(
+        [np.resize(training, POSES - HELD_OUT), np.resize(np.arange(count - tables, count), HELD_OUT)]
+    )
+
+
+def _folder() -> pathlib.Path:
+    """Where references are kept."""
+    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "references"
+
+
+def _key(policy: PolicyBundle, task: TaskConfig, objects: Sequence[GraspObject], physics: str) -> str:
+    """What references depend on, as a file's name."""
+    made_by = bundles.content_hash(encode(policy.to_message()))
+    digests = [store.digest(obj) for obj in objects]
+    geometry = [task.trajectory_points, task.surface_points, task.back_off, task.headings]
+    text = json.dumps([made_by, digests, geometry, physics, _SEED, POSES, _ATTEMPTS])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _read(path: pathlib.Path, bank: ConstraintBank) -> References | None:
+    """Kept references of the bank's objects, if they are there and whole."""
+    try:
+        arrays = decode(path.read_bytes()).arrays
+    except (OSError, CongraspError):
+        return None
+    if any(name not in arrays or arrays[name].shape != getattr(bank, name).shape for name in _ARRAYS):
+        return None
+    return References(bank._replace(**{name: jnp.asarray(arrays[name]) for name in _ARRAYS}), arrays["grasps"])
