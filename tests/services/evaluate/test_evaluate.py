@@ -1,6 +1,5 @@
 """Evaluation of an untrained policy: the command from end to end, and what it refuses."""
 
-import contextlib
 import dataclasses
 import itertools
 import json
@@ -17,8 +16,7 @@ from common.objects.store import Catalogue
 from common.policy import bundle as bundles
 from services.cli.main import load
 from services.evaluate.evaluator import Evaluator
-from services.evaluate.protocol import sampling_config
-from services.evaluate.scores import Sample, matching
+from services.evaluate.scores import Sample
 from services.evaluate.unseen import evaluate_objects, procedural_pools
 from services.train.command import untrained
 
@@ -44,17 +42,31 @@ def test_the_command_measures_rows_by_the_protocol(policy, tmp_path, capsys, mon
         Catalogue(folder).add(obj)
     row = Evaluator.row
     monkeypatch.setattr(Evaluator, "row", lambda self, name, sample: row(self, name, samples.setdefault(name, sample)))
-    arguments = ["--policy", str(policy), "--objects", str(folder), "--table", "composed"]
+    arguments = ["--policy", str(policy), "--objects", str(folder), "--table", "composed", "--by", "object"]
     assert load("evaluate")([*arguments, "--episodes", "3", "--batch", "8", "--json", str(out)])() == 0
-    read = json.loads(out.read_text())
-    assert [row["constraint"] for row in read["rows"]] == ["pose+trajectory", "trajectory+affordance"]
+    read, printed = json.loads(out.read_text()), capsys.readouterr().out
+    names = [(row["constraint"], row["group"]) for row in read["rows"]]
+    assert names == [("pose+trajectory", ""), ("pose+trajectory", "aligned pairs"), ("trajectory+affordance", "")]
     assert all(row["hand"] == "human" and 0 <= row["held_2s"] <= row["success"] <= 1 for row in read["rows"])
-    assert read["physics"] == "native" and "pose+trajectory" in capsys.readouterr().out
-    for name, sample in samples.items():
-        assert len(sample.values["success"]) == 3 and matching(sample.values, name, CONFIG.task).all()
+    assert read["physics"] == "native" and "grasps of the reference policy of the human hand" in printed
+    for row, sample in zip(read["rows"], samples.values(), strict=True):
+        assert row["pool"] == 3 and sum(obj["episodes"] for obj in row["objects"]) == row["episodes"] >= 3
+        assert {obj["episodes"] for obj in row["objects"]} == {row["episodes"] // row["covered"]}
+        assert all(obj["name"] in printed and obj.keys() >= {"success", "held_2s", "clean"} for obj in row["objects"])
+        assert row["paper"] is None  # its composed rows are of captured constraints
         assert np.all(sample.values["length"] == 250)  # 50 steps with the table, 2 s without
-        assert sample.link_force.shape == (3, 25, 16) and sample.torque.shape == (3, 25, 20)
-        assert 0.0 < sample.torque.max() <= 1.0
+        assert sample.link_force.shape == (row["episodes"], 25, 16)
+        assert sample.torque.shape == (row["episodes"], 25, 20) and 0.0 < sample.torque.max() <= 1.0
+
+
+def test_a_row_is_the_same_alone_and_among_others(evaluator):
+    """Equal to the last digit, whatever was simulated before it."""
+    names = ["affordance", "heading"]
+    among = evaluator.samples(names, 6)
+    for name in names:
+        alone = evaluator.samples([name], 6)[name]
+        for key, column in among[name].values.items():
+            np.testing.assert_array_equal(alone.values[key], column, err_msg=f"{name}: {key}")
 
 
 def test_every_pool_of_objects_gets_its_share_of_the_episodes(monkeypatch):
@@ -74,29 +86,32 @@ def test_every_pool_of_objects_gets_its_share_of_the_episodes(monkeypatch):
     settings = {"physics": "native", "batch": 0, "threads": 1, "seed": 0, "friction": 1.0, "progress": told.append}
     whole, *groups = evaluate_objects(untrained(CONFIG), pools, 15, **settings)
     assert told == [15, 30] and len(built) == 1
-    assert (whole.episodes, whole.objects, whole.success) == (30, 6, 1.0)
-    by_size = [(row.group.split(" ")[0], row.episodes, row.objects) for row in groups[:3]]
+    assert (whole.episodes, whole.covered, whole.success) == (30, 6, 1.0)
+    by_size = [(row.group.split(" ")[0], row.episodes, row.covered) for row in groups[:3]]
     assert by_size == [("small", 10, 2), ("medium", 10, 2), ("large", 10, 2)]
     assert sum(row.episodes for row in groups if row.group.startswith("family")) == 30
+    assert whole.paper.success == 0.927 and groups[2].paper.success == 0.917 and groups[3].paper is None
 
 
 def test_other_pools_take_the_place_of_the_first(monkeypatch):
-    worker, built = mock.Mock(), []
+    """With nothing compiled anew; their constraints are drawn from seeds of their own."""
+    built, runs = [], []
 
     def build_bank(hand, task, objects, seed):
         built.append((list(objects), seed))
         return len(built)
 
     monkeypatch.setattr("services.evaluate.evaluator.build_bank", build_bank)
-    evaluator = Evaluator(untrained(CONFIG), OBJECTS[:1], seed=5)
-    monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
-    monkeypatch.setattr(evaluator, "_gather", lambda worker, names, episodes, progress: {"heading": evaluator.objects})
+    evaluator, running = Evaluator(untrained(CONFIG), OBJECTS[:1], seed=5), mock.MagicMock()
+    running.__enter__.return_value = running
+    monkeypatch.setattr(evaluator, "_episodes", lambda episodes: running)
+    monkeypatch.setattr(evaluator, "plan", lambda name, episodes: (name, episodes, evaluator.objects))
+    monkeypatch.setattr(evaluator, "_run", lambda running, name, plan, bank, progress: runs.append((plan[2], bank)))
     pools = [OBJECTS[1:2], OBJECTS[2:3]]
-    assert list(evaluator.samples_of_pools("heading", pools, 2)) == [OBJECTS[:1], *pools]
+    assert list(evaluator.samples_of_pools("heading", pools, 2)) == [None] * 3
     assert built == [(OBJECTS[:1], 5), (OBJECTS[1:2], 6), (OBJECTS[2:3], 7)]
-    # The worlds begin anew each time: what was under way belongs to objects that are gone.
-    replace, restart = mock.call.replace_objects, mock.call.restart
-    assert worker.mock_calls == [replace(pools[0], 2), restart(), replace(pools[1], 3), restart()]
+    assert runs == [(OBJECTS[:1], 1), (pools[0], 2), (pools[1], 3)]
+    assert running.replace_objects.call_args_list == [mock.call(pool) for pool in pools]
 
 
 def test_procedural_pools_hold_different_objects_in_equal_numbers():
@@ -104,17 +119,6 @@ def test_procedural_pools_hold_different_objects_in_equal_numbers():
     assert [len(pool) for pool in pools] == [2, 2, 2]
     names = [obj.name for pool in pools for obj in pool]
     assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000)]
-
-
-def test_only_constraints_that_differ_between_rows_are_sampled():
-    def chances(*constraints):
-        task = sampling_config(CONFIG.task, constraints)
-        return task.p_affordance, task.p_pose, task.p_trajectory
-
-    assert chances("heading") == (0, 0, 0)
-    assert chances("trajectory+affordance") == (1, 0, 1)
-    assert chances("pose+trajectory", "trajectory+affordance") == (0.5, 0.5, 1)
-    assert chances("heading", "pose") == (0, 0.5, 0)
 
 
 def test_a_pool_that_never_allows_a_constraint_is_an_error(evaluator, monkeypatch):

@@ -1,6 +1,5 @@
 """Noise of references: its size and its direction, and the rows of the table."""
 
-import contextlib
 from unittest import mock
 
 import numpy as np
@@ -55,52 +54,28 @@ def test_jitter_moves_every_waypoint(bank):
     np.testing.assert_array_equal(noisy.trajectory_quaternion, bank.trajectory_quaternion)
 
 
-def test_noise_is_added_to_the_same_references_in_every_row(bank, monkeypatch, tmp_path):
+def test_noise_is_added_to_the_same_references_in_every_row(bank, monkeypatch):
     config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
-    evaluator = Evaluator(untrained(config), OBJECTS, bank=bank)
-    worker, told = mock.Mock(), []
-    monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
+    evaluator, running = Evaluator(untrained(config), OBJECTS, bank=bank), mock.MagicMock()
+    running.__enter__.return_value = running
+    monkeypatch.setattr(evaluator, "_episodes", lambda episodes: running)
+    told, runs = [], []
 
-    def gather(worker, names, episodes, progress):
-        progress(episodes)
-        return {names[0]: names[0]}
+    def run(running, name, plan, noisy, progress):
+        runs.append((plan, noisy))
+        progress(plan.total)
 
-    monkeypatch.setattr(evaluator, "_gather", gather)
-    monkeypatch.setattr(evaluator, "row", lambda constraint, sample, group: (constraint, sample, group))
+    monkeypatch.setattr(evaluator, "_run", run)
+    row = lambda constraint, sample, group: mock.Mock(constraint=constraint, group=group, episodes=6)  # noqa: E731
+    monkeypatch.setattr(evaluator, "row", row)
     rows = evaluator.rows_under_noise(told.append, 5)
-    assert rows == [(noise.constraint, noise.constraint, noise.label) for noise in LEVELS]
-    assert told == [5 * (i + 1) for i in range(len(LEVELS))]
-    given = [call.args[1] for call in worker.replace_objects.call_args_list]
-    for noise, seen in zip(LEVELS, given, strict=True):
+    assert [(row.constraint, row.group) for row in rows] == [(noise.constraint, noise.label) for noise in LEVELS]
+    assert told == [6 * (i + 1) for i in range(len(LEVELS))]  # 3 episodes for each of two objects
+    for noise, (plan, seen) in zip(LEVELS, runs, strict=True):
         expected = with_noise(HAND, bank, noise, 0)
+        assert plan.constraint == noise.constraint and plan.total == 6
         for name in ("pose_q", "pose_position", "trajectory_position"):
             np.testing.assert_array_equal(getattr(seen, name), getattr(expected, name))
-
-
-@pytest.mark.parametrize("most", [20, 5])
-def test_references_are_renewed_until_their_slots_are_filled_or_none_is_added(bank, monkeypatch, most):
-    config = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
-    flat = bank._replace(has_affordance=np.array([[True], [False]]).repeat(bank.rest.shape[1], 1))
-    evaluator = Evaluator(untrained(config), OBJECTS, bank=flat)
-    worker, told = mock.Mock(bank=flat), []
-
-    def forget():
-        worker.bank = flat._replace(pose_valid=np.zeros_like(flat.pose_valid))
-
-    def renew():
-        valid = np.array(worker.bank.pose_valid)
-        valid[:, :, 0, min(valid[0, 0].any(0).sum(), most - 1)] = True
-        worker.bank = flat._replace(pose_valid=valid)
-
-    worker.forget_references.side_effect, worker.renew_references.side_effect = forget, renew
-    monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
-    made = evaluator.references(lambda *counts: told.append(counts))
-    # Two whole surfaces and one graspable region; 40 episodes for each of the three, 64 a batch, are two batches.
-    idle = [(15, 60)] * 2 if most < 20 else []
-    assert told == [(3 * (i + 1), 60) for i in range(most)] + idle
-    sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 0, made)
-    assert [int(one.arrays["pose/allowed"][0].any(0).sum()) for one in sets] == [most, most]
-    np.testing.assert_array_equal(sets[0].arrays["pose/q"], flat.pose_q[0])
 
 
 def test_curves_show_every_kind_of_noise(tmp_path):

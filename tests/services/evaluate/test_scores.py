@@ -8,13 +8,12 @@ import pytest
 
 from common.config import TaskConfig
 from common.task.constraints import blocks
+from services.evaluate.paper import paper_row
 from services.evaluate.scores import (
     PROBED_EPISODES,
     TABLES,
     Sample,
-    active_mask,
     joined,
-    matching,
     object_groups,
     summarise,
     tables_of,
@@ -56,25 +55,6 @@ def test_wilson_interval():
     assert wilson(0, 0) == (0.0, 1.0)
 
 
-@pytest.mark.parametrize(
-    ("constraint", "mask"),  # affordance, fingers of the pose, wrist of the pose, trajectory
-    [
-        ("heading", (0, 0, 0, 0)),
-        ("pose", (0, 1, 1, 0)),
-        ("trajectory", (0, 0, 0, 1)),
-        ("affordance", (1, 0, 0, 0)),
-        ("pose+trajectory", (0, 1, 0, 1)),
-        ("trajectory+affordance", (1, 0, 0, 1)),
-    ],
-)
-def test_only_episodes_with_exactly_the_rows_constraints_count(constraint, mask):
-    assert active_mask(constraint, TASK) == dict(zip(BLOCKS, map(bool, mask), strict=True))
-    every = np.array([[(i >> bit) & 1 for bit in range(4)] for i in range(16)])
-    values = {f"mask_{name}": every[:, i].astype(np.float32) for i, name in enumerate(BLOCKS)}
-    (found,) = np.flatnonzero(matching(values, constraint, TASK))
-    np.testing.assert_array_equal(every[found], mask)
-
-
 def test_a_row_averages_over_successful_episodes():
     sample = _sample(
         [1, 1, 0, 1],
@@ -88,8 +68,13 @@ def test_a_row_averages_over_successful_episodes():
     )
     sample.link_force[:, 0] = [[2, 0], [4, 6], [100, 100], [0, 0]]
     sample.torque[:, 0] = [[0.5, 0.5, 0.5], [0.0, 0.0, 1.0], [1, 1, 1], [0.0, 0.0, 0.5]]
-    row = summarise("pose+trajectory", "human", sample, held_2s=True)
-    assert (row.episodes, row.objects, row.success, row.held_2s, row.diverged) == (4, 3, 0.75, 0.5, 0.25)
+    row = summarise("pose+trajectory", "human", sample, held_2s=True, objects=list("abcdefg"), paper="captured")
+    assert (row.episodes, row.covered, row.pool, row.success, row.held_2s) == (4, 3, 7, 0.75, 0.5)
+    assert row.diverged == 0.25 and [(of["name"], of["episodes"], of["success"]) for of in row.objects] == [
+        ("d", 2, 1.0),
+        ("e", 1, 1.0),
+        ("f", 1, 0.0),
+    ]
     assert (row.success_low, row.success_high) == wilson(3, 4) and (row.held_2s_low, row.held_2s_high) == wilson(2, 4)
     assert row.errors["pose_rad"] == pytest.approx(0.2) and row.errors["pose_m"] == pytest.approx(0.02)
     assert row.errors["traj_rad"] == pytest.approx(0.5)
@@ -102,9 +87,31 @@ def test_a_row_averages_over_successful_episodes():
 
 
 def test_a_row_without_success_has_no_errors_and_short_episodes_no_hold():
-    row = summarise("heading", "human", _sample([0, 0], [0, 0]), held_2s=False)
+    row = summarise("heading", "human", _sample([0, 0], [0, 0]), held_2s=False, objects=["a"])
     assert row.success == 0 and row.held_2s is None and row.held_2s_low is None
     assert set(row.errors.values()) == {None} and set(row.forces.values()) == {None}
+
+
+@pytest.mark.parametrize(
+    ("source", "hand", "method", "constraint", "group", "success"),
+    [
+        ("hands", "human", "ours", "pose", "", 0.964),
+        ("captured", "human", "ours", "pose", "", 0.874),
+        ("captured", "allegro", "ours", "pose", "", None),
+        ("captured", "human", "dgrasp", "pose", "", 0.512),
+        ("captured", "human", "ours", "pose+trajectory", "", 0.865),
+        ("captured", "human", "ours", "pose+trajectory", "aligned pairs", None),
+        ("hands", "human", "ours", "pose+trajectory", "", None),
+        ("hands", "human", "graspxl", "heading", "", None),
+        ("cross", "human", "ours", "trajectory", "", 0.733),
+        ("objects", "human", "graspxl", "heading", "large (above 9 cm)", 0.79),
+        ("objects", "human", "ours", "heading", "heavy (above 300 g)", None),
+        ("", "human", "ours", "heading", "", None),
+    ],
+)
+def test_rows_stand_beside_those_that_were_made_alike(source, hand, method, constraint, group, success):
+    row = paper_row(source, hand, method, constraint, group)
+    assert (row and row.success) == success
 
 
 def test_joined_samples_keep_forces_beside_their_episodes():

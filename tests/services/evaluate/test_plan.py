@@ -1,0 +1,113 @@
+"""Rows of an evaluation: their episodes, and what they do not depend on."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from actors.bank import build_bank
+from common.config import TaskConfig
+from common.hands import get_hand
+from common.objects import procedural
+from common.task.constraints import blocks
+from services.evaluate.plan import ALIGNED, batches, plan_row
+from services.evaluate.protocol import protocol
+from services.evaluate.scores import TABLES
+
+HAND = get_hand("human")
+TASK = protocol(TaskConfig(), 200)
+OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box"), procedural.generate(3, "hammer")]
+MASKS = {  # affordance, fingers of the pose, wrist of the pose, trajectory
+    "heading": (0, 0, 0, 0),
+    "pose": (0, 1, 1, 0),
+    "trajectory": (0, 0, 0, 1),
+    "affordance": (1, 0, 0, 0),
+    "pose+trajectory": (0, 1, 0, 1),
+    "trajectory+affordance": (1, 0, 0, 1),
+}
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return build_bank(HAND, TASK, OBJECTS, 3)
+
+
+def _all(bank, plan, seed=0, size=32):
+    """The conditions of all episodes of a plan."""
+    parts = [jax.tree.map(lambda x, n=n: np.asarray(x)[:n], c) for c, n in batches(HAND, TASK, bank, plan, seed, size)]
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_every_object_has_as_many_episodes_with_just_the_rows_constraints(bank, name):
+    plan = plan_row(TASK, bank, OBJECTS, name, 50)
+    conditions = _all(bank, plan)
+    index = conditions.reset_state.object_index
+    np.testing.assert_array_equal(index, plan.episodes.objects)
+    counts = np.bincount(index, minlength=len(OBJECTS))
+    each = -(-50 // plan.covered.sum())
+    np.testing.assert_array_equal(counts, np.where(plan.covered, each, 0))
+    for obj in np.flatnonzero(plan.covered):
+        rests = plan.episodes.rests[index == obj]
+        of_each = np.unique(rests, return_counts=True)[1]
+        assert of_each.max() - of_each.min() <= 1 and len(of_each) <= len(OBJECTS[obj].rest_poses)
+    for block, active in zip(blocks(TASK), MASKS[name], strict=True):
+        np.testing.assert_array_equal(conditions.goal.active[block], np.full(plan.total, bool(active)))
+
+
+def test_an_episode_does_not_depend_on_the_objects_beside_it(bank):
+    """Nor on how many there are, or in which batches they are simulated (but for the rounding of another program)."""
+    fewer = jax.tree.map(lambda x: x[1:], bank)
+    for name in ("affordance", "pose+trajectory"):
+        among = plan_row(TASK, bank, OBJECTS, name, 30)
+        alone = plan_row(TASK, fewer, OBJECTS[1:], name, 8)
+        whole, part = _all(bank, among), _all(fewer, alone, size=4)
+        for i, (obj, number) in enumerate(zip(alone.episodes.objects, alone.episodes.numbers, strict=True)):
+            (at,) = np.flatnonzero((among.episodes.objects == obj + 1) & (among.episodes.numbers == number))
+            for ours, theirs in zip(
+                jax.tree.leaves((part.goal, part.reset_state.base_position)),
+                jax.tree.leaves((whole.goal, whole.reset_state.base_position)),
+                strict=True,
+            ):
+                np.testing.assert_allclose(ours[i], theirs[at], rtol=0, atol=1e-6)
+
+
+def test_seeds_and_rows_draw_for_themselves(bank):
+    heading = plan_row(TASK, bank, OBJECTS, "heading", 30)
+    drawn = [_all(bank, heading, seed).goal["heading"].position for seed in (0, 1)]
+    drawn.append(_all(bank, heading._replace(constraint="affordance")).goal["heading"].position)
+    assert all(np.abs(a - b).max(-1).min() > 0 for a, b in ((drawn[0], drawn[1]), (drawn[0], drawn[2])))
+
+
+def test_pairs_are_drawn_independently_but_where_they_are_aligned(bank):
+    apart = {}
+    for name in ("pose+trajectory", f"pose+trajectory{ALIGNED}"):
+        goal = _all(bank, plan_row(TASK, bank, OBJECTS, name, 60)).goal
+        end = goal["trajectory"].position[:, -1]
+        own = np.linalg.norm(bank.pose_q[:, 0][:, None] - goal["pose"].q[None, :, None], axis=-1)
+        n, i, m = np.unravel_index(own.transpose(1, 0, 2).reshape(len(end), -1).argmin(1), own[:, 0].shape + (1,))
+        apart[name] = np.linalg.norm(np.asarray(bank.pose_position)[n, 0, i] - end, axis=-1)
+    independent, aligned = apart.values()
+    assert aligned.max() < 0.005 and np.mean(independent > 0.005) > 0.8
+
+
+def test_trajectories_end_nearer_to_the_graspable_region(bank):
+    conditions = _all(bank, plan_row(TASK, bank, OBJECTS, "trajectory+affordance", 60))
+    end = conditions.goal["trajectory"].position[:, -1]
+    distance = np.linalg.norm(conditions.surface.points - end[:, None], axis=-1)
+    avoid = conditions.surface.avoid
+    assert np.all(np.where(avoid, np.inf, distance).min(1) < np.where(avoid, distance, np.inf).min(1))
+
+
+def test_objects_that_allow_nothing_are_counted_not_replaced(bank):
+    valid = np.array(bank.pose_valid)
+    valid[1] = False
+    plan = plan_row(TASK, bank._replace(pose_valid=valid), OBJECTS, "pose", 10)
+    assert plan.covered.tolist() == [True, False, True] and 1 not in plan.episodes.objects
+    assert plan.total == 10
+
+
+def test_the_tables_name_rows_that_can_be_planned(bank):
+    for name in dict.fromkeys(row for rows in TABLES.values() for row in rows if "fingers" not in row):
+        assert plan_row(dataclasses.replace(TASK), bank, OBJECTS, name, 3).total >= 3

@@ -1,0 +1,88 @@
+"""References of a reference policy: where they come from, how they are split, and that they are made once."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from actors.bank import POSES, build_bank
+from common.config import TaskConfig
+from common.hands import get_hand
+from common.objects import procedural
+from common.policy import bundle as bundles
+from common.policy.pretrained import policy_file, pretrained_hands, reference_file
+from common.task.sampling.closed_poses import Poses
+from services.evaluate import references
+from services.evaluate.references import HELD_OUT, References, held_out
+
+HAND = get_hand("human")
+TASK = TaskConfig()
+OBJECTS = [procedural.generate(0, "bottle"), procedural.generate(1, "cylinder")]
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return build_bank(HAND, TASK, OBJECTS, 3)
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return bundles.load(reference_file("human"))
+
+
+def test_reference_policies_never_had_poses_or_trajectories():
+    for hand in pretrained_hands():
+        bundle = bundles.load(reference_file(hand))
+        assert bundle.spec.hand == hand and set(bundle.task.constraints) == {"heading", "affordance"}
+        found, _ = references.reference_policy(bundles.load(policy_file(None, hand)))
+        assert found.task == bundle.task
+
+
+@pytest.mark.parametrize("count", range(1, POSES + 1))
+def test_tables_and_training_share_no_reference(count):
+    order = references._arranged(count)
+    training, tables = order[:-HELD_OUT], order[-HELD_OUT:]
+    assert len(order) == POSES and set(order) <= set(range(count))
+    if count > 1:
+        assert set(order) == set(range(count)) and not set(training) & set(tables)
+    if count == POSES:
+        np.testing.assert_array_equal(order, np.arange(POSES))
+
+
+def test_objects_that_the_policy_cannot_grasp_keep_geometric_references(bank, policy):
+    valid = np.asarray(bank.pose_valid)
+    good = int(np.flatnonzero(valid[0, 0].any(0))[0])
+    own = Poses(*(np.asarray(field)[0, 0, good] for field in (bank.pose_q, bank.pose_position, bank.pose_quaternion)))
+    under = own._replace(position=own.position - np.array([0, 0, 1.0], np.float32))  # the table is in the way
+    made = references._filled(policy, TASK, bank, [[[own, under, own], []], [[under], []]])
+    np.testing.assert_array_equal(made.grasps, [[2, 0], [0, 0]])
+    np.testing.assert_array_equal(made.bank.pose_q[0, 0], np.tile(own.q, (POSES, 1)))
+    closed = np.asarray(bank.pose_q)[1, 0]
+    assert all(any(np.array_equal(q, other) for other in closed) for q in np.asarray(made.bank.pose_q)[1, 0])
+    assert np.asarray(made.bank.pose_valid)[:, 0].any(1).all()  # of those that the table leaves room for
+    for field in ("points", "heading_position", "rest"):
+        np.testing.assert_array_equal(getattr(made.bank, field), getattr(bank, field))
+
+
+def test_only_the_last_fifth_is_for_tables(bank):
+    everything = bank._replace(pose_valid=jnp.ones_like(bank.pose_valid))
+    allowed = np.asarray(held_out(everything).pose_valid)
+    assert allowed[..., -HELD_OUT:].all() and not allowed[..., :-HELD_OUT].any()
+
+
+def test_they_are_grasps_and_made_once(bank, policy, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(references, "_ATTEMPTS", 8)
+    told = []
+    arguments = (policy, TASK, OBJECTS, bank)
+    made = references.make(*arguments, physics="native", threads=1, progress=lambda *counts: told.append(counts))
+    assert made.grasps[:, 0].min() >= 3  # most episodes on such objects succeed
+    assert told[-1][0] >= made.grasps.sum() and [count for count, _ in told] == sorted(count for count, _ in told)
+    monkeypatch.setattr(references, "Episodes", None)  # nothing is simulated again
+    again = references.make(*arguments, physics="native", threads=1)
+    assert isinstance(again, References)
+    np.testing.assert_array_equal(again.bank.pose_q, made.bank.pose_q)
+    np.testing.assert_array_equal(again.grasps, made.grasps)
+    (kept,) = (tmp_path / "congrasp" / "references").iterdir()
+    kept.write_bytes(kept.read_bytes()[:1000])
+    with pytest.raises(TypeError):  # what is damaged is made anew
+        references.make(*arguments, physics="native", threads=1)
