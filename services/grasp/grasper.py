@@ -173,13 +173,14 @@ class Grasper:
         labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
         one = goal_of(self.hand, self.task, request)
         goal = jax.tree.map(lambda array: np.broadcast_to(array, (batch, *np.shape(array))), one)
-        if prescribed(request) is None:
+        path = prescribed(request)
+        if path is None:
             position, direction, cross, rests = headings(labelled, request, batch, self.task.back_off, rng)
             found = {"position": position, "direction": direction, "cross": cross}
             goal = goal.replace("heading", **{name: value.astype(np.float32) for name, value in found.items()})
             different = batch
         else:
-            reference = valid_rests(self.hand, obj, request)
+            reference = valid_rests(self.hand, obj, *path)
             rests, different = np.resize(reference, batch), min(batch, len(reference))
         surface = self._surface(labelled)
         surface = Surface(*(np.broadcast_to(field, (batch, *field.shape)) for field in surface))

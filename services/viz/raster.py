@@ -46,9 +46,10 @@ def render_scene(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int] 
 
 
 def visible(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:
-    """(height, width) index of the shape that each pixel shows, -1 for the background; none is seen through."""
-    parts = [triangles_of([shape], fine=False) for shape in shapes]
-    owner = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+    """(height, width) index of the solid shape that each pixel shows, -1 for the background."""
+    solid = [i for i, shape in enumerate(shapes) if shape.alpha >= 1]
+    parts = [triangles_of([shapes[i]], fine=False) for i in solid]
+    owner = np.repeat(solid, [len(part.faces) for part in parts])
     cover, seen = _Picture(camera, *size).nearest(joined(parts))
     shown = np.full(size[0] * size[1], -1)
     shown[cover.sample[seen]] = owner[cover.face[cover.span[seen]]]
