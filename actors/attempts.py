@@ -13,6 +13,7 @@ import numpy as np
 
 from actors import initial
 from actors.env import metric_names
+from actors.episode import episode_message
 from actors.initial import RequestedEpisodes
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker, Trace
@@ -20,7 +21,8 @@ from common.config import TaskConfig
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, mean_action
-from common.task.types import Array, Goal
+from common.task.types import Array, Goal, Surface
+from common.wire.codec import Message
 
 
 class Outcome(NamedTuple):
@@ -83,6 +85,15 @@ class Attempts:
         values = np.asarray(rollout.episodes)[:, : len(names)].T
         flags = (np.asarray(resolution.redirected), np.asarray(resolution.aligned))
         return Outcome(resolution.goal, *flags, dict(zip(names, values, strict=True)), rollout.trace)
+
+    def episode(
+        self, outcome: Outcome, index: int, surface: Surface, obj: GraspObject, about: dict[str, Any]
+    ) -> Message:
+        """One attempt as an episode for logs and pictures; `about` has what else its meta data says."""
+        metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
+        trace = Trace(*(field[:, index] for field in outcome.trace))
+        meta = {"version": self._bundle.version, "success": metrics["success"] > 0, "metrics": metrics, **about}
+        return episode_message(self._hand, self._task, trace, outcome.goal.row(index), surface, obj, meta)
 
     def renew(self, bundle: PolicyBundle) -> None:
         """Newer weights of the same policy; nothing is compiled anew."""
