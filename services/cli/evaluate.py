@@ -70,11 +70,14 @@ def evaluate(
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
     from services.assets.objects.named import objects_of
-    from services.cli.console import tracked
+    from services.cli.console import at_least, tracked
     from services.evaluate.scores import write_json
     from services.evaluate.worlds import objects_label
 
-    _check(friction, episodes=(episodes, 1), pool=(pool, 0), batch=(batch, 0), seed=(seed, 0))
+    at_least(1, episodes=episodes)
+    at_least(0, pool=pool, batch=batch, seed=seed)
+    if not 0.05 <= friction <= 10.0:
+        raise CongraspError(f"--friction is {friction:g}.", "It must lie between 0.05 and 10.")
     policy = policy_file(policy, hand)
     loaded = bundles.load(policy)
     engine = resolve_physics(physics)
@@ -106,15 +109,6 @@ class _Found(NamedTuple):
     """Rows under noise."""
     rows: list[Any]
     """All rows."""
-
-
-def _check(friction: float, **counts: tuple[int, int]) -> None:
-    """Raises a CongraspError for a count (value, least) or a friction out of range."""
-    for name, (value, least) in counts.items():
-        if value < least:
-            raise CongraspError(f"--{name} is {value}.", f"It must be at least {least}.")
-    if not 0.05 <= friction <= 10.0:
-        raise CongraspError(f"--friction is {friction:g}.", "It must lie between 0.05 and 10.")
 
 
 def _evaluate(

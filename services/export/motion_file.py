@@ -17,7 +17,7 @@ import numpy as np
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands import get_hand
-from common.hands.spec import Hand, link_origin
+from common.hands.spec import Hand, capsule_ends
 from common.inputs import file_name
 from common.npz import read_npz
 from common.task.constraints import CONSTRAINTS
@@ -138,8 +138,6 @@ def motion_of_episode(episode: Message) -> GraspMotion:
 def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
     """Joints, links and capsules of a hand, by the names of a motion's arrays."""
     index = {link.name: i for i, link in enumerate(hand.links)}
-    capsules = [(i, link, capsule) for i, link in enumerate(hand.links) for capsule in link.capsules]
-    ends = [np.subtract([capsule.start, capsule.end], link_origin(link)) for _, link, capsule in capsules]
     return {
         "joint_names": np.array([joint.name for joint in hand.joints]),
         "joint_link": np.array([i for i, link in enumerate(hand.links) for _ in link.joints], np.int32),
@@ -148,9 +146,9 @@ def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
         "joint_limits": np.array([(joint.lower, joint.upper) for joint in hand.joints]),
         "link_names": np.array([link.name for link in hand.links]),
         "link_parent": np.array([index.get(link.parent, -1) for link in hand.links], np.int32),
-        "capsule_link": np.array([i for i, _, _ in capsules], np.int32),
-        "capsule_ends": np.array(ends),
-        "capsule_radius": np.array([capsule.radius for _, _, capsule in capsules]),
+        "capsule_link": np.array([i for i, link in enumerate(hand.links) for _ in link.capsules], np.int32),
+        "capsule_ends": np.concatenate([capsule_ends(link) for link in hand.links]),
+        "capsule_radius": np.array([capsule.radius for link in hand.links for capsule in link.capsules]),
     }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.hands.spec import Hand, link_origin
+from common.hands.spec import Hand, capsule_ends
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.palette import SKIN, TABLE, Colour
 from services.viz.scene import Camera, Shape, between
@@ -38,8 +38,8 @@ def hand_shapes(
     shapes = []
     for i, link in enumerate(hand.links):
         turn = Rotation.from_quat(quaternion[i], scalar_first=True)
-        for capsule in link.capsules:
-            start, end = turn.apply(np.subtract([capsule.start, capsule.end], link_origin(link))) + position[i]
+        for capsule, ends in zip(link.capsules, capsule_ends(link), strict=True):
+            start, end = turn.apply(ends) + position[i]
             shapes.append(between(start, end, capsule.radius, colours[i] if colours else SKIN, alpha=alpha))
     return shapes
 
