@@ -13,6 +13,7 @@ import numpy as np
 
 from actors import initial, protocols
 from actors.env import metric_names
+from actors.episode import episode_message
 from actors.initial import RequestedEpisodes
 from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker, Trace
@@ -22,7 +23,8 @@ from common.objects.distance import distance_field
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, mean_action
 from common.task import plausibility
-from common.task.types import Array, Goal
+from common.task.types import Array, Goal, Surface
+from common.wire.codec import Message
 
 
 class Outcome(NamedTuple):
@@ -97,6 +99,15 @@ class Attempts:
         metrics |= protocols.assess(samples, metrics["held"] > 0, task, hold, height)
         flags = (np.asarray(resolution.redirected), np.asarray(resolution.aligned))
         return Outcome(resolution.goal, *flags, metrics, Trace(*(field[: self.steps] for field in trace)))
+
+    def episode(
+        self, outcome: Outcome, index: int, surface: Surface, obj: GraspObject, about: dict[str, Any]
+    ) -> Message:
+        """One attempt as an episode for logs and pictures; `about` has what else its meta data says."""
+        metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
+        trace = Trace(*(field[:, index] for field in outcome.trace))
+        meta = {"version": self._bundle.version, "success": metrics["success"] > 0, "metrics": metrics, **about}
+        return episode_message(self._hand, self._task, trace, outcome.goal.row(index), surface, obj, meta)
 
     def renew(self, bundle: PolicyBundle) -> None:
         """Newer weights of the same policy; nothing is compiled anew."""

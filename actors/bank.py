@@ -40,13 +40,7 @@ _STEEPEST_UP = 0.1
 """Largest upward component of a reference pose's approach direction."""
 
 
-def build_bank(
-    hand: Hand,
-    task: TaskConfig,
-    objects: Sequence[GraspObject],
-    seed: int,
-    given: Sequence[Headings | None] | None = None,
-) -> ConstraintBank:
+def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
     """Heading sets by the paper's rules, and procedural reference poses and trajectories, for a pool of objects.
 
     Args:
@@ -54,7 +48,6 @@ def build_bank(
       task: geometry of the approach.
       objects: N objects, in the hand's size already (`common.objects.pool.scale_objects`).
       seed: of everything random.
-      given: of each object the headings to take instead of sampled ones, if there are any.
 
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
@@ -66,7 +59,7 @@ def build_bank(
         itertools.repeat(task, count),
         objects,
         seeds,
-        given or [None] * count,
+        itertools.repeat(None, count),
         itertools.repeat(scale, count),
     )
     rests = max(len(row["rest"]) for row in rows)

@@ -232,7 +232,7 @@ class GraspEnv:
         force = jnp.linalg.norm(scene.features.force, axis=-1)
         state = state._replace(
             success=tracked,
-            grasps=harvest.collect(task, state, scene, error, up),
+            grasps=harvest.collect(scene, state.grasps, error, up, state.reset_state.object_index, state.region),
             sums={
                 **metrics.accumulate(task, state.sums, error, had_table, window),
                 "return": state.sums["return"] + reward,

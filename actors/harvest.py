@@ -6,7 +6,7 @@ constraint bank, so that what later episodes ask for is what this hand can do.
 
 import functools
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +21,6 @@ from common.task.constraints import get_constraint, optional
 from common.task.constraints.base import Scene
 from common.task.sampling.closed_poses import Poses
 from common.task.types import Array
-
-if TYPE_CHECKING:
-    from actors.env import EnvState
 
 
 class Grasps(NamedTuple):
@@ -44,24 +41,38 @@ class Grasps(NamedTuple):
 
 
 def collect(
-    task: TaskConfig, state: "EnvState", scene: Scene, error: Mapping[str, tuple[Array, Array]], up: Array
+    scene: Scene,
+    grasps: Grasps,
+    error: Mapping[str, tuple[Array, Array]],
+    up: Array,
+    object_index: Array,
+    region: Array,
 ) -> Grasps:
-    """The grasps, with those that succeeded just now near to their heading, and under constraints that let them."""
-    now = (state.time == task.approach_steps + task.hold_steps) & up
+    """The grasps, with those that succeeded just now near to their heading, and under constraints that let them.
+
+    Args:
+      scene: the control step.
+      grasps: before it.
+      error: of the step, by the names of the constraints' errors: numerators and denominators (B,).
+      up: (B,) bool: the object has not fallen.
+      object_index: (B,) int.
+      region: (B,) int, the axis V of the constraint bank.
+    """
+    task = scene.task
+    now = (scene.state.time == task.approach_steps + task.hold_steps) & up
     for spec in get_constraint("heading").errors:
         now &= error[spec.name][0] < spec.tolerance
     for constraint in optional(task):
         if not constraint.harvested:
-            now &= ~constraint.active(state.goal)
+            now &= ~constraint.active(scene.goal)
     position, quaternion = rotations.relative_pose(
         scene.state.object_position,
         scene.state.object_quaternion,
         scene.features.wrist_position,
         scene.features.wrist_quaternion,
     )
-    fresh = Grasps(now, state.reset_state.object_index, state.region, scene.state.q, position, quaternion)
-    taken = where_environments(now, fresh[1:], state.grasps[1:])
-    return Grasps(state.grasps.found | now, *taken)
+    fresh = Grasps(now, object_index, region, scene.state.q, position, quaternion)
+    return Grasps(grasps.found | now, *where_environments(now, fresh[1:], grasps[1:]))
 
 
 @functools.partial(jax.jit, static_argnames=("hand", "task"))

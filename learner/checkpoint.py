@@ -24,6 +24,8 @@ from common.files import sync_directory, write_atomically
 from common.wire.codec import Message, decode, encode
 from common.wire.codec import checksum as checksum_of
 
+KEPT = 3
+"""How many checkpoints of a run are kept."""
 _LATEST = "latest"
 _META = "meta"
 _PATTERN = "checkpoint_*.safetensors"
@@ -32,14 +34,14 @@ _ASIDE = ".aside"
 
 
 class Checkpoints:
-    """The checkpoints of one run, the newest of which are kept."""
+    """The checkpoints of one run, the newest `KEPT` of which stay."""
 
-    def __init__(self, directory: pathlib.Path, keep: int = 3):
-        """Uses `directory`, which is made at the first `save`, for `keep` checkpoints."""
-        self._directory, self._keep = directory, keep
+    def __init__(self, directory: pathlib.Path):
+        """Uses `directory`, which is made at the first `save`."""
+        self._directory = directory
 
     def save(self, tree: Any, meta: dict[str, Any], version: int) -> pathlib.Path:
-        """Writes a checkpoint, makes it the latest, and removes the oldest beyond `keep`.
+        """Writes a checkpoint, makes it the latest, and removes the oldest beyond `KEPT`.
 
         Args:
           tree: a pytree of arrays and integers.
@@ -62,7 +64,7 @@ class Checkpoints:
             sync_directory(self._directory)
         except OSError as error:
             raise CongraspError(f"{self._directory / _LATEST} could not be set: {error.strerror}.") from None
-        for old in self.files()[self._keep :]:
+        for old in self.files()[KEPT:]:
             if old != path:
                 with contextlib.suppress(OSError):
                     old.unlink()

@@ -186,6 +186,11 @@ def link_origin(link: Link) -> Vector:
     return link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0)
 
 
+def capsule_ends(link: Link) -> np.ndarray:
+    """(C, 2, 3) m, where the link's capsules start and end, in its frame."""
+    return np.array([(capsule.start, capsule.end) for capsule in link.capsules]).reshape(-1, 2, 3) - link_origin(link)
+
+
 def chain(
     names: Sequence[str],
     joints: Sequence[tuple[Joint, ...]],

@@ -9,7 +9,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from common.config import PPOConfig
 from common.policy import bundle as bundles
 from learner.algorithms.ppo import PPO
 from services.bench import toy
@@ -37,9 +36,9 @@ def settings(lag: int) -> list[Setting]:
     ]
 
 
-def returns(setting: Setting, seed: int, count: int, worlds: int, config: PPOConfig = SETTINGS) -> np.ndarray:
+def returns(setting: Setting, seed: int, count: int, worlds: int) -> np.ndarray:
     """Mean returns (count,) after each update of a training whose rollouts are all `setting.lag` versions old."""
-    algorithm = PPO(toy.SPEC, dataclasses.replace(config, decoupled=setting.decoupled))
+    algorithm = PPO(toy.SPEC, dataclasses.replace(SETTINGS, decoupled=setting.decoupled))
     state = algorithm.init(seed)
     past = collections.deque([toy.bundle_of(state)], maxlen=setting.lag + 1)
     rng, key = np.random.default_rng(seed), jax.random.PRNGKey(seed)

@@ -14,6 +14,13 @@ Track = Callable[[str, int | None], Callable[[int], None]]
 """(what is done, its total if known) -> what to call with the amount done."""
 
 
+def at_least(least: int, **counts: int) -> None:
+    """Raises a CongraspError for the first option, by its name, that is less."""
+    for name, value in counts.items():
+        if value < least:
+            raise CongraspError(f"--{name} is {value}.", f"It must be at least {least}.")
+
+
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Prints rows under the names of their columns."""
     table = Table(*columns)

@@ -82,11 +82,14 @@ def evaluate(
     from common.policy.pretrained import policy_file
     from common.task.methods import evaluated_as, get_method
     from services.assets.objects.named import objects_of
-    from services.cli.console import tracked
+    from services.cli.console import at_least, tracked
     from services.evaluate.protocol import objects_label
     from services.evaluate.scores import write_json
 
-    _check(friction, episodes=(episodes, 1), pool=(pool, 0), batch=(batch, 0), seed=(seed, 0))
+    at_least(1, episodes=episodes)
+    at_least(0, pool=pool, batch=batch, seed=seed)
+    if not 0.05 <= friction <= 10.0:
+        raise CongraspError(f"--friction is {friction:g}.", "It must lie between 0.05 and 10.")
     policy = policy_file(policy, hand)
     loaded = bundles.load(policy)
     if method is not None:
@@ -125,15 +128,6 @@ class _Found(NamedTuple):
     """All rows."""
     references: str
     """Where reference poses and trajectories come from; empty if no row has any."""
-
-
-def _check(friction: float, **counts: tuple[int, int]) -> None:
-    """Raises a CongraspError for a count (value, least) or a friction out of range."""
-    for name, (value, least) in counts.items():
-        if value < least:
-            raise CongraspError(f"--{name} is {value}.", f"It must be at least {least}.")
-    if not 0.05 <= friction <= 10.0:
-        raise CongraspError(f"--friction is {friction:g}.", "It must lie between 0.05 and 10.")
 
 
 def _evaluate(

@@ -68,14 +68,13 @@ def grasp(
     """
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
-    from services.cli.console import bars
+    from services.cli.console import at_least, bars
     from services.grasp.grasper import Grasper
     from services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
-    if tries < 1:
-        raise CongraspError(f"--tries is {tries}.", "It must be at least 1.")
+    at_least(1, tries=tries)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
     file = policy_file(policy, hand)

@@ -1,6 +1,5 @@
 """`congrasp learner`: the learner alone."""
 
-import functools
 import pathlib
 import threading
 from collections.abc import Sequence
@@ -103,47 +102,28 @@ def _learn(
     watch: Watch,
 ) -> None:
     """Runs the learner until it is finished or told to stop."""
-    from learner.process import run_learner
     from learner.run_directory import has_checkpoints
     from services.ops.logs import log
-    from services.ops.metrics import LearnerMetrics
-    from services.ops.status import ask
-    from services.train.in_process import train_in_process
-    from services.train.metric_writers import recorded
-
-    resume = resume and ranks.rank == 0 and has_checkpoints(run_dir)
-    metrics = LearnerMetrics(functools.partial(ask, transport, config.name))
+    from services.train.learn import learn
 
     def updated(values: dict[str, float]) -> None:
-        metrics.update(values)
         log("info", f"Update {values['update']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
 
-    with watch.watched("learner", str(ranks.rank), config.name, metrics):
-        if inside:
-            train_in_process(
-                run_dir,
-                config,
-                physics=config.physics,
-                stop=stop,
-                resume=resume,
-                ranks=ranks,
-                wire=transport,
-                writers=writers,
-                on_update=updated,
-                on_event=log,
-            )
-        else:
-            run_learner(
-                run_dir,
-                config,
-                transport,
-                stop_event=stop,
-                resume=resume,
-                ranks=ranks,
-                recorder=recorded(transport, config, run_dir, writers) if ranks.rank == 0 else None,
-                on_update=updated,
-                on_event=log,
-            )
+    with watch.watched("learner", str(ranks.rank), config.name):
+        learn(
+            run_dir,
+            config,
+            wire=transport,
+            inside=config.physics if inside else None,
+            stop=stop,
+            resume=resume and ranks.rank == 0 and has_checkpoints(run_dir),
+            ranks=ranks,
+            writers=writers,
+            metrics_port=watch.metrics_port,
+            metrics_host=watch.metrics_host,
+            on_update=updated,
+            on_event=log,
+        )
 
 
 COMMAND = learner

@@ -27,10 +27,9 @@ def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tup
     """
     from common.objects import procedural
     from common.objects.store import Catalogue
-    from services.cli.console import tracked
+    from services.cli.console import at_least, tracked
 
-    if count < 1:
-        raise CongraspError(f"--count is {count}.", "Ask for at least one object.")
+    at_least(1, count=count)
     catalogue = Catalogue(out)
     turns = procedural.family_turns(count, seed, families)
     with tracked() as track:

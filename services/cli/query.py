@@ -36,13 +36,11 @@ def query(
     """
     import json as json_module
 
-    from common.errors import CongraspError
+    from services.cli.console import at_least
     from services.serve.client import PolicyClient
     from services.serve.load import example_episode, measure, one_answer
 
-    for name_, value in (("repeat", repeat), ("concurrency", concurrency), ("states", states)):
-        if value < 1:
-            raise CongraspError(f"--{name_} {value} must be at least 1.")
+    at_least(1, repeat=repeat, concurrency=concurrency, states=states)
     if health:
         with PolicyClient(connect, name, timeout=timeout, wait=timeout, certs=certs) as client:
             print(json_module.dumps(client.health()))

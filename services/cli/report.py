@@ -51,7 +51,7 @@ def report(
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
     from services.assets.objects.named import objects_of
-    from services.cli.console import tracked
+    from services.cli.console import at_least, tracked
     from services.evaluate.evaluator import Evaluator
     from services.evaluate.failures import failure_sheets
     from services.evaluate.protocol import objects_label, two_seconds
@@ -59,7 +59,9 @@ def report(
     from services.evaluate.scores import TABLES, known_rows
     from services.viz.sheets import png_of
 
-    _check(out, episodes=episodes, pool=pool)
+    at_least(1, episodes=episodes, pool=pool)
+    if out.is_dir():
+        raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
     template()  # fails before the evaluation if a package is missing
     run_dir = source if source is not None and source.is_dir() else None
     file = _policy_of_run(run_dir) if run_dir else policy_file(source, hand)
@@ -92,15 +94,6 @@ def report(
         print(f"Left out: {error}")
     print(f"The report is in {out}: open it in a browser.")
     return 0
-
-
-def _check(out: pathlib.Path, **counts: int) -> None:
-    """Raises a CongraspError for a count below one, or a folder in place of a file."""
-    for name, value in counts.items():
-        if value < 1:
-            raise CongraspError(f"--{name} is {value}.", "It must be at least 1.")
-    if out.is_dir():
-        raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
 
 
 def _policy_of_run(run_dir: pathlib.Path) -> pathlib.Path:

@@ -63,7 +63,7 @@ def failure_sheets(
         causes = [cause(episode, evaluator.task.drop_height) for episode in episodes]
         for episode, outcome in zip(episodes, causes, strict=True):
             until, first = fall_step(episode, evaluator.task.drop_height), episode.meta["object"]
-            frames, captions = episode_strip(episode, _FRAMES, _SIZE, first, f": {outcome}", until=until, quick=True)
+            frames, captions = episode_strip(episode, _FRAMES, _SIZE, first, f": {outcome}", until=until)
             images += frames
             labels += captions
         who = f"{policy.spec.hand_name} hand, version {policy.version}"

@@ -17,11 +17,12 @@ import numpy as np
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands import get_hand
-from common.hands.spec import Hand, link_origin
+from common.hands.spec import Hand, capsule_ends
 from common.inputs import file_name
 from common.npz import read_npz
 from common.task.constraints import CONSTRAINTS
 from common.wire.codec import Message
+from services.described import check_arrays
 from services.record.goals import active_constraints
 
 FORMAT = 2
@@ -137,8 +138,6 @@ def motion_of_episode(episode: Message) -> GraspMotion:
 def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
     """Joints, links and capsules of a hand, by the names of a motion's arrays."""
     index = {link.name: i for i, link in enumerate(hand.links)}
-    capsules = [(i, link, capsule) for i, link in enumerate(hand.links) for capsule in link.capsules]
-    ends = [np.subtract([capsule.start, capsule.end], link_origin(link)) for _, link, capsule in capsules]
     return {
         "joint_names": np.array([joint.name for joint in hand.joints]),
         "joint_link": np.array([i for i, link in enumerate(hand.links) for _ in link.joints], np.int32),
@@ -147,9 +146,9 @@ def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
         "joint_limits": np.array([(joint.lower, joint.upper) for joint in hand.joints]),
         "link_names": np.array([link.name for link in hand.links]),
         "link_parent": np.array([index.get(link.parent, -1) for link in hand.links], np.int32),
-        "capsule_link": np.array([i for i, _, _ in capsules], np.int32),
-        "capsule_ends": np.array(ends),
-        "capsule_radius": np.array([capsule.radius for _, _, capsule in capsules]),
+        "capsule_link": np.array([i for i, link in enumerate(hand.links) for _ in link.capsules], np.int32),
+        "capsule_ends": np.concatenate([capsule_ends(link) for link in hand.links]),
+        "capsule_radius": np.array([capsule.radius for link in hand.links for capsule in link.capsules]),
     }
 
 
@@ -214,20 +213,8 @@ def _check_facts(facts: dict[str, Any]) -> None:
 
 
 def _check_arrays(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> None:
-    """A ValueError where an array has another shape than its meaning says, or none, or values that cannot be."""
-    sizes: dict[str, int] = {}
-    for name, meaning in meanings.items():
-        words = meaning[1 : meaning.index(")")]
-        letters, shape = words.replace(",", " ").split(), arrays[name].shape
-        if 0 in shape:
-            raise ValueError(f"{name} is empty")
-        if len(letters) == len(shape):
-            for letter, size in zip(letters, shape, strict=True):
-                sizes.setdefault(letter, int(letter) if letter.isdigit() else size)
-        wanted = [sizes.get(letter) for letter in letters]
-        if wanted != list(shape):
-            raise ValueError(f"{name} has shape {shape}, where ({words}) is {tuple(wanted)}")
-        _check_values(name, meaning, arrays[name])
+    """A ValueError where an array is not what its meaning says, or has values that cannot be."""
+    sizes = check_arrays(arrays, meanings, indices=_INDICES, largest=_LARGEST)
     faces = arrays["object_faces"]
     if faces.min() < 0 or faces.max() >= sizes["V"]:
         raise ValueError("object_faces names vertices that are not there")
@@ -238,14 +225,3 @@ def _check_arrays(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> No
         raise ValueError("joint_limits are in the wrong order")
     if not (arrays["capsule_radius"] > 0).all() or not 0 < arrays["object_file_scale"] < _LARGEST:
         raise ValueError("capsule_radius or object_file_scale is not above zero")
-
-
-def _check_values(name: str, meaning: str, array: np.ndarray) -> None:
-    """A ValueError where values are not of the kind that the array's meaning says, not finite, or absurdly large."""
-    kinds = "U" if ") text" in meaning else "b" if "bool" in meaning else "biuf"
-    if array.dtype.kind not in kinds:
-        raise ValueError(f"{name} is of the type {array.dtype}")
-    if array.dtype.kind == "f" and not (np.isfinite(array).all() and np.abs(array).max() < _LARGEST):
-        raise ValueError(f"{name} holds numbers that are not finite, or absurdly large")
-    if name in _INDICES and array.dtype.kind not in "iu":
-        raise ValueError(f"{name} is of the type {array.dtype}")

@@ -2,16 +2,14 @@
 
 import numpy as np
 
-from common import rotations
+from actors.bank import clear_of_table
 from common.errors import CongraspError
-from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
+from common.objects.shapes import matrix
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.task.constraints import CONSTRAINTS
 from common.task.sampling.headings import above, clear_table, feasible, sample_headings
-
-_CLEARANCE, _STEEPEST_UP = 0.02, 0.1  # of a wrist over the table, m, and of an approach that rises
 
 
 def headings(
@@ -55,16 +53,11 @@ def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
             f"'{obj.name}' cannot be approached in any of its resting poses.",
             "Scale it so that some part is narrower than 12 cm, or leave out --heading above and --at.",
         )
-    down = -_matrix(obj.rest_poses[0][3:])[2]
+    down = -matrix(obj.rest_poses[0][3:])[2]
     return (
         "The hand would have to come through the table, however the object lies.",
         f'In its likeliest pose straight down is --heading "{" ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)}".',
     )
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation of a quaternion (4,)."""
-    return np.asarray(rotations.to_matrix(np.asarray(quaternion, np.float32)))
 
 
 def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
@@ -77,13 +70,9 @@ def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
     return None
 
 
-def valid_rests(hand: Hand, obj: GraspObject, request: GraspRequest) -> np.ndarray:
-    """Resting poses in which a reference pose or trajectory stays over the table and does not come from below."""
-    path, turn = prescribed(request) or (np.zeros((0, 3)), np.array([1.0, 0.0, 0.0, 0.0]))
-    heading = _matrix(turn) @ grasp_frame(hand).heading
-    up = np.array([_matrix(rest[3:])[2] for rest in obj.rest_poses])
-    lowest = (up @ path.T).min(-1) + obj.rest_poses[:, 2]
-    valid = np.flatnonzero((lowest > _CLEARANCE) & (up @ heading < _STEEPEST_UP))
+def valid_rests(hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Resting poses in which a wrist path (n, 3) with a last orientation (4,) stays over the table, not from below."""
+    valid = np.flatnonzero(clear_of_table(hand, turn[None], path[None], obj.rest_poses[None])[0])
     if not len(valid):
         raise CongraspError(
             f"With this reference the hand would be in the table in every resting pose of '{obj.name}'.",

@@ -1,7 +1,7 @@
 """Constraint sets as files: headings, reference poses and wrist trajectories of one object for one hand."""
 
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from common.objects.pool import object_scale, scale_objects
 from common.objects.spec import GraspObject
 from common.task.bank import ConstraintBank
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
+from services.described import check_arrays
 
 SUFFIX = ".constraints.safetensors"
 REGIONS = ("whole surface", "graspable region")
@@ -268,37 +269,27 @@ def load(path: pathlib.Path) -> Message:
         raise CongraspError(f"{path} is not a constraint set of this version of congrasp.", remedy)
     if missing := sorted(_MEANING.keys() - message.arrays.keys()):
         raise CongraspError(f"The constraint set {path} lacks '{missing[0]}'.", remedy)
-    for fault in _faults(message):
-        raise CongraspError(f"The constraint set {path} is damaged: {fault}.", remedy)
+    try:
+        _check(message)
+    except (CongraspError, ValueError) as error:
+        raise CongraspError(f"The constraint set {path} is damaged: {str(error).split('. ')[0]}.", remedy) from None
     return message
 
 
-def _faults(message: Message) -> Iterator[str]:
-    """Facts of another kind, and arrays whose shape or values are not what `_MEANING` says."""
+def _check(message: Message) -> None:
+    """An error for facts of another kind, and for arrays that are not what `_MEANING` says."""
     meta, sizes = message.meta, {"V": len(REGIONS), "F": len(_names(message.meta.get("finger_joints")))}
     for name in ("object", "hand"):
-        try:
-            file_name(meta.get(name), f"the {name} of a constraint set")
-        except CongraspError as error:
-            yield str(error).split(". ")[0]
+        file_name(meta.get(name), f"the {name} of a constraint set")
     scale = meta.get("object_scale")
     if not isinstance(scale, (int, float)) or not 0 < scale <= 100 or not isinstance(meta.get("object_digest"), str):
-        yield "its object_scale or object_digest is none"
+        raise ValueError("its object_scale or object_digest is none")
     if len(_names(meta.get("variants"))) != len(REGIONS):
-        yield f"it has other variants than {', '.join(REGIONS)}"
-    for name, meaning in _MEANING.items():
-        array = message.arrays[name]
-        letters = meaning[1 : meaning.index(")")].replace(",", " ").split()
-        for letter, size in zip(letters, array.shape, strict=False):
-            sizes.setdefault(letter, int(letter) if letter.isdigit() else size)
-        if array.shape != tuple(sizes.get(letter) for letter in letters) or not array.size > 0:
-            yield f"{name} has the shape {array.shape}, not ({', '.join(letters)})"
-        elif array.dtype.kind not in ("b" if "bool" in meaning else "iu" if "indices" in meaning else "f"):
-            yield f"{name} is of the type {array.dtype}"
-        elif array.dtype.kind == "f" and not (np.isfinite(array).all() and np.abs(array).max() <= _LARGEST):
-            yield f"{name} holds numbers that are not finite, or absurdly large"
-        elif array.dtype.kind in "iu" and not (array.min() >= 0 and array.max() < sizes["n"]):
-            yield f"{name} names vertices that are not there"
+        raise ValueError(f"it has other variants than {', '.join(REGIONS)}")
+    sizes = check_arrays(message.arrays, _MEANING, indices=("visual/faces",), largest=_LARGEST, sizes=sizes)
+    faces = message.arrays["visual/faces"]
+    if faces.min() < 0 or faces.max() >= sizes["n"]:
+        raise ValueError("visual/faces names vertices that are not there")
 
 
 def _names(value: Any) -> list[str]:

@@ -50,8 +50,8 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
     last = steps[-1]
     camera = best_camera(episode, steps) if pictures or video else None
     if pictures:
-        save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera, quick=True))
-        save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera, quick=True)))
+        save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera))
+        save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if video:
         save_episode_video(folder / VIDEO, episode, _VIDEO, camera)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())

@@ -11,12 +11,12 @@ import jax
 import numpy as np
 
 from actors.attempts import Attempts, Outcome
-from actors.episode import episode_message
 from actors.initial import RequestedEpisodes
 from actors.protocols import ASSESSED
-from actors.rollout import Trace
+from common.config import TaskConfig
 from common.errors import ContradictionError
 from common.hands import get_hand
+from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
@@ -173,26 +173,18 @@ class Grasper:
         """Attempts under the constraints, (B,) the resting pose of each, and how many of them are different."""
         batch = self._attempts_count
         labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
-        one = goal_of(self.hand, self.task, request)
-        goal = jax.tree.map(lambda array: np.broadcast_to(array, (batch, *np.shape(array))), one)
-        if prescribed(request) is None:
+        episodes = repeated(self.hand, self.task, labelled, request, batch)
+        path = prescribed(request)
+        if path is None:
             position, direction, cross, rests = headings(labelled, request, batch, self.task.back_off, rng)
             found = {"position": position, "direction": direction, "cross": cross}
-            goal = goal.replace("heading", **{name: value.astype(np.float32) for name, value in found.items()})
+            found = {name: value.astype(np.float32) for name, value in found.items()}
+            episodes = episodes._replace(goal=episodes.goal.replace("heading", **found))
             different = batch
         else:
-            reference = valid_rests(self.hand, obj, request)
+            reference = valid_rests(self.hand, obj, *path)
             rests, different = np.resize(reference, batch), min(batch, len(reference))
-        surface = self._surface(labelled)
-        surface = Surface(*(np.broadcast_to(field, (batch, *field.shape)) for field in surface))
-        asked = {c.name: np.full(batch, c.name in request.constraints) for c in optional(self.task)}
-        rest = np.asarray(obj.rest_poses, np.float32)[rests]
-        return RequestedEpisodes(goal, asked, surface, rest), rests, different
-
-    def _surface(self, obj: GraspObject) -> Surface:
-        """As many labelled points as the policy looks at."""
-        points = self.task.surface_points
-        return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points])
+        return episodes._replace(rest=np.asarray(obj.rest_poses, np.float32)[rests]), rests, different
 
     def _result(
         self,
@@ -206,26 +198,15 @@ class Grasper:
         held: int,
     ) -> Grasp:
         """One attempt of an outcome, with its episode, motion and the constraints that were active."""
-        metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
         labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
-        episode = episode_message(
-            self.hand,
-            self.task,
-            Trace(*(field[:, index] for field in outcome.trace)),
-            outcome.goal.row(index),
-            self._surface(labelled),
-            obj,
-            {
-                "version": self._policy.version,
-                "actor": "grasp",
-                "success": metrics["success"] > 0,
-                "metrics": metrics,
-                "tries": attempts,
-                "tries_held": held,
-                "object_file_scale": obj.file_scale,
-                "object_file_origin": [-x for x in obj.origin],
-            },
-        )
+        about = {
+            "actor": "grasp",
+            "tries": attempts,
+            "tries_held": held,
+            "object_file_scale": obj.file_scale,
+            "object_file_origin": [-x for x in obj.origin],
+        }
+        episode = self._attempts.episode(outcome, index, surface_of(self.task, labelled), obj, about)
         asked = tuple(request.constraints)
         active = explain(asked, bool(outcome.redirected[index]))
         written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
@@ -272,6 +253,23 @@ def grasp(
 def _grasper(file: pathlib.Path, changed: int, attempts: int, seed: int) -> Grasper:
     """The grasper of a policy file as it was when it changed last."""
     return Grasper(bundles.load(file), attempts=attempts, seed=seed)
+
+
+def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int) -> RequestedEpisodes:
+    """What is asked for of a labelled object, `batch` times, in the resting pose that the request names."""
+    rest = np.asarray(obj.rest_poses[request.rest or 0], np.float32)
+    goal, surface, rest = jax.tree.map(
+        lambda array: np.broadcast_to(array, (batch, *np.shape(array))),
+        (goal_of(hand, task, request), surface_of(task, obj), rest),
+    )
+    asked = {c.name: np.full(batch, c.name in request.constraints) for c in optional(task)}
+    return RequestedEpisodes(goal, asked, surface, rest)
+
+
+def surface_of(task: TaskConfig, obj: GraspObject) -> Surface:
+    """As many labelled points of an object as the policy looks at, without batch axis."""
+    points = task.surface_points
+    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points])
 
 
 def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:

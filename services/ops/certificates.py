@@ -29,12 +29,11 @@ _LOOPBACK = ("localhost", "127.0.0.1")
 _CLOCKS = datetime.timedelta(minutes=5)  # by which the clocks of two machines may differ
 
 
-def create_authority(folder: pathlib.Path, *, days: float = CA_DAYS, force: bool = False) -> Certificate:
+def create_authority(folder: pathlib.Path, *, force: bool = False) -> Certificate:
     """Makes an authority: `ca.crt`, which everyone gets, and `ca.key`, which stays where it is.
 
     Args:
       folder: made if it is not there.
-      days: until it expires.
       force: replace an authority that is there, which makes all certificates that it issued useless.
 
     Raises:
@@ -56,7 +55,7 @@ def create_authority(folder: pathlib.Path, *, days: float = CA_DAYS, force: bool
         data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
     )  # fmt: skip
     made = (
-        _builder(name, name, key.public_key(), days)
+        _builder(name, name, key.public_key(), CA_DAYS)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
         .sign(key, hashes.SHA256())

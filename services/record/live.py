@@ -11,6 +11,7 @@ from typing import Any
 from common.errors import CongraspError
 from services.record.channels import Channel, Entry
 
+_HOST = "127.0.0.1"
 _BACKLOG = 20000  # entries that may wait for their time; beyond it the newest are left out
 
 
@@ -21,12 +22,11 @@ class LiveServer:
     plays it. Whoever subscribes later is given the last message of latched channels.
     """
 
-    def __init__(self, port: int, host: str = "127.0.0.1"):
-        """Listens.
+    def __init__(self, port: int):
+        """Listens on the loopback interface: there is no authentication, and anyone who reaches it sees the run.
 
         Args:
           port: TCP port; 0 takes a free one (see `port`).
-          host: interface. There is no authentication: anyone who reaches it sees the run.
 
         Raises:
           CongraspError: the package is absent, or the port is busy.
@@ -55,11 +55,11 @@ class LiveServer:
 
         try:
             self._server = foxglove.start_server(
-                name="congrasp", host=host, port=port, context=self._context, server_listener=Listener()
+                name="congrasp", host=_HOST, port=port, context=self._context, server_listener=Listener()
             )
         except (OSError, RuntimeError) as error:
             raise CongraspError(
-                f"The live view cannot listen on {host}:{port} ({error}).", "Choose another port with --live."
+                f"The live view cannot listen on {_HOST}:{port} ({error}).", "Choose another port with --live."
             ) from None
         self.port = self._server.port
         self._thread = threading.Thread(target=self._work, daemon=True, name="live view")

@@ -43,7 +43,6 @@ class Recorder:
         name: str = "log",
         sinks: Sequence[Sink] = (),
         depth: int = 512,
-        max_bytes: int = 256 << 20,
         max_seconds: float = 600.0,
         warn: Callable[[str], None] = lambda text: print(f"congrasp: {text}", file=sys.stderr, flush=True),
     ):
@@ -56,13 +55,10 @@ class Recorder:
           name: how the files' names begin.
           sinks: who else is given every entry.
           depth: messages kept when they come faster than they are written; then the oldest are dropped.
-          max_bytes: see `LogWriter`.
           max_seconds: see `LogWriter`.
           warn: takes a line about what goes wrong.
         """
-        self._writer = (
-            LogWriter(directory, name, run=run, max_bytes=max_bytes, max_seconds=max_seconds) if directory else None
-        )
+        self._writer = LogWriter(directory, name, run=run, max_seconds=max_seconds) if directory else None
         self._subscription = transport.subscribe(Keys(run).logs, depth=depth)
         self._sinks, self._warn = tuple(sinks), warn
         self._convert = Converter()

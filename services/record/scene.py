@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from common.hands import get_hand
 from common.hands.mjcf import WRIST_JOINTS
-from common.hands.spec import Capsule, Hand, Link, link_origin
+from common.hands.spec import Hand, Link, capsule_ends
 from common.wire.codec import Message, encode
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
@@ -109,8 +109,7 @@ def _static_scene(
     update.deletions.add(type=SceneEntityDeletion.ALL).timestamp.FromNanoseconds(now)
     for link in hand.links:
         entity = _entity(update, f"hand/{link.name}", f"{actor}/{link.name}", now)
-        for capsule in link.capsules:
-            _add_capsule(entity, capsule, np.array(link_origin(link)), np.zeros(3), Rotation.identity(), _SKIN)
+        _add_capsules(entity, link, np.zeros(3), Rotation.identity(), _SKIN)
     frame = f"{actor}/object"
     body = _entity(update, "object", frame, now).triangles.add()
     body.pose.orientation.w = 1.0
@@ -153,9 +152,7 @@ def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mappin
             position, quaternion = mujoco_link_poses(hand, arrays["goal/pose_q"])
             for k, link in enumerate(hand.links):
                 turn = wrist * Rotation.from_quat(quaternion[k], scalar_first=True)
-                for capsule in link.capsules:
-                    place = wrist.apply(position[k]) + origin
-                    _add_capsule(entity, capsule, np.array(link_origin(link)), place, turn, _GHOST)
+                _add_capsules(entity, link, wrist.apply(position[k]) + origin, turn, _GHOST)
 
 
 def _surface(actor: str, arrays: Mapping[str, np.ndarray], now: int) -> PointCloud:
@@ -170,8 +167,7 @@ def _skin(link: Link) -> np.ndarray:
     Equal steps along a capsule's whole length cut equal areas off it, caps included (Archimedes).
     """
     points = []
-    for capsule in link.capsules:
-        start, end = np.subtract([capsule.start, capsule.end], link_origin(link))
+    for capsule, (start, end) in zip(link.capsules, capsule_ends(link), strict=True):
         length = float(np.linalg.norm(end - start))
         axis = (end - start) / length if length else np.array([0.0, 0.0, 1.0])
         turn = Rotation.from_quat(_turn_onto([0.0, 0.0, 1.0], axis), scalar_first=True)
@@ -245,21 +241,19 @@ def _entity(update: SceneUpdate, name: str, frame: str, now: int, *, lifetime: i
     return entity
 
 
-def _add_capsule(
-    entity: SceneEntity, capsule: Capsule, origin: np.ndarray, place: np.ndarray, turn: Rotation, colour: Colour
-) -> None:
-    """A capsule of a link (`origin`: the link's at zero) whose frame lies at `place`, `turn` in the entity's frame."""
-    start, end = turn.apply(np.subtract([capsule.start, capsule.end], origin)) + place
-    along = end - start
-    length = float(np.linalg.norm(along))
-    if length > 0:
-        cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
-        _set_vector(cylinder.pose.position, (start + end) / 2)
-        _set_quaternion(cylinder.pose.orientation, _turn_onto([0.0, 0.0, 1.0], along / length))
-        _set_vector(cylinder.size, [2 * capsule.radius, 2 * capsule.radius, length])
-        _set_colour(cylinder.color, colour)
-        _add_sphere(entity, end, capsule.radius, colour)
-    _add_sphere(entity, start, capsule.radius, colour)
+def _add_capsules(entity: SceneEntity, link: Link, place: np.ndarray, turn: Rotation, colour: Colour) -> None:
+    """The capsules of a link whose frame lies at `place`, `turn` in the entity's frame."""
+    for capsule, ends in zip(link.capsules, capsule_ends(link), strict=True):
+        start, end = turn.apply(ends) + place
+        length = float(np.linalg.norm(end - start))
+        if length > 0:
+            cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+            _set_vector(cylinder.pose.position, (start + end) / 2)
+            _set_quaternion(cylinder.pose.orientation, _turn_onto([0.0, 0.0, 1.0], (end - start) / length))
+            _set_vector(cylinder.size, [2 * capsule.radius, 2 * capsule.radius, length])
+            _set_colour(cylinder.color, colour)
+            _add_sphere(entity, end, capsule.radius, colour)
+        _add_sphere(entity, start, capsule.radius, colour)
 
 
 def _add_sphere(entity: SceneEntity, center: np.ndarray, radius: float, colour: Colour) -> None:

@@ -32,7 +32,7 @@ from services.evaluate.showcase import showcase
 from services.ops.shutdown import on_signal
 from services.serve.client import PolicyClient
 from services.serve.load import example_episode, one_answer, serving, wait_until_ready
-from services.train.in_process import train_in_process
+from services.train.learn import learn
 from services.train.presets import PRESETS, easier
 from services.train.processes import engine_of, leave_gpus_to, train
 from services.viz.render import episode_sheet
@@ -94,10 +94,11 @@ def run_training(
         began = time.monotonic()
         with _Progress(config, ranks) as progress:
             if plan.in_process:
-                train_in_process(
+                learn(
                     run_dir,
                     config,
-                    physics=plan.physics,
+                    wire=None,
+                    inside=plan.physics,
                     stop=stop,
                     resume=resume,
                     writers=writers,

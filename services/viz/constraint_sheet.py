@@ -7,10 +7,10 @@ from common.hands import get_hand
 from common.task.sampling.headings import INWARD
 from common.wire.codec import Message
 from services.record.palette import HEADING, OBJECT, WAYPOINT
-from services.viz.raycast import Shape
+from services.viz.raster import render_scene
 from services.viz.render import OBJECT_AVOID
-from services.viz.shade import render_scene
-from services.viz.shapes import arrow, beads, fit, posed_hand, table_shape
+from services.viz.scene import Shape
+from services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, table_shape
 from services.viz.sheets import contact_sheet
 
 _ARROWS, _PATHS = 14, 4
@@ -64,7 +64,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
     avoid = arrays["surface/minus"]
     body = Shape(
         "mesh",
-        (0, 0, 0),
+        (0, 0),
         OBJECT,
         np.asarray(place[:3], float),
         np.asarray(place[3:], float),
@@ -83,20 +83,10 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
         "another reference pose": grasp(0, whole[1:2]),
         "reference pose on the graspable region and its trajectory": grasp(1, region[:1]) + paths(1, region[:1]),
     }
-    solid = turn.apply(arrays["visual/vertices"]) + place[:3]
     images = []
     for shapes in panels.values():
-        extent = np.concatenate([solid, *(_extent(shape) for shape in shapes)])
+        extent = np.concatenate([shape_points(shape) for shape in [*shapes, body]])
         camera = fit(extent, np.array(_VIEW), _SIZE[0] / _SIZE[1])
         images.append(render_scene([*shapes, body, table_shape(place[:3])], camera, _SIZE))
     title = f"{meta['object']}, {meta['hand']} hand, resting pose {rest + 1} of {len(arrays['rest'])}"
     return contact_sheet(images, list(panels), columns=3, title=f"{title}; avoid region in dark red")
-
-
-def _extent(shape: Shape) -> np.ndarray:
-    """(N, 3) points of a shape in the world."""
-    if shape.vertices is not None:
-        turn = Rotation.from_quat(shape.quaternion, scalar_first=True)
-        return turn.apply(shape.vertices) + shape.position
-    reach = max(shape.size) + shape.size[0]
-    return shape.position + reach * np.concatenate([np.eye(3), -np.eye(3)])

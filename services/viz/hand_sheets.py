@@ -7,8 +7,8 @@ import numpy as np
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand, link_origin
 from services.record.palette import HEADING, OBJECT, SKIN, WAYPOINT
-from services.viz.raycast import Shape
-from services.viz.shade import render_scene
+from services.viz.raster import render_scene
+from services.viz.scene import Shape
 from services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, upright
 from services.viz.sheets import contact_sheet
 

@@ -13,8 +13,8 @@ from services.assets.objects.repair import with_few_faces
 from services.assets.objects.sizes import length, size_in_words
 from services.assets.objects.sources import Source, read_mesh
 from services.record.palette import OBJECT, PIECES
-from services.viz.raster import Raster
-from services.viz.raycast import Shape
+from services.viz.raster import render_scene
+from services.viz.scene import Shape
 from services.viz.shapes import fit, posed_hand, shape_points, upright
 from services.viz.sheets import contact_sheet
 
@@ -55,11 +55,10 @@ def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -
     parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [
         (rest.apply(vertices), faces, PIECES[i % len(PIECES)]) for i, (vertices, faces) in pieces
     ]
-    raster = Raster()
     images = []
     for shapes in (_beside(hand, bodies) for bodies in parts.values()):
         points = np.concatenate([shape_points(shape) for shape in shapes])
-        images.append(raster.draw(shapes, fit(points, np.array(_VIEW), _SIZE[0] / _SIZE[1]), _SIZE))
+        images.append(render_scene(shapes, fit(points, np.array(_VIEW), _SIZE[0] / _SIZE[1]), _SIZE))
     title = f"{obj.name} beside the {hand.name} hand at true scale"
     return contact_sheet(images, list(parts), columns=len(parts), title="  |  ".join([title, *obj.notes]))
 
@@ -79,7 +78,7 @@ def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
     low, high = points.min(0), points.max(0)
     middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     shapes = [
-        Shape("mesh", (0, 0, 0), colour, vertices=vertices - middle, faces=faces) for vertices, faces, colour in bodies
+        Shape("mesh", (0, 0), colour, vertices=vertices - middle, faces=faces) for vertices, faces, colour in bodies
     ]
     turn = upright(hand)
     standing = posed_hand(hand, hand.q_open, np.zeros(3), turn)

@@ -10,8 +10,8 @@ from common.objects.shapes import tessellate
 from common.objects.spec import GraspObject
 from common.task.sampling.headings import Headings, clear_table, feasible
 from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, PIECES
-from services.viz.raster import Raster
-from services.viz.raycast import Shape
+from services.viz.raster import render_scene
+from services.viz.scene import Shape
 from services.viz.shapes import arrow, fit, shape_points, table_shape
 from services.viz.sheets import contact_sheet
 
@@ -35,7 +35,7 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
     chosen = np.flatnonzero(feasible(cleared, pose))[:_ARROWS]
     tips, ways = turn.apply(cleared.position[chosen]) + place, turn.apply(cleared.direction[chosen])
 
-    whole = Shape("mesh", (0, 0, 0), OBJECT, place, pose[3:], vertices=obj.visual_vertices, faces=obj.visual_faces)
+    whole = Shape("mesh", (0, 0), OBJECT, place, pose[3:], vertices=obj.visual_vertices, faces=obj.visual_faces)
     paint = np.where(obj.non_graspable_points[:, None], AVOID, GRASPABLE)
     pieces = [
         dataclasses.replace(whole, colour=PIECES[i % len(PIECES)], vertices=vertices, faces=faces)
@@ -52,9 +52,9 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
             *itertools.chain(*arrows),
         ],
     }
-    raster, images = Raster(), []
+    images = []
     for shapes in panels.values():
         camera = fit(np.concatenate([shape_points(shape) for shape in shapes]), np.array(_VIEW), _SIZE[0] / _SIZE[1])
-        images.append(raster.draw([*shapes, table_shape(place)], camera, _SIZE))
+        images.append(render_scene([*shapes, table_shape(place)], camera, _SIZE))
     title = f"{obj.name}: {1000 * obj.mass:.0f} g, resting pose 1 of {len(obj.rest_poses)}"
     return contact_sheet(images, list(panels), columns=len(panels), title=title)

@@ -13,9 +13,8 @@ from common.hands.spec import Hand
 from common.wire.codec import Message
 from services.record.goals import active_blocks
 from services.record.palette import HEADING, OBJECT, SKIN, WAYPOINT
-from services.viz.raster import Raster
-from services.viz.raycast import Camera, Scene, Shape
-from services.viz.shade import render_scene, visible
+from services.viz.raster import render_scene, visible
+from services.viz.scene import Camera, Shape
 from services.viz.shapes import arrow, beads, fit, hand_shapes, posed_hand, table_shape
 from services.viz.sheets import contact_sheet, save_video
 
@@ -51,7 +50,7 @@ def _object(episode: Message, step: int) -> Shape:
     painted = affordance and bool(avoid.any())
     return Shape(
         "mesh",
-        (0, 0, 0),
+        (0, 0),
         OBJECT,
         np.asarray(arrays["object_position"][step], float),
         np.asarray(arrays["object_quaternion"][step], float),
@@ -89,17 +88,17 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
 def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -> Camera:
     """A camera that holds everything that happens in the steps, from where object and touching links show most."""
     points = np.concatenate([_extent(episode, step) for step in steps])
-    scenes = [Scene(episode_shapes(episode, steps[i])) for i in sorted({len(steps) // 2, len(steps) - 1})]
+    pictured = [episode_shapes(episode, steps[i]) for i in sorted({len(steps) // 2, len(steps) - 1})]
     links = sum(len(link.capsules) for link in get_hand(episode.meta["hand"]).links)
 
     def score(camera: Camera) -> float:
         """How much of object, touching links and constraints a camera shows."""
         total = 0.0
-        for scene in scenes:
-            shown, rest = scene.shapes[: links + 1], scene.shapes[links + 1 :]
-            worth = np.array([0.2 if shape.colour == SKIN else 1.0 for shape in shown] + [0.5] * len(rest))
-            seen = visible(scene, camera, (round(72 * aspect), 72))
-            total += float(worth[seen[seen >= 0]].sum() - 0.5 * (seen == links + 1).sum())
+        for shapes in pictured:
+            worth = [0.2 if shape.colour == SKIN else 1.0 for shape in shapes[: links + 1]]
+            worth += [0.0 if shape.kind == "cylinder" else 0.5 for shape in shapes[links + 1 :]]
+            seen = visible(shapes, camera, (round(72 * aspect), 72))
+            total += float(np.array(worth)[seen[seen >= 0]].sum())
         return total
 
     azimuths = np.radians(np.arange(0, 360, 30))
@@ -130,8 +129,6 @@ def render_episode_frames(
     steps: Iterable[int],
     size: tuple[int, int] = (640, 480),
     camera: Camera | None = None,
-    *,
-    quick: bool = False,
 ) -> Iterator[np.ndarray]:
     """Pictures (height, width, 3) uint8 of control steps of an episode, all from one camera.
 
@@ -140,17 +137,11 @@ def render_episode_frames(
       steps: control steps, from 0.
       size: width and height in pixels.
       camera: from where; the best of a circle around the scene otherwise.
-      quick: plainer light, many times faster.
     """
     steps = list(steps)
     seen_from = camera or best_camera(episode, steps, size[0] / size[1])
-    if not quick:
-        for step in steps:
-            yield render_scene(episode_shapes(episode, step), seen_from, size)
-        return
-    raster = Raster()
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        yield from pool.map(lambda step: raster.draw(episode_shapes(episode, step), seen_from, size), steps)
+        yield from pool.map(lambda step: render_scene(episode_shapes(episode, step), seen_from, size), steps)
 
 
 def episode_sheet(
@@ -160,7 +151,6 @@ def episode_sheet(
     size: tuple[int, int] = (440, 330),
     steps: Sequence[int] | None = None,
     camera: Camera | None = None,
-    quick: bool = False,
 ) -> np.ndarray:
     """An episode in a few frames (its first and last step, and the table's removal, among them), with its metrics.
 
@@ -169,14 +159,13 @@ def episode_sheet(
       frames: number of pictures.
       size: width and height of each, pixels.
       steps: control steps of the pictures; spread evenly otherwise.
-      camera: see `render_episode_frames`, as is `quick`.
-      quick: plainer light, many times faster.
+      camera: see `render_episode_frames`.
     """
     steps = steps or key_steps(np.asarray(episode.arrays["table"], bool), frames)
     dt = float(episode.meta["control_dt"])
     table = np.asarray(episode.arrays["table"], bool)
     labels = [f"{dt * step:.2f} s" + ("" if table[step] else "   table removed") for step in steps]
-    images = list(render_episode_frames(episode, steps, size, camera, quick=quick))
+    images = list(render_episode_frames(episode, steps, size, camera))
     return contact_sheet(images, labels, columns=min(4, len(steps)), title=episode_title(episode))
 
 
@@ -188,7 +177,6 @@ def episode_strip(
     last: str,
     *,
     until: int | None = None,
-    quick: bool = False,
 ) -> tuple[list[np.ndarray], list[str]]:
     """A contact sheet's row: pictures of an episode's key frames, and their labels.
 
@@ -199,12 +187,11 @@ def episode_strip(
       first: label of the first picture.
       last: what to say after the time of the last one.
       until: step of the last one; the episode's last if not given.
-      quick: plainer light, many times faster.
     """
     table = np.asarray(episode.arrays["table"], bool)
     steps = key_steps(table if until is None else table[: until + 1], frames)
     seconds = [f"{episode.meta['control_dt'] * step:.2f} s" for step in steps]
-    return list(render_episode_frames(episode, steps, size, quick=quick)), [
+    return list(render_episode_frames(episode, steps, size)), [
         first,
         *seconds[1:-1],
         f"{seconds[-1]}{last}",
@@ -242,4 +229,4 @@ def save_episode_video(
     step = max(1, round(_FRAME_SECONDS / 2 / float(episode.meta["control_dt"])))
     removal = int(table.sum())
     steps = [*range(0, removal, step), *range(removal, len(table), 2 * step)]
-    save_video(path, render_episode_frames(episode, steps, size, camera, quick=True), size, 1 / _FRAME_SECONDS)
+    save_video(path, render_episode_frames(episode, steps, size, camera), size, 1 / _FRAME_SECONDS)

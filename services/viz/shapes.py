@@ -8,10 +8,10 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.hands.spec import Hand, link_origin
+from common.hands.spec import Hand, capsule_ends
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.palette import SKIN, TABLE, Colour
-from services.viz.raycast import Camera, Shape, between
+from services.viz.scene import Camera, Shape, between
 
 _TABLE_RADIUS, _TABLE_HALF_HEIGHT = 0.28, 0.008  # m
 FIELD_OF_VIEW = 26.0
@@ -38,8 +38,8 @@ def hand_shapes(
     shapes = []
     for i, link in enumerate(hand.links):
         turn = Rotation.from_quat(quaternion[i], scalar_first=True)
-        for capsule in link.capsules:
-            start, end = turn.apply(np.subtract([capsule.start, capsule.end], link_origin(link))) + position[i]
+        for capsule, ends in zip(link.capsules, capsule_ends(link), strict=True):
+            start, end = turn.apply(ends) + position[i]
             shapes.append(between(start, end, capsule.radius, colours[i] if colours else SKIN, alpha=alpha))
     return shapes
 
@@ -64,11 +64,11 @@ def posed_hand(
 def table_shape(below: np.ndarray) -> Shape:
     """A round table top at height zero under a point (3,)."""
     position = np.array([below[0], below[1], -_TABLE_HALF_HEIGHT], float)
-    return Shape("cylinder", (_TABLE_RADIUS, _TABLE_HALF_HEIGHT, 0), TABLE, position, shine=0.0)
+    return Shape("cylinder", (_TABLE_RADIUS, _TABLE_HALF_HEIGHT), TABLE, position, shine=0.0, shadow=False)
 
 
 def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: Colour) -> list[Shape]:
-    """A shaft with a cone whose tip is at `end` (3,)."""
+    """A shaft with a cone whose tip is at `end` (3,), without a shadow."""
     along = np.subtract(end, start)
     direction = along / np.linalg.norm(along)
     neck = end - 6 * radius * direction
@@ -79,17 +79,17 @@ def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: Colour) -> 
     here = np.arange(32)
     after = (here + 1) % 32
     faces = np.concatenate([np.stack([here, after, np.full(32, 32)], -1), np.stack([after, here, np.full(32, 33)], -1)])
-    cone = Shape("mesh", (0, 0, 0), colour, neck, turn, vertices=vertices, faces=faces)
-    return [between(start, neck, radius, colour), cone]
+    cone = Shape("mesh", (0, 0), colour, neck, turn, shadow=False, vertices=vertices, faces=faces)
+    return [between(start, neck, radius, colour, shadow=False), cone]
 
 
 def beads(points: np.ndarray, radius: float, colour: Colour) -> Shape:
-    """Balls at points (N, 3) on a string, as one mesh: every further shape would slow down all rays."""
+    """Balls at points (N, 3) on a string, without a shadow."""
     balls = [trimesh.creation.icosphere(1, radius).apply_translation(point) for point in points]
     pairs = [pair for pair in itertools.pairwise(points) if np.linalg.norm(np.subtract(*pair)) > 1e-6]
     string = [trimesh.creation.cylinder(0.4 * radius, segment=pair, sections=8) for pair in pairs]
     mesh: Any = trimesh.util.concatenate([*balls, *string])
-    return Shape("mesh", (0, 0, 0), colour, vertices=mesh.vertices, faces=mesh.faces)
+    return Shape("mesh", (0, 0), colour, shadow=False, vertices=mesh.vertices, faces=mesh.faces)
 
 
 def fit(points: np.ndarray, direction: np.ndarray, aspect: float) -> Camera:

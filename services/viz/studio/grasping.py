@@ -4,24 +4,20 @@ import dataclasses
 import os
 from typing import Any
 
-import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from actors.attempts import Attempts, Outcome
-from actors.episode import episode_message
 from actors.initial import RequestedEpisodes
-from actors.rollout import Trace
 from common.config import TaskConfig
 from common.errors import CongraspError, TransportError
 from common.hands import get_hand
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
-from common.task.constraints import goal_of, known, optional, require_known
-from common.task.types import Surface
+from common.task.constraints import known, require_known
 from common.wire.codec import Message
-from services.grasp.grasper import costs
+from services.grasp.grasper import costs, repeated, surface_of
 from services.serve.server import Source
 from services.viz.studio.jobs import Progress
 
@@ -92,22 +88,8 @@ class PolicyGrasping:
         outcome = self._attempts.run(obj, episodes, lambda step: progress("grasping", step / steps))
         self._compiled = True
         index = _best(outcome, tuple(request.constraints))
-        metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
-        return episode_message(
-            self.hand,
-            self.task,
-            Trace(*(field[:, index] for field in outcome.trace)),
-            outcome.goal.row(index),
-            _surface(self.task, obj),
-            obj,
-            {
-                "version": self._policy.version,
-                "actor": "studio",
-                "success": metrics["success"] > 0,
-                "metrics": metrics,
-                "note": _note(outcome, index, aside),
-            },
-        )
+        about = {"actor": "studio", "note": _note(outcome, index, aside)}
+        return self._attempts.episode(outcome, index, surface_of(self.task, obj), obj, about)
 
 
 def _episodes(
@@ -115,7 +97,8 @@ def _episodes(
 ) -> tuple[RequestedEpisodes, np.ndarray]:
     """`ATTEMPTS` episodes, the first as drawn; and how far (B,) in m each is beside that."""
     rng = np.random.default_rng(0)
-    goal = jax.tree.map(lambda array: np.repeat(np.asarray(array)[None], ATTEMPTS, 0), goal_of(hand, task, request))
+    drawn = repeated(hand, task, obj, request, ATTEMPTS)
+    goal = drawn.goal
     others = np.arange(ATTEMPTS) > 0
     shift = (rng.normal(0.0, _ASIDE, (ATTEMPTS, 3)) * others[:, None]).astype(np.float32)
     tilt, roll = (rng.normal(0.0, sigma, ATTEMPTS) * others for sigma in (_TILT, _ROLL))
@@ -130,17 +113,7 @@ def _episodes(
         if "position" in constraint.arrays:
             place = goal[constraint.name].position
             goal = goal.replace(constraint.name, position=place + shift.reshape(-1, *[1] * (place.ndim - 2), 3))
-    requested = {
-        constraint.name: np.full(ATTEMPTS, constraint.name in request.constraints) for constraint in optional(task)
-    }
-    surface = Surface(*(np.repeat(np.asarray(field)[None], ATTEMPTS, 0) for field in _surface(task, obj)))
-    rest = np.repeat(obj.rest_poses[request.rest or 0][None].astype(np.float32), ATTEMPTS, 0)
-    return RequestedEpisodes(goal, requested, surface, rest), np.linalg.norm(shift, axis=-1)
-
-
-def _surface(task: TaskConfig, obj: GraspObject) -> Surface:
-    """Its surface points (N, 3) and which of them are in the avoid region (N,), object frame."""
-    return Surface(obj.points[: task.surface_points], obj.non_graspable_points[: task.surface_points])
+    return drawn._replace(goal=goal), np.linalg.norm(shift, axis=-1)
 
 
 def _best(outcome: Outcome, constraints: tuple[str, ...]) -> int:

@@ -86,7 +86,7 @@ def test_pairs_are_drawn_independently_but_where_they_are_aligned(bank):
         goal = _all(bank, plan_row(TASK, bank, OBJECTS, name, 60)).goal
         end = goal["trajectory"].position[:, -1]
         own = np.linalg.norm(bank.pose_q[:, 0][:, None] - goal["pose"].q[None, :, None], axis=-1)
-        n, i, m = np.unravel_index(own.transpose(1, 0, 2).reshape(len(end), -1).argmin(1), own[:, 0].shape + (1,))
+        n, i, _m = np.unravel_index(own.transpose(1, 0, 2).reshape(len(end), -1).argmin(1), (*own[:, 0].shape, 1))
         apart[name] = np.linalg.norm(np.asarray(bank.pose_position)[n, 0, i] - end, axis=-1)
     independent, aligned = apart.values()
     assert aligned.max() < 0.005 and np.mean(independent > 0.005) > 0.8

@@ -1,11 +1,13 @@
 """Pictures show what is there, where it is, and in the right colours."""
 
+import dataclasses
 import pathlib
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
@@ -17,7 +19,7 @@ from services.record.palette import OBJECT
 from services.record.reader import pick_episode
 from services.record.writer import LogWriter
 from services.viz.hand_sheets import hand_sheet
-from services.viz.raycast import Camera, Scene, Shape, between
+from services.viz.raster import render_scene, visible
 from services.viz.render import (
     OBJECT_AVOID,
     TOUCHING,
@@ -28,10 +30,10 @@ from services.viz.render import (
     key_steps,
     render_episode_frames,
 )
-from services.viz.shade import render_scene, visible
+from services.viz.scene import Camera, Shape, between
 from services.viz.shapes import arrow, beads, fit
 from services.viz.sheets import contact_sheet, save_png, save_video
-from services.viz.smooth import SmoothNormals
+from services.viz.triangles import cut, smooth_corners
 from tests.episodes import CONTROL_DT, episode, older
 
 WHITE, RED, BLUE = (0.9, 0.9, 0.9), (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
@@ -39,7 +41,14 @@ FRONT = Camera(np.array([1.0, 0.0, 0.0]), np.zeros(3), 30.0)
 
 
 def ball(radius: float = 0.1, colour: tuple[float, float, float] = RED, at: tuple[float, ...] = (0, 0, 0)) -> Shape:
-    return Shape("sphere", (radius, 0, 0), colour, np.array(at, float))
+    return Shape("sphere", (radius, 0), colour, np.array(at, float))
+
+
+def box(
+    sides: tuple[float, ...], colour: tuple[float, float, float], at: tuple[float, ...], alpha: float = 1.0
+) -> Shape:
+    mesh = trimesh.creation.box(sides)
+    return Shape("mesh", (0, 0), colour, np.array(at, float), alpha=alpha, vertices=mesh.vertices, faces=mesh.faces)
 
 
 def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -49,7 +58,7 @@ def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def test_a_ball_covers_its_projection() -> None:
-    seen = visible(Scene([ball()]), FRONT, (200, 200)) == 0
+    seen = visible([ball()], FRONT, (200, 200)) == 0
     # A sphere of radius r at distance d is seen under the half angle asin(r / d).
     radius = np.tan(np.arcsin(0.1)) / np.tan(np.radians(15)) * 100
     assert seen.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
@@ -59,13 +68,13 @@ def test_a_ball_covers_its_projection() -> None:
 
 def test_right_is_right_and_up_is_up() -> None:
     # Seen from +x, +y lies to the right.
-    seen = visible(Scene([ball(0.03, at=(0, 0.15, 0.15))]), FRONT, (100, 100)) == 0
+    seen = visible([ball(0.03, at=(0, 0.15, 0.15))], FRONT, (100, 100)) == 0
     rows, columns = np.nonzero(seen)
     assert rows.mean() < 40 and columns.mean() > 60
 
 
 def test_the_nearer_shape_hides_the_other() -> None:
-    seen = visible(Scene([ball(0.1), ball(0.02, BLUE, (0.3, 0, 0))]), FRONT, (101, 101))
+    seen = visible([ball(0.1), ball(0.02, BLUE, (0.3, 0, 0))], FRONT, (101, 101))
     assert seen[50, 50] == 1 and seen[35, 50] == 0 and seen[0, 0] == -1
 
 
@@ -78,25 +87,28 @@ def test_colours_and_background() -> None:
 
 
 def test_what_is_seen_through_takes_its_share_of_the_colour() -> None:
-    pane = Shape("box", (0.01, 0.2, 0.2), BLUE, np.array([0.3, 0, 0]), alpha=0.5)
+    pane = box((0.02, 0.4, 0.4), BLUE, (0.3, 0, 0), alpha=0.5)
     plain, through = render_scene([ball()], FRONT, (61, 61)), render_scene([ball(), pane], FRONT, (61, 61))
     center_plain, center = plain[30, 30].astype(int), through[30, 30].astype(int)
     assert center[0] < center_plain[0] and center[2] > center_plain[2]
     assert center[0] > 40  # the red ball is still seen
-    hidden = Shape("box", (0.01, 0.02, 0.02), BLUE, np.array([-0.3, 0, 0]), alpha=0.5)
+    hidden = box((0.02, 0.04, 0.04), BLUE, (-0.3, 0, 0), alpha=0.5)
     np.testing.assert_array_equal(render_scene([ball(), hidden], FRONT, (61, 61))[30, 30], plain[30, 30])
 
 
 def test_a_ball_darkens_the_ground_beneath_it() -> None:
-    ground = Shape("box", (1, 1, 0.01), WHITE, np.array([0, 0, -0.01]), shine=0.0)
+    ground = Shape("cylinder", (1, 0.01), WHITE, np.array([0, 0, -0.01]), shine=0.0, shadow=False)
     above = Camera(np.array([0.5, 0.0, 0.5]), np.zeros(3), 40.0)
     bare = render_scene([ground], above, (80, 80)).astype(int).sum(-1)
     shaded = render_scene([ground, ball(0.05, at=(0, 0, 0.05))], above, (80, 80)).astype(int).sum(-1)
-    floor = visible(Scene([ground, ball(0.05, at=(0, 0, 0.05))]), above, (80, 80)) == 0
+    floor = visible([ground, ball(0.05, at=(0, 0, 0.05))], above, (80, 80)) == 0
     assert (bare - shaded)[floor].max() > 100
     corner = np.zeros_like(floor)
     corner[:10, :10] = True
     assert np.abs(bare - shaded)[floor & corner].max() < 30
+    marked = render_scene([ground, dataclasses.replace(ball(0.05, at=(0, 0, 0.05)), shadow=False)], above, (80, 80))
+    inside = binary_erosion(floor, iterations=2)  # without pixels that show some of the ball
+    np.testing.assert_array_equal(marked.astype(int).sum(-1)[inside], bare[inside])
 
 
 def test_painted_regions_meet_where_their_points_do() -> None:
@@ -104,7 +116,7 @@ def test_painted_regions_meet_where_their_points_do() -> None:
     points = np.array([[0.1, y, z] for y in np.linspace(-0.1, 0.1, 11) for z in np.linspace(-0.1, 0.1, 11)])
     colours = np.where(points[:, 2:] > 0, RED, BLUE)
     painted = Shape(
-        "mesh", (0, 0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint_points=points, paint_colours=colours
+        "mesh", (0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint_points=points, paint_colours=colours
     )
     image = render_scene([painted], FRONT, (60, 60)).astype(int)
     assert image[20, 30, 0] > 2 * image[20, 30, 2] and image[40, 30, 2] > 2 * image[40, 30, 0]
@@ -112,17 +124,32 @@ def test_painted_regions_meet_where_their_points_do() -> None:
 
 def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
     sphere = trimesh.creation.icosphere(2, 0.1)
-    points, faces = trimesh.sample.sample_surface(sphere, 500, seed=0)
-    flat = sphere.face_normals[faces]
-    exact = points / np.linalg.norm(points, axis=1, keepdims=True)
-    smooth = SmoothNormals(sphere.vertices, sphere.faces)(points, flat)
-    assert np.degrees(np.arccos((flat * exact).sum(1))).max() > 5
-    assert np.degrees(np.arccos(np.clip((smooth * exact).sum(1), -1, 1))).max() < 2
+    corners, smooth = cut(*smooth_corners(sphere.vertices, sphere.faces))
+    exact = corners / np.linalg.norm(corners, axis=-1, keepdims=True)
+
+    def degrees_off(normals: np.ndarray) -> float:
+        unit = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+        return float(np.degrees(np.arccos(np.clip((unit * exact).sum(-1), -1, 1))).max())
+
+    assert len(corners) > 2 * len(sphere.faces)
+    assert degrees_off(flat_normals(corners)) > 5 and degrees_off(smooth) < 2
     box = trimesh.creation.box((1, 1, 1))
-    points, faces = trimesh.sample.sample_surface(box, 200, seed=0)
-    np.testing.assert_allclose(
-        SmoothNormals(box.vertices, box.faces)(points, box.face_normals[faces]), box.face_normals[faces], atol=1e-6
-    )
+    corners, smooth = cut(*smooth_corners(box.vertices, box.faces))
+    np.testing.assert_allclose(smooth, np.broadcast_to(flat_normals(corners), smooth.shape), atol=1e-6)
+
+
+def flat_normals(corners: np.ndarray) -> np.ndarray:
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return (cross / np.linalg.norm(cross, axis=-1, keepdims=True))[:, None]
+
+
+def test_a_mesh_is_cut_without_a_change_of_its_surface() -> None:
+    box = trimesh.creation.box((0.1, 0.06, 0.02))
+    corners, _ = cut(*smooth_corners(box.vertices, box.faces))
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    assert sides.max() <= 0.00501  # at most 5 mm
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    assert mesh.area == pytest.approx(box.area) and mesh.volume == pytest.approx(box.volume)
 
 
 def test_between_and_arrow_lie_where_they_are_asked_to() -> None:

@@ -1,4 +1,4 @@
-"""A learner and an actor in one process: rollouts never leave the device."""
+"""A learner with its metrics and recordings, and where rollouts are to stay on the device an actor beside it."""
 
 import contextlib
 import dataclasses
@@ -26,59 +26,66 @@ _START_SECONDS = 0.5
 """By which the learner, which must listen first, is ahead of the actor."""
 
 
-def train_in_process(
+def learn(
     run_dir: pathlib.Path,
     config: RunConfig,
     *,
-    physics: PhysicsName,
+    wire: Transport | None,
+    inside: PhysicsName | None,
     stop: threading.Event,
     resume: bool,
     ranks: Ranks | None = None,
-    wire: Transport | None = None,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
     on_event: Callable[[str, str], None] = lambda level, text: None,
     writers: Sequence[MetricWriter] = (),
     metrics_port: int = 0,
+    metrics_host: str = "127.0.0.1",
 ) -> None:
-    """The same learner and one actor in this process, over the in-memory transport.
+    """Runs a learner until it is finished or told to stop.
 
-    The two share their processors: to act under old weights while the learner updates would gain nothing. So updates
-    are on-policy, whatever `max_staleness` is.
+    With an actor inside the two share their processors: to act under old weights while the learner updates would gain
+    nothing. So updates are on-policy then, whatever `max_staleness` is.
 
     Args:
       run_dir: see `run_learner`, as `config`, `resume`, `ranks`, `on_update` and `on_event`.
-      physics: engine of the actor.
+      wire: a transport that listens, by which others send rollouts and ask how things stand; None only with an actor
+        inside.
+      inside: engine of an actor in this process, over the in-memory transport; None for no such actor.
       stop: ends training.
-      wire: a transport that listens, where others may ask how things stand, and send rollouts, too.
-      writers: which metric writers get its metrics.
-      metrics_port: port of a Prometheus endpoint on the loopback interface; 0 for none.
+      writers: which metric writers get the metrics of rank 0.
+      metrics_port: port of a Prometheus endpoint; 0 for none.
+      metrics_host: its interface.
     """
-    prepare_workers(config.objects.count)
-    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, max_staleness=0))
-    rank, url = 0 if ranks is None else ranks.rank, f"memory/{run_dir}"
-    with urls.listen(url, "learner") as memory:
-        metrics = LearnerMetrics(functools.partial(ask, memory, config.name))
+    rank, transport = 0 if ranks is None else ranks.rank, wire
+    with contextlib.ExitStack() as stack:
+        if inside is not None:
+            prepare_workers(config.objects.count)
+            config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, max_staleness=0))
+            memory = stack.enter_context(urls.listen(url := f"memory/{run_dir}", "learner"))
+            transport = memory if wire is None else PairTransport(memory, wire)
+        assert transport is not None, "somebody must be able to reach the learner"
+        metrics = LearnerMetrics(functools.partial(ask, transport, config.name))
 
         def updated(values: dict[str, float]) -> None:
             metrics.update(values)
             on_update(values)
 
-        with (
-            exposed(metrics_port, "127.0.0.1", metrics) if metrics_port else contextlib.nullcontext(),
-            _actor_thread(url, config, f"actor-{rank}", physics, stop),
-        ):
-            run_learner(
-                run_dir,
-                config,
-                memory if wire is None else PairTransport(memory, wire),
-                stop_event=stop,
-                resume=resume,
-                ranks=ranks,
-                audit=False,
-                recorder=recorded(memory, config, run_dir, writers) if rank == 0 else None,
-                on_update=updated,
-                on_event=on_event,
-            )
+        if metrics_port:
+            stack.enter_context(exposed(metrics_port, metrics_host, metrics))
+        if inside is not None:
+            stack.enter_context(_actor_thread(url, config, f"actor-{rank}", inside, stop))
+        run_learner(
+            run_dir,
+            config,
+            transport,
+            stop_event=stop,
+            resume=resume,
+            ranks=ranks,
+            audit=inside is None,
+            recorder=recorded(transport, config, run_dir, writers) if rank == 0 else None,
+            on_update=updated,
+            on_event=on_event,
+        )
 
 
 @contextlib.contextmanager

@@ -1,0 +1,197 @@
+"""Shapes as triangles with smooth normals, small enough for paint and light to be known at their corners alone."""
+
+import functools
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from services.viz.scene import Shape
+
+GAMMA = 2.2
+"""sRGB is about linear light to the power of one over this."""
+CREASE = np.cos(np.radians(35.0))
+"""Faces whose normals differ by more than this angle (given as its cosine) meet in a sharp edge."""
+_SIDE = 0.005  # longest side of a mesh's triangles, m
+_MOST = 12_000  # about how many triangles a mesh is cut into; those of a larger one stay longer
+_RINGS, _SECTIONS = 56, 128  # of a cylinder's faces
+
+
+class Triangles(NamedTuple):
+    """F triangles between V points, which have a normal each: where two smooth surfaces meet there are two points."""
+
+    points: np.ndarray
+    """(V, 3) float32."""
+    normals: np.ndarray
+    """(V, 3) float32 unit."""
+    colours: np.ndarray
+    """(V, 3) float32 linear light that the surface gives back."""
+    shine: np.ndarray
+    """(V,) float32 strength of the highlight."""
+    faces: np.ndarray
+    """(F, 3) indices of their corners."""
+    closed: np.ndarray
+    """(F,) bool: part of a closed surface that winds outwards, so that only its outside can be seen."""
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(F, 3, 3)."""
+        return self.points[self.faces]
+
+
+class _Surface(NamedTuple):
+    """A shape's triangles in its own frame."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    closed: bool
+    paint: np.ndarray | None = None
+    """(V, 3) linear light, if it is painted."""
+
+
+def triangles_of(shapes: Iterable[Shape], *, fine: bool = True) -> Triangles:
+    """The triangles of shapes in the world, one shape after the other; small ones if they are `fine`."""
+    none = np.zeros((0, 3), np.float32)
+    found = [Triangles(none, none, none, none[:, 0], none.astype(int), none[:, 0] > 0)]
+    return joined([*found, *(_triangles(shape, fine) for shape in shapes)])
+
+
+def joined(parts: Sequence[Triangles]) -> Triangles:
+    """The triangles of all parts, one after the other."""
+    firsts = np.cumsum([0, *(len(part.points) for part in parts)])
+    parts = [part._replace(faces=part.faces + first) for part, first in zip(parts, firsts, strict=False)]
+    return Triangles(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+
+
+def _triangles(shape: Shape, fine: bool) -> Triangles:
+    """The triangles of one shape in the world."""
+    if shape.kind == "mesh":
+        surface = _mesh(
+            _content(shape.vertices, float),
+            _content(shape.faces, int),
+            _content(shape.paint_points, float),
+            _content(shape.paint_colours, float),
+            fine,
+        )
+    else:
+        surface = (_cylinder if shape.kind == "cylinder" else _capsule)(*shape.size, fine)
+    turn = Rotation.from_quat(shape.quaternion, scalar_first=True).as_matrix().astype(np.float32)
+    points = surface.points @ turn.T + np.asarray(shape.position, np.float32)
+    even = np.broadcast_to(_linear(np.asarray(shape.colour)), points.shape)
+    return Triangles(
+        points,
+        surface.normals @ turn.T,
+        even if surface.paint is None else surface.paint,
+        np.full(len(points), shape.shine, np.float32),
+        surface.faces,
+        np.full(len(surface.faces), surface.closed),
+    )
+
+
+def _content(array: np.ndarray | None, kind: type) -> bytes:
+    """The numbers of an array, if there is one."""
+    return b"" if array is None else np.asarray(array, kind).tobytes()
+
+
+@functools.lru_cache(maxsize=64)
+def _mesh(vertices: bytes, faces: bytes, paint_points: bytes, paint_colours: bytes, fine: bool) -> _Surface:
+    """A mesh; its arrays' contents tell meshes apart, so that one that moves from picture to picture is cut once."""
+    corners, triples = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, int).reshape(-1, 3)
+    closed = bool(trimesh.Trimesh(corners, triples).is_volume)
+    surface = _surface(*smooth_corners(corners, triples), closed, fine)
+    if not paint_points:
+        return surface
+    points, colours = (np.frombuffer(paint).reshape(-1, 3) for paint in (paint_points, paint_colours))
+    return surface._replace(paint=_linear(_painted(cKDTree(points), colours, surface.points)))
+
+
+@functools.lru_cache(maxsize=256)
+def _capsule(radius: float, half_length: float, fine: bool) -> _Surface:
+    """A capsule along z, or a ball."""
+    ball = trimesh.creation.icosphere(2 if fine else 1, 1.0)
+    normals, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    # As large as a round one, not inside of it, and pulled apart at its equator: what crosses it becomes the shaft.
+    lift = np.where(normals[:, 2] > 1e-6, half_length, np.where(normals[:, 2] < -1e-6, -half_length, 0.0))
+    points = radius * np.sqrt(4 * np.pi / ball.area) * normals + lift[:, None] * np.array([0.0, 0.0, 1.0])
+    return _surface(points[faces], normals[faces], True, fine)
+
+
+@functools.lru_cache(maxsize=8)
+def _cylinder(radius: float, half_length: float, fine: bool) -> _Surface:
+    """A cylinder along z."""
+    outline = [(0.0, -half_length), (radius, -half_length), (radius, half_length), (0.0, half_length)]
+    if fine:
+        outline[-1:] = [(r, half_length) for r in radius * np.linspace(1, 0, _RINGS)[1:]]
+    mesh = trimesh.creation.revolve(outline, sections=_SECTIONS)
+    return _surface(*smooth_corners(mesh.vertices, mesh.faces), True, False)
+
+
+def _surface(corners: np.ndarray, normals: np.ndarray, closed: bool, fine: bool) -> _Surface:
+    """Triangles (F, 3, 3) with normals (F, 3, 3), cut if they are to be fine; equal corners become one point."""
+    if fine:
+        corners, normals = cut(corners, normals)
+    rows = np.concatenate([corners, normals], -1).reshape(-1, 6)
+    found, faces = np.unique(np.round(rows, 5), axis=0, return_inverse=True)
+    points, directions = np.split(found.astype(np.float32), 2, -1)
+    return _Surface(points, directions, faces.reshape(-1, 3), closed)
+
+
+def smooth_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and normals (F, 3, 3) of a mesh (V, 3), (F, 3) without its faces of no area.
+
+    A corner's normal is the mean, weighted by area, of the faces around it that are within the crease angle.
+    """
+    vertices, faces = np.asarray(vertices, float), np.asarray(faces)
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    good = area > 1e-14
+    faces, corners, cross = faces[good], corners[good], cross[good]
+    flat = cross / area[good, None]
+    # Vertices at one place are one vertex, whatever the file says.
+    places = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)[1].ravel()[faces].ravel()
+    order = np.argsort(places, kind="stable")
+    owner = order // 3
+    starts = np.flatnonzero(np.r_[True, np.diff(places[order]) > 0])
+    sizes = np.diff(np.r_[starts, len(order)])
+    normals = np.zeros((len(order), 3))
+    for size in np.unique(sizes):
+        groups = starts[sizes == size][:, None] + np.arange(size)
+        around = owner[groups]  # (groups, size) faces that share a vertex
+        near = np.einsum("gik,gjk->gij", flat[around], flat[around]) > CREASE
+        normals[order[groups]] = np.einsum("gij,gjk->gik", near, cross[around])
+    return corners, (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).reshape(-1, 3, 3)
+
+
+def cut(corners: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface (F, 3, 3) in smaller triangles: those with a long side are halved across it, again and again."""
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum() / 2
+    longest = max(_SIDE, 3 * float(np.sqrt(area / _MOST)))
+    rest, small = np.concatenate([corners, normals], -1), []
+    while len(rest):
+        sides = np.linalg.norm(rest[:, [1, 2, 0], :3] - rest[..., :3], axis=-1)
+        long = sides.max(1) > longest
+        small.append(rest[~long])
+        first = (sides[long].argmax(1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(rest[long], first[..., None], 1).swapaxes(0, 1)
+        middle = (a + b) / 2
+        rest = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+    corners, normals = np.split(np.concatenate(small), 2, -1)
+    return corners, normals
+
+
+def _painted(tree: cKDTree, colours: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n, 3) colours of the nearest paint points, with a soft border."""
+    distance, near = tree.query(points, k=min(4, len(colours)))
+    distance, near = distance.reshape(len(points), -1), near.reshape(len(points), -1)
+    weight = 1 / (distance**2 + 1e-8) ** 2
+    return (weight[..., None] * colours[near]).sum(1) / weight.sum(1, keepdims=True)
+
+
+def _linear(colour: np.ndarray) -> np.ndarray:
+    """sRGB as linear light."""
+    return (colour**GAMMA).astype(np.float32)
