@@ -84,6 +84,8 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
         trajectory_position=path.reshape(*shape, *path.shape[1:]),
         trajectory_quaternion=turns.reshape(*shape, *turns.shape[1:]),
         pose_valid=jnp.swapaxes(valid.reshape(*shape, -1), -1, -2),
+        weight=jnp.ones(len(objects)),
+        renewable=jnp.ones(len(objects), bool),
     )
 
 

@@ -90,7 +90,7 @@ def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, ke
     place = grasps.object_index, grasps.region, slot
     # Of several grasps for one place the last is taken, in all arrays: a scatter would mix them on a GPU.
     number = jnp.arange(slot.size)
-    usable = grasps.found & valid.any(-1)
+    usable = grasps.found & valid.any(-1) & bank.renewable[grasps.object_index]
     taken = jnp.full(bank.pose_q.shape[:3], -1).at[place].max(jnp.where(usable, number, -1))
     # What is written outside of an array is dropped.
     row = jnp.where(usable & (taken[place] == number), grasps.object_index, objects)

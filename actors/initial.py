@@ -62,7 +62,9 @@ def sample(
       stationary: () bool, holds the objects in place (the paper's first phase).
     """
     keys = iter(jax.random.split(key, 3))
-    objects = jax.random.randint(next(keys), (batch,), 0, bank.points.shape[0])
+    share = jnp.cumsum(bank.weight)
+    objects = jnp.searchsorted(share, share[-1] * jax.random.uniform(next(keys), (batch,)), side="right")
+    objects = jnp.minimum(objects, len(bank.weight) - 1).astype(jnp.int32)  # rounding may reach the end
     rests = jax.random.randint(next(keys), (batch,), 0, bank.rest.shape[1])
     wanted = {
         c.name: jax.random.uniform(own_key(key, c.name, 0), (batch,)) < getattr(task, f"p_{c.name}")

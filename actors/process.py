@@ -9,18 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from actors.bank import build_bank
 from actors.env import EnvState, episode_fields
 from actors.episode import episode_message
 from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes
+from actors.training_set import training_set
 from common.config import RunConfig, run_config_from_json
 from common.engines import PhysicsName
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.journal import Journal
-from common.objects.pool import load_pool, scale_objects
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
 from common.task.types import Array, Surface
 from common.transport.base import Transport
@@ -105,8 +104,7 @@ class _Actor:
         self._config, self._arrays, self._link, self._transport = config, arrays, link, transport
         self._hand = get_hand(config.task.hand)
         number = zlib.crc32(link.actor.encode())
-        self._objects = scale_objects(self._hand, config.task, load_pool(config.objects, number))
-        bank = build_bank(self._hand, config.task, self._objects, config.seed + number)
+        self._objects, bank = training_set(self._hand, config, number)
         self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
         self._spec = policy_spec(config.task, config.network)
         self._worker = RolloutWorker(

@@ -130,6 +130,10 @@ class TaskConfig(_Shares):
     """The reward's weights."""
 
 
+Split = Literal["all", "training", "held-out"]
+"""Parts of constraint sets."""
+
+
 @dataclasses.dataclass(frozen=True)
 class ObjectsConfig:
     """Which objects a run uses."""
@@ -142,6 +146,16 @@ class ObjectsConfig:
     """First seed; actors shift it so that each has its own objects. Evaluation uses seeds from one million upward."""
     folder: str = ""
     """A folder of imported objects to use instead of procedural ones."""
+    constraints: str = ""
+    """A folder of constraint sets of that folder's objects, such as captured ones ('congrasp constraints import'):
+    training draws headings, reference poses and trajectories from them. Objects without a set are left out."""
+    split: Split = "training"
+    """Of these sets the part for training, what is held out, or all."""
+    procedural: int = 0
+    """Procedural objects beside those of the folder."""
+    folder_share: float = 0.0
+    """Share of the episodes that have an object of the folder, where there are procedural ones beside; 0: every object
+    is drawn alike."""
 
 
 @dataclasses.dataclass(frozen=True)

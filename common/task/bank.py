@@ -1,8 +1,10 @@
 """The constraint bank: what the constraints of episodes are drawn from, stacked over a pool of objects."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
+
+import numpy as np
 
 from common.task.types import Array
 
@@ -44,6 +46,46 @@ class ConstraintBank(NamedTuple):
     """(N, V, R, M) bool: pose and trajectory stay above the table in the resting pose."""
     has_affordance: Array
     """(N, R) bool: the object has an avoid region, and its graspable one can be approached in the resting pose."""
+    weight: Array
+    """(N,) how often the object is drawn, in relation to the others."""
+    renewable: Array
+    """(N,) bool: grasps of the policy in training may take the place of the object's references."""
+
+
+_AXES = {
+    **{name: "VRH" for name in ("heading_index", "heading_back")},
+    **{name: "VH" for name in ("heading_position", "heading_direction", "heading_cross")},
+    **{f"pose_{name}": "VM" for name in ("q", "position", "quaternion")},
+    **{f"trajectory_{name}": "VM" for name in ("position", "quaternion")},
+    "rest": "R",
+    "has_affordance": "R",
+    "pose_valid": "VRM",
+}
+"""Leading axes of an object's arrays whose sizes may differ between objects, among others."""
+
+
+def rows_of(bank: ConstraintBank) -> list[ConstraintBank]:
+    """Each object's arrays, without the leading axis N."""
+    return [ConstraintBank(*(np.asarray(field)[n] for field in bank)) for n in range(len(bank.points))]
+
+
+def stacked(rows: Sequence[ConstraintBank]) -> ConstraintBank:
+    """The bank of objects from each one's arrays; resting poses, headings and references repeat up to the most."""
+    most = {
+        axis: max(getattr(row, name).shape[_AXES[name].index(axis)] for row in rows)
+        for axis, name in (("R", "rest"), ("H", "heading_position"), ("M", "pose_q"))
+    }
+
+    def repeated(name: str, value: np.ndarray) -> np.ndarray:
+        """One array with as many rows along each of these axes as any object has."""
+        for place, axis in enumerate(_AXES.get(name, "")):
+            if axis in most:
+                value = np.take(value, np.resize(np.arange(value.shape[place]), most[axis]), place)
+        return value
+
+    return ConstraintBank(
+        **{name: np.stack([repeated(name, getattr(row, name)) for row in rows]) for name in ConstraintBank._fields}
+    )
 
 
 class Draw(NamedTuple):

@@ -238,8 +238,9 @@ def show(
       rest: Resting pose of the picture, from 1; 0 takes the one that leaves room for most poses.
       seed: Draws which constraints the picture shows.
     """
+    from common.task.constraint_sets import load
     from services.cli.console import show_facts
-    from services.grasp.constraint_sets import describe, load
+    from services.grasp.constraint_sets import describe
 
     constraints = load(file)
     rests = len(constraints.arrays["rest"])

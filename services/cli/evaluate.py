@@ -8,6 +8,7 @@ import numpy as np
 import tyro
 
 from actors.physics import PhysicsName
+from common.config import Split
 from common.errors import CongraspError
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from common.task.bank import ConstraintBank
     from services.cli.console import Track
 
-Split = Literal["all", "training", "held-out"]
 Table = Literal["single", "composed", "cross", "objects", "noise", "all"]
 _POOL = 64
 _PICTURED = 4
@@ -255,8 +255,8 @@ def _captured(
 ) -> "tuple[list[GraspObject], ConstraintBank, str]":
     """The objects that have a constraint set in a folder, the bank of their sets, and the paper's table of their data
     set."""
+    from common.task.constraint_sets import bank_of, load_for
     from services.evaluate.paper import CAPTURED_SETS
-    from services.grasp.constraint_sets import bank_of, load_for
 
     if given is None:
         raise CongraspError("--constraints needs the sets' objects.", "Name their folder with --objects.")

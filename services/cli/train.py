@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 import actors.physics  # noqa: F401 - registers the engines that --physics offers
-from common.config import MetricWriter, RunConfig
+from common.config import MetricWriter, RunConfig, Split
 from common.task.methods import with_method
 from learner.run_directory import CONFIG_FILE, open_run
 from services.train.presets import get_preset, with_hand
@@ -22,6 +22,8 @@ def train(
     actors: int | None = None,
     ranks: int = 1,
     initial: pathlib.Path | None = None,
+    constraints: pathlib.Path | None = None,
+    split: Split | None = None,
     resume: bool = False,
     listen: str | None = None,
     certs: pathlib.Path | None = None,
@@ -48,6 +50,9 @@ def train(
       ranks: Learners that train together, data parallel; each has a GPU of its own where there are GPUs, and --actors
         actors. The batch grows with them.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
+      constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp constraints import'); their
+        objects are those of --objects.folder, and --objects.procedural puts others beside them.
+      split: Of these sets the part for training (the default), what is held out, or all.
       resume: Go on from the newest intact checkpoint in --run-dir, with the run's own configuration; what the learner
         alone uses, such as --updates and --ppo.…, may be changed.
       listen: Endpoint where actors of other machines may join, such as tls/0.0.0.0:7447; on this machine alone by

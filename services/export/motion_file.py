@@ -14,6 +14,7 @@ from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 
+from common.described import check_arrays
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands import get_hand
@@ -22,7 +23,6 @@ from common.inputs import file_name
 from common.npz import read_npz
 from common.task.constraints import CONSTRAINTS
 from common.wire.codec import Message
-from services.described import check_arrays
 from services.record.goals import active_constraints
 
 FORMAT = 2

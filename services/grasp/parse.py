@@ -19,6 +19,7 @@ from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
+from common.task import constraint_sets
 from common.task.constraints import CONSTRAINTS
 from common.task.constraints.base import Option
 from common.wire.codec import Message
@@ -26,7 +27,6 @@ from services.assets.objects.headers import check_header
 from services.assets.objects.sizes import size_in_words
 from services.export.frames import continuous_quaternions
 from services.export.motion_file import GraspMotion, load_motion
-from services.grasp import constraint_sets
 
 ABOVE = "above"
 """The heading straight down, whatever the object's pose."""

@@ -59,6 +59,8 @@ def _bank(valid: np.ndarray) -> ConstraintBank:
         trajectory_quaternion=quaternions(rng, 2, 2, M, K),
         pose_valid=np.broadcast_to(valid, (2, 2, 1, M)),
         has_affordance=np.ones((2, 1), bool),
+        weight=np.ones(2, np.float32),
+        renewable=np.ones(2, bool),
     )
 
 

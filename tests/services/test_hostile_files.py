@@ -22,6 +22,7 @@ from common.policy import bundle as bundles
 from common.policy import network, normalizer
 from common.policy.bundle import PolicyBundle
 from common.policy.pretrained import policy_file
+from common.task import constraint_sets as stored_sets
 from common.wire.codec import Message, decode, encode
 from services.export.motion_file import load_motion, motion_of_episode, save_motion
 from services.grasp import constraint_sets
@@ -58,7 +59,7 @@ def test_an_object_that_names_another_folder_is_not_read(tmp_path):
 
 def test_pipes_and_folders_are_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "a.safetensors")
-    for read in (store.load, bundles.load, constraint_sets.load, load_motion, read_hand):
+    for read in (store.load, bundles.load, stored_sets.load, load_motion, read_hand):
         assert "no regular file" in limited(read, tmp_path / "a.safetensors", seconds=5)
     with pytest.raises(CongraspError, match="more than the 3"):
         (tmp_path / "b").write_bytes(b"1234")
@@ -176,10 +177,10 @@ def test_motions_with_values_that_none_has_are_named(tmp_path, change, why):
 
 def _set():
     made = {"object": "mug", "hand": "human", "object_scale": 1.0, "object_digest": "0" * 16, "kind": "constraints"}
-    made |= {"format": 2, "variants": list(constraint_sets.REGIONS), "finger_joints": ["a", "b"]}
+    made |= {"format": 2, "variants": list(stored_sets.REGIONS), "finger_joints": ["a", "b"]}
     sizes = {"P": 8, "R": 2, "V": 2, "H": 4, "M": 3, "F": 2, "K": 5, "n": 4, "m": 4}
     arrays = {}
-    for name, meaning in constraint_sets._MEANING.items():
+    for name, meaning in stored_sets.MEANING.items():
         letters = meaning[1 : meaning.index(")")].replace(",", " ").split()
         kind = bool if "bool" in meaning else np.int32 if "indices" in meaning else np.float32
         arrays[name] = np.ones([int(x) if x.isdigit() else sizes[x] for x in letters], kind)
@@ -199,9 +200,9 @@ def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
     ):
         path.write_bytes(encode(change))
         with pytest.raises(CongraspError, match=why):
-            constraint_sets.load(path)
+            stored_sets.load(path)
     path.write_bytes(encode(made))
-    assert constraint_sets.load(path).meta == made.meta
+    assert stored_sets.load(path).meta == made.meta
 
 
 def _recomputed(data: bytes) -> bytes:
@@ -230,7 +231,7 @@ def _files(folder: pathlib.Path):
 
 LOADERS = {
     "object": store.load,
-    "set": constraint_sets.load,
+    "set": stored_sets.load,
     "hand": read_hand,
     "motion": load_motion,
     "policy": bundles.load,

@@ -229,6 +229,8 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
         trajectory_position=_twice(position),
         trajectory_quaternion=_twice(quaternion),
         pose_valid=np.stack([clear.T, (clear & nearer[:, None]).T]),
+        weight=np.float32(1.0),
+        renewable=np.bool_(False),
     )
     about = {
         "source": source,

@@ -11,6 +11,7 @@ from common.config import NetworkConfig, RunConfig, TaskConfig
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from common.objects import procedural
+from common.task import constraint_sets as stored_sets
 from services.evaluate.evaluator import Evaluator
 from services.evaluate.noise import LEVELS, Noise, with_noise
 from services.evaluate.noise_sheet import draw_curves
@@ -91,7 +92,7 @@ def test_curves_show_every_kind_of_noise(tmp_path):
 
 def test_a_constraint_bank_comes_back_from_its_files(bank):
     sets = constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 3)
-    back = constraint_sets.bank_of(sets)
+    back = stored_sets.bank_of(sets)
     for name in ("points", "avoid", "heading_position", "pose_q", "trajectory_position", "pose_quaternion"):
         np.testing.assert_array_equal(getattr(back, name), getattr(bank, name))
     for n in range(len(OBJECTS)):
@@ -104,7 +105,7 @@ def test_a_constraint_bank_comes_back_from_its_files(bank):
                 back_of = dict(zip(np.asarray(asked), np.asarray(bank.heading_back[n, v, r]), strict=True))
                 np.testing.assert_allclose([back_of[i] for i in found], back.heading_back[n, v, r])
         np.testing.assert_array_equal(back.has_affordance[n, :rests], bank.has_affordance[n, :rests])
-    held = constraint_sets.bank_of(sets, "held-out")
-    training = constraint_sets.bank_of(sets, "training")
+    held = stored_sets.bank_of(sets, "held-out")
+    training = stored_sets.bank_of(sets, "training")
     assert not np.any(held.pose_valid[:, 0, 0] & training.pose_valid[:, 0, 0])
     assert 0 < held.pose_valid[:, 0].any(1).mean() < training.pose_valid[:, 0].any(1).mean()

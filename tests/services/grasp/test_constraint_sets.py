@@ -9,6 +9,7 @@ from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural, store
+from common.task import constraint_sets as stored_sets
 from common.task.sampling.headings import Headings, clear_table, feasible
 from common.wire.codec import Message
 from services.cli.main import load
@@ -62,18 +63,18 @@ def test_a_set_is_what_training_draws_from(sets):
 
 
 def test_files_come_back_whole_and_others_are_refused(sets, file, tmp_path):
-    read = constraint_sets.load(file)
+    read = stored_sets.load(file)
     assert file.name == "mug_7.constraints.safetensors" and dict(read.meta) == dict(sets[0].meta)
     for name, array in sets[0].arrays.items():
         np.testing.assert_array_equal(read.arrays[name], array)
     store.save(OBJECTS[0], tmp_path / "object.safetensors")
     with pytest.raises(CongraspError, match="not a constraint set"):
-        constraint_sets.load(tmp_path / "object.safetensors")
+        stored_sets.load(tmp_path / "object.safetensors")
     (tmp_path / "text").write_text("not a set")
     with pytest.raises(CongraspError, match="cannot be read as a constraint set"):
-        constraint_sets.load(tmp_path / "text")
+        stored_sets.load(tmp_path / "text")
     with pytest.raises(CongraspError, match="cannot be read"):
-        constraint_sets.load(tmp_path / "absent")
+        stored_sets.load(tmp_path / "absent")
 
 
 def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypatch):

@@ -2,9 +2,9 @@ import json
 
 import pytest
 
+from common.task.constraint_sets import load as load_set
 from services.assets.captures.build import Report
 from services.cli.main import load
-from services.grasp.constraint_sets import load as load_set
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,8 +9,9 @@ from actors.bank import HEADINGS
 from common.hands import get_hand
 from common.hands.human import HUMAN
 from common.hands.kinematics import grasp_frame, keypoints, link_transforms
+from common.task.constraint_sets import bank_of
 from services.assets.captures.fit import joint_positions
-from services.grasp.constraint_sets import bank_of, describe
+from services.grasp.constraint_sets import describe
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write
 

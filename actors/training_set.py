@@ -1,0 +1,69 @@
+"""What an actor trains on: its objects, and the constraint bank that their episodes are drawn from."""
+
+import dataclasses
+import pathlib
+from typing import NamedTuple
+
+import numpy as np
+
+from actors.bank import build_bank
+from common.config import RunConfig
+from common.errors import CongraspError
+from common.hands.spec import Hand
+from common.objects.pool import load_pool, scale_objects
+from common.objects.spec import GraspObject
+from common.task.bank import ConstraintBank, rows_of, stacked
+from common.task.constraint_sets import bank_of, load_for
+
+
+class TrainingSet(NamedTuple):
+    """N objects in the hand's size, and their constraints."""
+
+    objects: list[GraspObject]
+    bank: ConstraintBank
+
+
+def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
+    """Procedural objects, those of a folder, or both, with procedural constraints or those of constraint sets.
+
+    Args:
+      hand: the hand.
+      config: of the run.
+      number: of the actor, whose procedural objects are its own.
+
+    Raises:
+      CongraspError: a folder holds nothing that can be trained on, or a set is not for this hand.
+    """
+    objects, task, seed = config.objects, config.task, config.seed + number
+    if not objects.folder:
+        if objects.constraints:
+            raise CongraspError("Constraint sets need their objects.", "Name their folder: --objects.folder FOLDER.")
+        pool = scale_objects(hand, task, load_pool(objects, number))
+        return TrainingSet(pool, build_bank(hand, task, pool, seed))
+    found = load_pool(objects)
+    if objects.constraints:
+        found, sets = load_for(pathlib.Path(objects.constraints), found)
+        if not sets:
+            raise CongraspError(
+                f"{objects.constraints} holds no constraint set of an object in {objects.folder}.",
+                "Name folders that belong together.",
+            )
+        if sets[0].meta["hand"] != hand.name:
+            raise CongraspError(
+                f"The constraint sets in {objects.constraints} are for the hand '{sets[0].meta['hand']}'.",
+                f"Make them for '{hand.name}', or train that hand.",
+            )
+        pool = scale_objects(hand, task, found)
+        bank = bank_of(sets, objects.split)
+    else:
+        pool = scale_objects(hand, task, found)
+        bank = build_bank(hand, task, pool, seed)
+    if not objects.procedural:
+        return TrainingSet(pool, bank)
+    more = dataclasses.replace(objects, folder="", count=objects.procedural)
+    beside = scale_objects(hand, task, load_pool(more, number))
+    both = stacked([*rows_of(bank), *rows_of(build_bank(hand, task, beside, seed))])
+    if share := objects.folder_share:
+        weights = [share / len(pool)] * len(pool) + [(1 - share) / len(beside)] * len(beside)
+        both = both._replace(weight=np.array(weights, np.float32))
+    return TrainingSet(pool + beside, both)

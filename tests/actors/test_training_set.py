@@ -1,0 +1,105 @@
+"""What actors train on: procedural objects, folders, captured constraints, and mixtures of them."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from actors import harvest, initial
+from actors.harvest import Grasps
+from actors.training_set import training_set
+from common.config import ObjectsConfig, RunConfig, TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects import procedural
+from common.objects.store import Catalogue
+from common.task.bank import rows_of, stacked
+from services.grasp.constraint_sets import make_sets, save
+
+HAND = get_hand("human")
+OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """A folder of two objects, and one of the constraint set of the first."""
+    objects, sets = tmp_path_factory.mktemp("objects"), tmp_path_factory.mktemp("sets")
+    for obj in OBJECTS:
+        Catalogue(objects).add(obj)
+    save(make_sets(HAND, TaskConfig(), OBJECTS[:1], 5)[0], sets)
+    return str(objects), str(sets)
+
+
+def _run(**objects) -> RunConfig:
+    return RunConfig(objects=ObjectsConfig(count=3, **objects))
+
+
+def test_a_folder_takes_the_place_of_procedural_objects_and_others_may_stand_beside_it(folders):
+    assert [obj.name for obj in training_set(HAND, _run(), 0).objects] == [
+        obj.name for obj in procedural.generate_many(3, 0)
+    ]
+    assert [obj.name for obj in training_set(HAND, _run(folder=folders[0]), 0).objects] == ["box-0", "mug-7"]
+    mixed = training_set(HAND, _run(folder=folders[0], procedural=4, folder_share=0.75), 0)
+    assert len(mixed.objects) == 6 and len(mixed.bank.points) == 6
+    np.testing.assert_allclose(mixed.bank.weight, [0.375] * 2 + [0.0625] * 4)
+
+
+def test_constraint_sets_keep_their_split_and_their_references(folders):
+    """Grasps of the policy in training replace references of its procedural objects, never captured ones."""
+    objects, sets = folders
+    found = training_set(HAND, _run(folder=objects, constraints=sets, procedural=1), 0)
+    assert found.objects[0].name == "mug-7" and len(found.objects) == 2
+    assert np.asarray(found.bank.renewable).tolist() == [False, True]
+    apart = [
+        np.asarray(training_set(HAND, _run(folder=objects, constraints=sets, split=split), 0).bank.pose_valid)
+        for split in ("training", "held-out", "all")
+    ]
+    assert not (apart[0] & apart[1]).any() and np.array_equal(apart[0] | apart[1], apart[2])
+    index = np.array([0, 1], np.int32)
+    poses = np.asarray(found.bank.pose_q)[:, 0, 0], np.asarray(found.bank.pose_position)[:, 0, 0]
+    grasps = Grasps(
+        np.ones(2, bool), index, 0 * index, poses[0] + 0.01, poses[1], np.asarray(found.bank.pose_quaternion)[:, 0, 0]
+    )
+    for _ in range(4):  # a random place each time
+        renewed = harvest.renew(HAND, TaskConfig(), found.bank, grasps, jax.random.key(0))
+        np.testing.assert_array_equal(renewed.pose_q[0], found.bank.pose_q[0])
+
+
+@pytest.mark.parametrize(
+    ("objects", "text"),
+    [({"constraints": "x"}, "objects.folder"), ({"folder": 0, "constraints": 0}, "no constraint set")],
+)
+def test_what_cannot_be_trained_on_is_said(folders, objects, text):
+    given = {name: folders[0] if value == 0 else value for name, value in objects.items()}
+    with pytest.raises(CongraspError, match=text):
+        training_set(HAND, _run(**given), 0)
+
+
+def test_sets_of_another_hand_are_refused(folders):
+    config = dataclasses.replace(_run(folder=folders[0], constraints=folders[1]), task=TaskConfig(hand="allegro"))
+    with pytest.raises(CongraspError, match="for the hand 'human'"):
+        training_set(get_hand("allegro"), config, 0)
+
+
+def test_objects_of_different_sizes_stack_and_come_apart_again(folders):
+    bank = training_set(HAND, _run(folder=folders[0]), 0).bank
+    rows = rows_of(bank)
+    for a, b in zip(stacked(rows), bank, strict=True):
+        np.testing.assert_array_equal(a, b)
+    first = rows[0]._replace(
+        pose_valid=rows[0].pose_valid[:, :, :3],
+        **{name: getattr(rows[0], name)[:, :3] for name in bank._fields if name.startswith(("pose_q", "pose_p"))},
+        pose_quaternion=rows[0].pose_quaternion[:, :3],
+        trajectory_position=rows[0].trajectory_position[:, :3],
+        trajectory_quaternion=rows[0].trajectory_quaternion[:, :3],
+    )
+    both = stacked([first, rows[1]])
+    np.testing.assert_array_equal(both.pose_q[0], first.pose_q[:, np.arange(20) % 3])
+    np.testing.assert_array_equal(both.pose_q[1], rows[1].pose_q)
+
+
+def test_objects_are_drawn_as_often_as_their_weights_say(folders):
+    bank = training_set(HAND, _run(folder=folders[0]), 0).bank._replace(weight=np.array([1.0, 3.0], np.float32))
+    drawn = initial.sample(HAND, TaskConfig(), bank, jax.random.key(0), 4000)
+    assert 0.72 < np.mean(np.asarray(drawn.reset_state.object_index) == 1) < 0.78
