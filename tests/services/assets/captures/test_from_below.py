@@ -10,7 +10,7 @@ from services.cli.constraints import _print_report
 
 
 def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
-    """By hand: one resting pose, the object's centre 10 cm high; wrists 5 cm and -9 cm from it, one of three allowed."""
+    """By hand: an object whose centre is 10 cm high; wrists 5 cm over it and 9 cm under, of which one is allowed."""
     path = np.zeros((2, 3, 15, 3), np.float32)
     path[..., 2] = np.array([0.05, 0.05, -0.09])[:, None]
     arrays = {
