@@ -118,10 +118,14 @@ def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> A
     heading = rotations.rotate(
         quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), (*quaternion.shape[:-1], 3))
     )
+    rising = jnp.einsum("mri,mi->mr", rotations.to_matrix(rest[..., 3:])[..., 2, :], heading)
+    return above_table(path, rest) & (rising < _STEEPEST_UP)
+
+
+def above_table(path: Array, rest: Array) -> Array:
+    """(M, R) bool: all waypoints (M, K, 3) of a wrist stay over the table in the resting poses (M, R, 7) of objects."""
     up = rotations.to_matrix(rest[..., 3:])[..., 2, :]
-    lowest = jnp.min(jnp.einsum("mri,mki->mrk", up, path), -1) + rest[..., 2]
-    rising = jnp.einsum("mri,mi->mr", up, heading)
-    return (lowest > _CLEARANCE) & (rising < _STEEPEST_UP)
+    return jnp.min(jnp.einsum("mri,mki->mrk", up, path), -1) + rest[..., 2] > _CLEARANCE
 
 
 @functools.partial(jax.jit, static_argnums=0)

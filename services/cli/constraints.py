@@ -220,6 +220,10 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
         above = sum(row["clear_of_table"] for row in kept)
         sets = len({row["object"] for row in kept})
         print(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")
+        for below, why in ((True, "from below, which no episode does"), (False, "too near to the table")):
+            left = [row["sequence"] for row in kept if not row["clear_of_table"] and row["from_below"] == below]
+            if left:
+                print(f"No episode is drawn from {len(left)}, whose hand comes {why}: {', '.join(left)}.")
         print(f"Constraint sets ({sets}) are in {out}, their objects in {objects}.")
     print(f"{out / REPORT} holds the outcome of each sequence.")
 

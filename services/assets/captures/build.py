@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from actors.bank import HEADINGS, clear_of_table, headings_of
+from actors.bank import HEADINGS, above_table, clear_of_table, headings_of
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands.human import HUMAN
@@ -122,7 +122,7 @@ def import_sets(
             continue
         objects.append(obj)
         sets.append(made)
-        usable = made.arrays["pose/allowed"].any((0, 1))
+        usable, below = made.arrays["pose/allowed"].any((0, 1)), _from_below(made)
         for m, demonstration in enumerate(group.demonstrations):
             report.kept.append(
                 {
@@ -134,6 +134,7 @@ def import_sets(
                     "residual_tip_m": round(demonstration.fit.tip, 5),
                     "touched_points": len(demonstration.contact),
                     "clear_of_table": bool(usable[m]),
+                    "from_below": bool(below[m]),
                 }
             )
     return objects, sets, report
@@ -239,6 +240,13 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
         "object_digest": store.digest(obj),
     }
     return obj, set_of(hand, row, fitting, options.seed, about)
+
+
+def _from_below(made: Message) -> np.ndarray:
+    """(M,) bool: demonstrations that no resting pose allows only because the hand comes from below."""
+    path, rest = (made.arrays[name] for name in ("trajectory/position", "rest"))
+    clear = np.asarray(above_table(path[0], np.stack([rest] * path.shape[1]))).any(-1)
+    return clear & ~made.arrays["pose/allowed"].any((0, 1))
 
 
 def _twice(values: np.ndarray) -> np.ndarray:

@@ -1,0 +1,38 @@
+"""Captured sequences of which no episode is drawn: they are told by name, and why."""
+
+import pathlib
+
+import numpy as np
+
+from common.wire.codec import Message
+from services.assets.captures.build import Report, _from_below
+from services.cli.constraints import _print_report
+
+
+def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
+    """By hand: an object whose centre is 10 cm high; wrists 5 cm over it and 9 cm under, of which one is allowed."""
+    path = np.zeros((2, 3, 15, 3), np.float32)
+    path[..., 2] = np.array([0.05, 0.05, -0.09])[:, None]
+    arrays = {
+        "trajectory/position": path,
+        "rest": np.array([[0, 0, 0.1, 1, 0, 0, 0]], np.float32),
+        "pose/allowed": np.broadcast_to(np.array([True, False, False]), (2, 1, 3)),
+    }
+    np.testing.assert_array_equal(_from_below(Message(arrays, {})), [False, True, False])
+
+
+def test_the_report_names_them(capsys):
+    def row(name: str, *, clear: bool, below: bool) -> dict:
+        return {"sequence": name, "object": "box", "residual_rad": 0.0, "clear_of_table": clear, "from_below": below}
+
+    kept = [
+        row("lift", clear=True, below=False),
+        row("scoop", clear=False, below=True),
+        row("push", clear=False, below=False),
+        row("dig", clear=False, below=True),
+    ]
+    _print_report(Report(kept), "human", pathlib.Path("sets"), pathlib.Path("objects"))
+    said = capsys.readouterr().out
+    assert "room for 1 of 4" in said
+    assert "No episode is drawn from 2, whose hand comes from below, which no episode does: scoop, dig." in said
+    assert "No episode is drawn from 1, whose hand comes too near to the table: push." in said
