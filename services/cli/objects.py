@@ -60,7 +60,7 @@ def import_meshes(
       options: How meshes become objects.
     """
     from common.objects.store import Catalogue
-    from services.assets.objects.meshes import import_source
+    from services.assets.objects.meshes import import_sources
     from services.assets.objects.sources import find_sources
     from services.cli.console import bars, report_error
 
@@ -76,17 +76,15 @@ def import_meshes(
     catalogue = Catalogue(out)
     with bars() as progress:
         task = progress.add_task("Importing", total=len(sources))
-        for source in sources:
-            progress.update(task, description=f"Importing {source.name}")
-            try:
-                obj = import_source(source, options)
+        for _, obj in import_sources(sources, options):
+            if isinstance(obj, CongraspError):
+                report_error(obj)
+                failures += 1
+            else:
                 catalogue.add(obj)
                 done += 1
                 for note in obj.notes:
-                    print(f"{source.name}: {note}.")
-            except CongraspError as error:
-                report_error(error)
-                failures += 1
+                    print(f"{obj.name}: {note}.")
             progress.advance(task)
     if done:
         print(f"{done} of {done + failures} imported; they are in {out}.")
