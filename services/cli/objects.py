@@ -153,6 +153,7 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
         "mass": f"{1000 * obj.mass:.1f} g",
         "principal inertia": " ".join(f"{1e6 * v:.1f}" for v in np.linalg.eigvalsh(obj.inertia)) + " kg.mm²",
         "pieces": ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds)),
+        "pieces against the mesh": _errors(obj),
         "graspable region": f"{graspable} ({share:.0%} of the surface)",
         "avoid region": avoided or "nothing",
         "digest": digest(obj),
@@ -246,6 +247,14 @@ def _size(obj: "GraspObject") -> str:
     """The sides of its box in cm."""
     sides = 100 * (obj.visual_vertices.max(0) - obj.visual_vertices.min(0))
     return " x ".join(f"{side:.1f}" for side in sides)
+
+
+def _errors(obj: "GraspObject") -> str:
+    """How faithful its pieces are, where it was imported."""
+    if obj.surface_error is None:
+        return "the object is its pieces"
+    volume = "" if obj.volume_error is None else f", volume {obj.volume_error:+.1%}"
+    return f"surface {1000 * obj.surface_error:.1f} mm off at most{volume}"
 
 
 def _parts(obj: "GraspObject") -> tuple[str, str]:
