@@ -65,8 +65,9 @@ def import_sources(
     wait for it; they keep no program from ending.
 
     Raises:
-      CongraspError: nothing comes for much longer than the deadlines of the decompositions.
+      CongraspError: an option cannot be, or nothing comes for much longer than the deadlines of the decompositions.
     """
+    check_options(options)
     todo = collections.deque(range(len(sources)))
     done: queue.SimpleQueue[tuple[int, GraspObject | Exception]] = queue.SimpleQueue()
 

@@ -14,15 +14,25 @@ def block(sides, center):
     return mesh
 
 
-def joined(blocks, max_pieces):
-    triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in blocks])
+def prism(outline, depth):
+    """Triangles of a prism over an outline (N, 2) that its first corner sees all of."""
+    low, high = (np.column_stack([outline, np.full(len(outline), z)]) for z in (-depth / 2, depth / 2))
+    caps = [[side[0], side[i], side[i + 1]] for side in (low, high) for i in range(1, len(side) - 1)]
+    walls = [[low[i - 1], low[i], high[i]] for i in range(len(low))]
+    return np.array(caps + walls + [[low[i - 1], high[i], high[i - 1]] for i in range(len(low))])
+
+
+def joined(blocks, max_pieces, triangles=None):
+    if triangles is None:
+        triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in blocks])
     volume = sum(mesh.volume for mesh in blocks)
     return pieces.merge([np.asarray(mesh.vertices) for mesh in blocks], max_pieces, triangles, volume)
 
 
 def test_pieces_that_form_a_convex_one_are_joined_without_need():
     blocks = [block((0.01, 0.01, 0.01), (x, 0, 0)) for x in (0, 0.01, 0.1, 0.11)]
-    merged = joined(blocks, 8)
+    whole = [np.asarray(block((0.02, 0.01, 0.01), (x, 0, 0)).triangles) for x in (0.005, 0.105)]
+    merged = joined(blocks, 8, np.concatenate(whole))
     np.testing.assert_allclose([shapes.hull_of(piece).volume for piece in merged], [2e-6, 2e-6], rtol=1e-6)
 
 
@@ -35,16 +45,16 @@ def test_a_corner_is_kept_while_there_is_room_and_filled_when_there_is_none():
 
 
 def test_a_thin_step_is_joined_for_its_small_depth_but_not_for_a_large_volume():
-    # A step of 1 mm on the half of a slab: buried by 1 mm at most; its volume is 5 % of a slab of 1 cm, 2.3 % of one
-    # of 2 cm, and its hull adds half of that.
-    def slab(height):
-        return [
-            block((0.04, 0.04, height), (0, 0, 0)),
-            block((0.04, 0.04, height + 0.001), (0.04, 0, 0.0005)),
-        ]
+    # The upper side of the lower half is buried by 0.5 mm at most, under a wedge of 2 x 2 cm x 0.25 mm: 5.6 % of a slab
+    # of 2 mm, 1.2 % of one of 1 cm.
+    def pieces_of_step(height):
+        low, high = block((0.02, height, 0.02), (0.01, height / 2, 0)), height + 0.0005
+        blocks = [low, block((0.02, high, 0.02), (0.03, high / 2, 0))]
+        outline = [[0, 0], [0.04, 0], [0.04, high], [0.02, high], [0.02, height], [0, height]]
+        return len(joined(blocks, 4, prism(np.array(outline), 0.02)))
 
-    assert len(joined(slab(0.01), 4)) == 2
-    assert len(joined(slab(0.02), 4)) == 1
+    assert pieces_of_step(0.002) == 2
+    assert pieces_of_step(0.01) == 1
 
 
 def test_bodies_apart_are_never_joined():
