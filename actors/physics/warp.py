@@ -20,7 +20,7 @@ from actors.physics.scene import SENSOR_WIDTH, addresses
 from actors.physics.warp_buffers import WarpBuffers, control_step, meshes_on, objects_on, register
 from common.config import TaskConfig
 from common.hands.spec import Hand
-from common.objects.spec import MAX_MESH_PIECES, GraspObject
+from common.objects.spec import GraspObject
 from common.task.types import CONTACTS_PER_LINK, Array
 
 
@@ -37,6 +37,9 @@ class WarpState(NamedTuple):
     """What the environments started from; `object_index` is a row of the engine's catalogue."""
 
 
+_LEAST_SLOTS = 8  # mesh pieces: room for other objects than those of the first pool
+
+
 class WarpPhysics:
     """A batch of environments in MuJoCo Warp.
 
@@ -49,19 +52,22 @@ class WarpPhysics:
     name = "warp"
     compiled = True
 
-    def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], mesh_slots: int = MAX_MESH_PIECES):
+    def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], mesh_slots: int | None = None):
         """Puts the objects on the device.
 
         Args:
           hand: the hand.
           task: timing and collision settings.
           objects: the pool that `ResetState.object_index` points into.
-          mesh_slots: most mesh pieces of an object; 0 for primitives alone.
+          mesh_slots: most mesh pieces of an object, 0 for primitives alone; by default those of this pool, or 8.
 
         Raises:
           CongraspError: an object has more pieces than slots.
         """
         self._task = task
+        if mesh_slots is None:
+            most = max(sum(piece.kind == "mesh" for piece in obj.pieces) for obj in objects)
+            mesh_slots = max(most, _LEAST_SLOTS)
         self._catalogue = Catalogue(hand, task, objects[0], mesh_slots)
         model = self._catalogue.model
         # Measured: more iterations of either kind hold no more grasps there. Dense Jacobians cost elliptic cones

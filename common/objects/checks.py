@@ -51,6 +51,9 @@ def _facts(obj: GraspObject) -> Iterator[str]:
         yield f"its file_scale is {obj.file_scale!r:.20}"
     if len(obj.origin) != 3 or not all(_is_number(x) and abs(x) < 1e9 for x in obj.origin):
         yield "its origin is not three finite numbers"
+    for name in ("surface_error", "volume_error"):
+        if getattr(obj, name) is not None and not _is_number(getattr(obj, name)):
+            yield f"its {name} is {getattr(obj, name)!r:.20}, which is no number"
 
 
 def _is_number(value: object) -> bool:

@@ -12,9 +12,9 @@ PieceKind = Literal["box", "cylinder", "capsule", "ellipsoid", "mesh"]
 SURFACE_POINTS = 512
 PRIMITIVE_SLOTS = {"box": 3, "cylinder": 2, "capsule": 3, "ellipsoid": 2}
 """Most pieces of each kind in a primitive object: the geoms that a batched environment keeps for its object."""
-MAX_MESH_PIECES = 8
+MAX_MESH_PIECES = 48
 """Most convex pieces of an object with mesh pieces."""
-MAX_MESH_VERTICES = 32
+MAX_MESH_VERTICES = 64
 """Most vertices of a mesh piece."""
 
 
@@ -64,6 +64,10 @@ class GraspObject:
     """Metres per unit of that file."""
     notes: tuple[str, ...] = ()
     """What its import mended, or what else the user should know."""
+    surface_error: float | None = None
+    """Hausdorff distance of the pieces' surface from the mesh's that was imported, m."""
+    volume_error: float | None = None
+    """(Volume of the pieces' union - the mesh's) / the mesh's; None where the mesh was open, too."""
 
     @property
     def non_graspable_points(self) -> np.ndarray:
@@ -99,4 +103,5 @@ class GraspObject:
             visual_vertices=factor * self.visual_vertices,
             origin=longer(self.origin),
             file_scale=factor * self.file_scale,
+            surface_error=None if self.surface_error is None else factor * self.surface_error,
         )

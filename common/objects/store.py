@@ -19,6 +19,7 @@ MAX_BYTES = 64 << 20
 """Bytes that an object file may have."""
 _FORMAT = 1
 _KINDS = ("box", "cylinder", "capsule", "ellipsoid", "mesh")
+_ERRORS = ("surface_error", "volume_error")
 _ARRAYS = ("graspable", "inertia", "points", "normals", "labels", "rest_poses", "visual_vertices", "visual_faces")
 
 
@@ -126,6 +127,9 @@ def _to_message(obj: GraspObject) -> Message:
         meta["origin"] = list(obj.origin)
     if obj.file_scale != 1.0:
         meta["file_scale"] = obj.file_scale
+    for name in _ERRORS:
+        if getattr(obj, name) is not None:
+            meta[name] = getattr(obj, name)
     if obj.notes:
         meta["notes"] = list(obj.notes)
     return Message(arrays, meta)
@@ -156,5 +160,7 @@ def _from_message(message: Message) -> GraspObject:
         origin=tuple(meta.get("origin", (0.0, 0.0, 0.0))),
         file_scale=meta.get("file_scale", 1.0),
         notes=tuple(meta.get("notes", ())),
+        surface_error=meta.get("surface_error"),
+        volume_error=meta.get("volume_error"),
         **{name: arrays[name] for name in _ARRAYS},
     )

@@ -22,6 +22,29 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
     return 0
 
 
+def pieces(
+    objects: pathlib.Path,
+    hand: str = "human",
+    counts: tuple[int, ...] = (8, 16, 32, 48),
+    vertices: tuple[int, ...] = (32, 64),
+    repeats: int = 5,
+) -> int:
+    """What convex pieces and their vertices cost a physics step (MuJoCo C), and what they gain in shape.
+
+    Args:
+      objects: Folder of objects or meshes; their pieces are joined to fewer for each budget.
+      hand: The hand that closes around them.
+      counts: Most pieces of an object; rates are compared with the first.
+      vertices: Most vertices of a piece.
+      repeats: Measurements of each; medians are printed.
+    """
+    from services.assets.objects.named import objects_of
+    from services.bench.pieces import bench_pieces
+
+    bench_pieces(objects_of(objects), hand, counts, vertices, repeats)
+    return 0
+
+
 def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
     """Latency of a policy server in a process of its own that serves an untrained policy, over the loopback interface.
 
@@ -165,6 +188,7 @@ def scaling(
 
 COMMANDS = {
     "physics": physics,
+    "pieces": pieces,
     "query": query,
     "shutdown": shutdown,
     "security": security,

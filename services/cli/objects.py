@@ -59,7 +59,7 @@ def import_meshes(
       options: How meshes become objects.
     """
     from common.objects.store import Catalogue
-    from services.assets.objects.meshes import import_source
+    from services.assets.objects.meshes import import_sources
     from services.assets.objects.sources import find_sources
     from services.cli.console import bars, report_error
 
@@ -75,17 +75,15 @@ def import_meshes(
     catalogue = Catalogue(out)
     with bars() as progress:
         task = progress.add_task("Importing", total=len(sources))
-        for source in sources:
-            progress.update(task, description=f"Importing {source.name}")
-            try:
-                obj = import_source(source, options)
+        for _, obj in import_sources(sources, options):
+            if isinstance(obj, CongraspError):
+                report_error(obj)
+                failures += 1
+            else:
                 catalogue.add(obj)
                 done += 1
                 for note in obj.notes:
-                    print(f"{source.name}: {note}.")
-            except CongraspError as error:
-                report_error(error)
-                failures += 1
+                    print(f"{obj.name}: {note}.")
             progress.advance(task)
     if done:
         print(f"{done} of {done + failures} imported; they are in {out}.")
@@ -154,6 +152,7 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
         "mass": f"{1000 * obj.mass:.1f} g",
         "principal inertia": " ".join(f"{1e6 * v:.1f}" for v in np.linalg.eigvalsh(obj.inertia)) + " kg.mm²",
         "pieces": ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds)),
+        "pieces against the mesh": _errors(obj),
         "graspable region": f"{graspable} ({share:.0%} of the surface)",
         "avoid region": avoided or "nothing",
         "digest": digest(obj),
@@ -247,6 +246,14 @@ def _size(obj: "GraspObject") -> str:
     """The sides of its box in cm."""
     sides = 100 * (obj.visual_vertices.max(0) - obj.visual_vertices.min(0))
     return " x ".join(f"{side:.1f}" for side in sides)
+
+
+def _errors(obj: "GraspObject") -> str:
+    """How faithful its pieces are, where it was imported."""
+    if obj.surface_error is None:
+        return "the object is its pieces"
+    volume = "" if obj.volume_error is None else f", volume {obj.volume_error:+.1%}"
+    return f"surface {1000 * obj.surface_error:.1f} mm off at most{volume}"
 
 
 def _parts(obj: "GraspObject") -> tuple[str, str]:

@@ -1,10 +1,14 @@
 """Import of meshes: from files to a `GraspObject`."""
 
+import collections
+import contextlib
 import dataclasses
 import hashlib
 import os
 import pathlib
-from collections.abc import Iterable, Sequence
+import queue
+import threading
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import trimesh
@@ -17,13 +21,17 @@ from common.objects.resting import rest_poses
 from common.objects.spec import GraspObject, Piece
 from common.objects.surface import halves, mass_properties, sample_mesh
 from services.assets.objects import decompose, repair
+from services.assets.objects.fidelity import Fidelity, fidelity
 from services.assets.objects.options import ImportOptions, check_options
+from services.assets.objects.pieces import SQUEEZE, merge, simplify, squeeze
 from services.assets.objects.sizes import metres_per_unit
 from services.assets.objects.sources import MeshFile, Source, read_mesh
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""
-_CACHE_VERSION = 3
+_CACHE_VERSION = 4
+_PATIENCE = 600.0  # s beyond the limits of an object's decompositions
+_TOO_LARGE = 0.01  # share of the volume; pieces of thin walls fill the inside of their bends
 
 
 def import_source(source: Source, options: ImportOptions) -> GraspObject:
@@ -46,6 +54,47 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
     obj = _build(source, options, int(key, 16))
     store.save(obj, cached)
     return obj
+
+
+def import_sources(
+    sources: Sequence[Source], options: ImportOptions
+) -> Iterator[tuple[int, GraspObject | CongraspError]]:
+    """Imports objects side by side, one for each core: the index of each as it is done, and the object or its fault.
+
+    Each decomposition is a process of its own, with a deadline and a limit of memory, while the threads of this one
+    wait for it; they keep no program from ending.
+
+    Raises:
+      CongraspError: an option cannot be, or nothing comes for much longer than the deadlines of the decompositions.
+    """
+    check_options(options)
+    todo = collections.deque(range(len(sources)))
+    done: queue.SimpleQueue[tuple[int, GraspObject | Exception]] = queue.SimpleQueue()
+
+    def work() -> None:
+        """Imports until there is nothing left to do."""
+        with contextlib.suppress(IndexError):
+            while True:
+                i = todo.popleft()
+                try:
+                    done.put((i, import_source(sources[i], options)))
+                except Exception as error:  # raised in the caller's thread
+                    done.put((i, error))
+
+    for _ in range(min(len(sources), len(os.sched_getaffinity(0)))):
+        threading.Thread(target=work, daemon=True).start()
+    meshes = max((len(source.visuals) for source in sources), default=0)
+    patience = meshes * (options.time_limit + decompose.FALLBACK_LIMIT) + _PATIENCE
+    try:
+        for _ in sources:
+            i, result = done.get(timeout=patience)
+            if isinstance(result, Exception) and not isinstance(result, CongraspError):
+                raise result
+            yield i, result
+    except queue.Empty:
+        raise CongraspError(f"No import has ended for {patience:.0f} s.", "Import fewer objects at once.") from None
+    finally:
+        todo.clear()
 
 
 def _cache_folder(options: ImportOptions) -> pathlib.Path:
@@ -85,6 +134,8 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
             "(--mass sets the mass)"
         )
     hulls, owners = _pieces(source, meshes, factor, closed, options, notes)
+    hulls, errors = _fitted(np.asarray(whole.triangles), hulls, closed)
+    notes.append(f"{len(hulls)} convex piece{'s stand' if len(hulls) > 1 else ' stands'} for it: {errors}")
     solids = hulls if source.pieces else [np.asarray(whole.vertices)]
     mass, center, inertia = _weigh(whole if closed else None, solids, options)
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
@@ -121,6 +172,8 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         origin=tuple((-center).tolist()),
         file_scale=factor,
         notes=tuple(notes),
+        surface_error=errors.surface,
+        volume_error=errors.volume,
     )
     return dataclasses.replace(obj, rest_poses=rest_poses(obj))
 
@@ -154,13 +207,12 @@ def _pieces(
     options: ImportOptions,
     notes: list[str],
 ) -> tuple[list[np.ndarray], list[int]]:
-    """Vertices of at most `max_pieces` simple convex pieces, and the part of each (0 where the parts are labels)."""
-    hulls: list[np.ndarray] = []
-    owners: list[int] = []
-    missing = 0.0
+    """Vertices of the convex pieces, and the part of each (0 where the parts are labels)."""
     try:
         if source.pieces:
-            groups, limits = [[_corners(file) * factor for file in source.pieces]], [options.max_pieces]
+            surface, given = _joined(meshes), [_corners(file) * factor for file in source.pieces]
+            volume = float(surface.volume) if closed else sum(shapes.hull_of(piece).volume for piece in given)
+            groups = [merge(given, options.max_pieces, np.asarray(surface.triangles), volume)]
         else:
             volumes = np.array([shapes.hull_of(mesh.vertices).volume for mesh in meshes])
             limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
@@ -170,35 +222,29 @@ def _pieces(
                 found = decompose.decompose(
                     np.asarray(small.vertices),
                     np.asarray(small.faces),
-                    fill=float(mesh.volume) if closed else None,
+                    volume=float(mesh.volume) if closed and small.is_volume else None,
                     time_limit=options.time_limit,
                     max_pieces=limit,
                 )
                 groups.append(found.pieces)
                 notes.extend(found.notes)
-        for owner, (group, limit) in enumerate(zip(groups, limits, strict=True)):
-            merged = decompose.merge(group, limit)
-            before, after = (sum(shapes.hull_of(piece).volume for piece in pieces) for pieces in (group, merged))
-            if after > 1.1 * before:
-                notes.append(
-                    f"{len(group)} convex pieces were merged into {len(merged)}, whose volume is "
-                    f"{after / before - 1:.0%} larger: some hollows are filled (--max-pieces)"
-                )
-            for piece in merged:
-                vertices, lost = decompose.simplify(piece)
-                hulls.append(vertices)
-                owners.append(owner if source.parts_are_pieces else 0)
-                missing = max(missing, lost)
+        hulls = [simplify(piece) for group in groups for piece in group]
     except QhullError:
         raise CongraspError(
             f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
         ) from None
-    if missing > 0.1:
-        notes.append(
-            "its round parts are a little angular in the simulation: pieces have 32 vertices "
-            f"(up to {missing:.0%} of a piece's volume is made up by its scale)"
-        )
+    owners = [owner if source.parts_are_pieces else 0 for owner, group in enumerate(groups) for _ in group]
     return hulls, owners
+
+
+def _fitted(triangles: np.ndarray, hulls: list[np.ndarray], closed: bool) -> tuple[list[np.ndarray], Fidelity]:
+    """The pieces (V, 3), thinner where their union is larger than the mesh (F, 3, 3), and how faithful they are."""
+    errors = fidelity(triangles, hulls, closed)
+    if errors.volume is None or errors.volume < _TOO_LARGE:
+        return hulls, errors
+    thinner = [squeeze(hull, 1 / (1 + errors.volume)) for hull in hulls]
+    better = fidelity(triangles, thinner, closed)
+    return (thinner, better) if better.surface <= errors.surface + SQUEEZE else (hulls, errors)
 
 
 def _weigh(

@@ -9,7 +9,7 @@ from common.errors import CongraspError
 from common.objects import store
 from common.objects.procedural import generate
 from common.objects.spec import GraspObject
-from services.assets.objects.meshes import import_source
+from services.assets.objects.meshes import import_source, import_sources
 from services.assets.objects.options import ImportOptions
 from services.assets.objects.sources import SUFFIXES, Source, find_sources
 
@@ -63,15 +63,19 @@ def objects_of(
       CongraspError: there is nothing of the kind, or it cannot be read or imported.
     """
     found = objects_at(path)
-    advance = track("Importing objects", len(found)) if track and found[0].source else lambda done: None
-    objects = []
-    for one in found:
-        obj = one.load(options)
-        for note in obj.notes if one.source else ():
-            _log.warning("%s: %s", one.name, note)
-        objects.append(obj)
+    sources = [one.source for one in found if one.source]
+    if not sources:
+        return [one.load(options) for one in found]
+    advance = track("Importing objects", len(found)) if track else lambda done: None
+    objects: dict[int, GraspObject] = {}
+    for i, obj in import_sources(sources, options):
+        if isinstance(obj, CongraspError):
+            raise obj
+        for note in obj.notes:
+            _log.warning("%s: %s", obj.name, note)
+        objects[i] = obj
         advance(len(objects))
-    return objects
+    return [objects[i] for i in range(len(objects))]
 
 
 def one_object(path: pathlib.Path, options: ImportOptions = _METRES_OR_ASK) -> GraspObject:

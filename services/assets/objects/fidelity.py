@@ -1,0 +1,156 @@
+"""How faithful convex pieces are to the mesh that they stand for: volume of their union, distance of the surfaces.
+
+Both bodies are cut by parallel rays along each axis, the same for both. A ray is inside where the winding number of
+the triangles around it is above zero: bodies may overlap, walls inside of others do not count, and neither does a gap
+along a ray that is narrower than `_SEAM`. What the rays are inside of is the volume; where they enter and leave, the
+outer surface. The inside of a cup is outside. Of that surface counts what a ball of radius `REACH` can touch: no finger
+gets into a crack.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from common.objects import shapes
+
+POINTS = 50_000
+"""Most points of a surface whose distances from the other are taken, to the nearest of all points of that one."""
+REACH = 2e-3
+"""Radius of the ball, m."""
+_RAYS = 256  # along the longest side of the box around both bodies
+_SEAM = 4e-4  # m
+_FACING = 0.5  # cosine; walls that face one another within `_SEAM` are a crack, too
+_TOUCHES = 0.8  # of the ball's radius: samples are not where the ball is nearest
+_OFF_GRID = np.array([0.1236068, 0.4142136, 0.7320508])  # of the rays' spacing: corners at round numbers miss the rays
+
+
+class Fidelity(NamedTuple):
+    """Errors of an object's convex pieces against its mesh."""
+
+    volume: float | None
+    """(Volume of the pieces' union - the mesh's) / the mesh's; None for an open mesh, which encloses no volume."""
+    surface: float
+    """Hausdorff distance of the two outer surfaces, m: the larger of both directions, by sampled points."""
+
+    def __str__(self) -> str:
+        """Both errors as a phrase."""
+        surface = f"their surface is at most {1000 * self.surface:.1f} mm off the mesh's"
+        if self.volume is None:
+            return f"{surface}; their volume has nothing to compare with, because the mesh is open"
+        return f"{surface}, and their volume {abs(self.volume):.1%} too {'large' if self.volume > 0 else 'small'}"
+
+
+def fidelity(mesh: np.ndarray, pieces: list[np.ndarray], closed: bool) -> Fidelity:
+    """Compares the union of convex pieces with a mesh.
+
+    Args:
+      mesh: (F, 3, 3) corners of its triangles, m; they wind outwards where it is closed.
+      pieces: (V, 3) vertices of each piece, in the same frame.
+      closed: whether the mesh encloses a volume; otherwise all of it counts as surface.
+    """
+    union = np.concatenate([np.asarray(shapes.triangulate(piece).triangles) for piece in pieces])
+    corners = np.concatenate([mesh, union]).reshape(-1, 3)
+    low, spacing = corners.min(0), float(np.ptp(corners, axis=0).max()) / _RAYS
+    volume, surface = _cut(union, low, spacing)
+    if closed:
+        wanted, wanted_surface = _cut(mesh, low, spacing)
+    else:
+        points, normals, _ = shapes.on_triangles(mesh, _random().random((2 * POINTS, 3)))
+        wanted, wanted_surface = 0.0, _Surface(points, normals, np.ones(len(points), bool))
+    distance = max(_farthest(surface, wanted_surface), _farthest(wanted_surface, surface))
+    return Fidelity(volume / wanted - 1 if closed else None, distance)
+
+
+class _Surface(NamedTuple):
+    """Points of a surface (N, 3), m, outward unit normals (N, 3) there, and which (N,) do not lie in closed seams."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    outer: np.ndarray
+
+
+def _random() -> np.random.Generator:
+    """The same numbers for every object."""
+    return np.random.default_rng(0)
+
+
+def _farthest(surface: _Surface, other: _Surface) -> float:
+    """The largest distance of a point of a surface that the ball can touch from the other surface, m."""
+    some = _random().permutation(np.flatnonzero(surface.outer))[:POINTS]
+    points, normals = surface.points[some], surface.normals[some]
+    tree = cKDTree(surface.points)
+    distance, near = tree.query(points, k=8)
+    in_crack = (distance < _SEAM) & (np.einsum("nkj,nj->nk", surface.normals[near], normals) < -_FACING)
+    touched = ~in_crack.any(-1) & (tree.query(points + REACH * normals)[0] > _TOUCHES * REACH)
+    return float(cKDTree(other.points[other.outer]).query(points[touched])[0].max(initial=0.0))
+
+
+def _cut(triangles: np.ndarray, low: np.ndarray, spacing: float) -> tuple[float, _Surface]:
+    """Volume (m^3; the mean of three axes) and outer surface of what triangles (F, 3, 3) enclose."""
+    volumes, surfaces = [], []
+    for axis in range(3):
+        order = [(axis + 1) % 3, (axis + 2) % 3, axis]  # the rays run along the last of these
+        shift = np.array([*_OFF_GRID[order[:2]], 0.0])
+        rays, place, owner, normal = _crossings((triangles[..., order] - low[order]) / spacing + shift)
+        entries, exits, closed = _intervals(rays, place, -np.sign(normal[owner, 2]), _SEAM / spacing)
+        volumes.append((place[exits] - place[entries]).sum() * spacing**3)
+        ends = np.concatenate([entries, exits, closed])
+        points, normals = np.empty((2, len(ends), 3))
+        points[:, order] = (np.column_stack([rays, place])[ends] - shift) * spacing + low[order]
+        normals[:, order] = normal[owner[ends]]
+        surfaces.append(_Surface(points, normals, np.arange(len(ends)) < 2 * len(entries)))
+    return float(np.mean(volumes)), _Surface(*map(np.concatenate, zip(*surfaces, strict=True)))
+
+
+def _crossings(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where rays through the integers of the first two axes, along the third, go through triangles (F, 3, 3).
+
+    Returns:
+      (N, 2) the rays, (N,) places on them, (N,) the triangles, and (F, 3) unit normals of all triangles.
+    """
+    corners, normals = triangles[:, 0], np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+    owner, row = _integers(triangles[:, :, 0].min(1), triangles[:, :, 0].max(1))
+    start, end = triangles[owner], np.roll(triangles, -1, axis=1)[owner]
+    crossed = (start[:, :, 0] <= row[:, None]) != (end[:, :, 0] <= row[:, None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (row[:, None] - start[:, :, 0]) / (end[:, :, 0] - start[:, :, 0])
+        side = start[:, :, 1] + share * (end[:, :, 1] - start[:, :, 1])
+    span, column = _integers(np.where(crossed, side, np.inf).min(1), np.where(crossed, side, -np.inf).max(1))
+    owner, row = owner[span], row[span]
+    upright = normals[owner, 2]
+    rise = normals[owner, 0] * (row - corners[owner, 0]) + normals[owner, 1] * (column - corners[owner, 1])
+    seen = upright != 0
+    place = corners[owner, 2][seen] - rise[seen] / upright[seen]
+    return np.column_stack([row, column])[seen], place, owner[seen], normals
+
+
+def _integers(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All integers k with low <= k < high for each of (N,) ranges: the range's index, and the integer."""
+    first = np.ceil(low).astype(int)
+    counts = np.maximum(np.ceil(high).astype(int) - first, 0)
+    index = np.repeat(np.arange(len(low)), counts)
+    return index, first[index] + np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _intervals(
+    rays: np.ndarray, place: np.ndarray, change: np.ndarray, seam: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The crossings (N,) where rays enter, those (N,) where they leave, and those (M,) at the ends of closed gaps.
+
+    Args:
+      rays: (K, 2) the ray of each crossing.
+      place: (K,) where on the ray.
+      change: (K,) of the winding number.
+      seam: gaps narrower than this are closed.
+    """
+    order = np.lexsort((place, rays[:, 1], rays[:, 0]))
+    rays, place = rays[order], place[order]
+    inside = np.cumsum(change[order]) > 0.5
+    before = np.r_[False, inside[:-1]]
+    entries, exits = np.flatnonzero(inside & ~before), np.flatnonzero(~inside & before)
+    same = (rays[entries[1:]] == rays[exits[:-1]]).all(-1)
+    wide = ~same | (place[entries[1:]] - place[exits[:-1]] >= seam)
+    closed = np.r_[entries[1:][~wide], exits[:-1][~wide]]
+    return order[entries[np.r_[True, wide]]], order[exits[np.r_[wide, True]]], order[closed]

@@ -1,0 +1,101 @@
+"""What the number of an object's convex pieces and vertices costs a physics step, and what it gains in shape."""
+
+import dataclasses
+import time
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from actors.physics.scene import TABLE_AWAY, addresses, compile_scene
+from common.config import TaskConfig
+from common.hands import get_hand
+from common.hands.spec import Hand
+from common.objects.spec import GraspObject, Piece
+from services.assets.objects.fidelity import fidelity
+from services.assets.objects.pieces import merge, simplify
+
+_CLOSING = 100
+"""Control steps in which the fingers close around the object, which is held where it is."""
+_STEPS = 50
+"""Control steps that are timed."""
+_DEFINITION = (
+    "mj_step on one thread, in processor time, with the hand closed around each object in turn; ratio to the first "
+    "row. Contacts and error are means over the objects; the error is against the object's mesh."
+)
+
+
+def coarser(obj: GraspObject, max_pieces: int, max_vertices: int) -> GraspObject:
+    """The object with its mesh pieces joined to at most `max_pieces` of at most `max_vertices` vertices."""
+    vertices = [np.asarray(piece.vertices) + piece.pos for piece in obj.pieces]
+    triangles = obj.visual_vertices[obj.visual_faces].astype(float)
+    joined = merge(vertices, max_pieces, triangles, obj.mass / 500.0)
+    pieces = tuple(Piece("mesh", (0.0, 0.0, 0.0), vertices=simplify(piece, max_vertices)) for piece in joined)
+    return dataclasses.replace(obj, pieces=pieces)
+
+
+def bench_pieces(
+    objects: Sequence[GraspObject], hand_name: str, pieces: Sequence[int], vertices: Sequence[int], repeats: int
+) -> None:
+    """Physics steps a second for budgets of pieces and vertices, measured in turns.
+
+    Args:
+      objects: of mesh pieces, imported with as many as the largest budget at least.
+      hand_name: the hand that closes around them.
+      pieces: most pieces of an object, the first is what the others are compared with.
+      vertices: most vertices of a piece; each with each number of pieces.
+      repeats: measurements of each; medians count.
+    """
+    hand, task = get_hand(hand_name), TaskConfig(hand=hand_name)
+    budgets = [(p, v) for p in pieces for v in vertices]
+    variants = [[coarser(obj, p, v) for obj in objects] for p, v in budgets]
+    held = [[_closed_around(hand, task, obj) for obj in row] for row in variants]
+    seconds = np.array([[[_timed(*scene, task) for scene in row] for row in held] for _ in range(repeats)])
+    per_step = np.median(seconds, axis=0).sum(-1) / (len(objects) * _STEPS * task.substeps)
+    table = Table(title=f"{len(objects)} objects, {hand_name} hand, {repeats} repeats")
+    for column in ("pieces", "vertices", "pieces used", "contacts", "surface error", "physics steps/s", "ratio"):
+        table.add_column(column, justify="right")
+    for i, (p, v) in enumerate(budgets):
+        used = np.mean([len(obj.pieces) for obj in variants[i]])
+        contacts = np.mean([data.ncon for _, data in held[i]])
+        error = np.mean([_error(obj) for obj in variants[i]])
+        cost = [f"{1 / per_step[i]:,.0f}", f"{per_step[0] / per_step[i]:.2f}"]
+        table.add_row(str(p), str(v), f"{used:.1f}", f"{contacts:.1f}", f"{1000 * error:.1f} mm", *cost)
+    console = Console()
+    console.print(table)
+    console.print(_DEFINITION)
+
+
+def _closed_around(hand: Hand, task: TaskConfig, obj: GraspObject) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """A scene without table in which the fingers have closed around the object, which stays between palm and tips."""
+    model = compile_scene(hand, task, obj)
+    where, data = addresses(model, hand), mujoco.MjData(model)
+    model.body_pos[where.base_body] = 0.0
+    data.qpos[where.finger_qpos] = hand.q_open
+    data.mocap_pos[where.table_mocap] = TABLE_AWAY
+    mujoco.mj_forward(model, data)
+    tips = np.mean([data.body(hand.links[i].name).xpos for i in hand.tip_links], axis=0)
+    middle = (tips + data.body(hand.links[0].name).xpos) / 2
+    data.qpos[where.object_qpos] = [*middle, 1.0, 0.0, 0.0, 0.0]
+    data.mocap_pos[where.anchor_mocap] = middle
+    data.mocap_quat[where.anchor_mocap] = (1.0, 0.0, 0.0, 0.0)
+    data.eq_active[where.weld] = 1
+    data.ctrl[:6], data.ctrl[6:] = 0.0, hand.q_closed
+    mujoco.mj_step(model, data, _CLOSING * task.substeps)
+    return model, data
+
+
+def _timed(model: mujoco.MjModel, data: mujoco.MjData, task: TaskConfig) -> float:
+    """Seconds of this thread's processor time for the steps that are timed."""
+    began = time.thread_time()
+    mujoco.mj_step(model, data, _STEPS * task.substeps)
+    return time.thread_time() - began
+
+
+def _error(obj: GraspObject) -> float:
+    """Distance of the pieces' surface from the mesh's, m."""
+    triangles = obj.visual_vertices[obj.visual_faces].astype(float)
+    closed = obj.volume_error is not None
+    return fidelity(triangles, [np.asarray(piece.vertices) + piece.pos for piece in obj.pieces], closed).surface
