@@ -237,6 +237,9 @@ class RunConfig:
     """Observations travel (and are acted on) as float16."""
     checkpoint_every: int = 25
     """Updates between two checkpoints."""
+    write_ahead: bool = True
+    """Rollouts are on disk before they are acknowledged, until a checkpoint holds their outcome: a resume takes them up
+    whatever was killed. Without, a killed learner takes along what it had accepted since the checkpoint."""
     collapse_patience: int = 60
     """Updates in a row without contact, or with less than half of the best success, that end the run; 0: none do."""
     episode_every: int = 10
@@ -271,7 +274,7 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         if not isinstance(fields, dict):
             raise ValueError("it is no object")
         return dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
-    except (ValueError, RecursionError) as error:  # what is no UTF-8, and what is nested too deep, too
+    except (ValueError, TypeError, RecursionError) as error:  # no UTF-8, null for a number, or nested too deep
         raise CongraspError(
             f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."
         ) from None

@@ -1,9 +1,10 @@
 """The directory of a run.
 
 It holds `config.json`, `initial.safetensors` where training does not begin with random weights, `checkpoints/`,
-`policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `version` (the
-newest version that was ever published, so that versions rise over a crash, too) and, after an update that was not
-finite, `failure/`. What a resume could not read, or does not go on from, is kept beside it as `*.aside`.
+`policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `accepted/`
+(rollouts that no checkpoint holds yet), `version` (the newest version that was ever published, so that versions rise
+over a crash, too) and, after an update that was not finite, `failure/`.
+What a resume could not read, or does not go on from, is kept beside it as `*.aside`.
 """
 
 import dataclasses
@@ -26,7 +27,7 @@ LOGS = "logs"
 CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
 _MAX_VERSION = 1 << 53
-CHANGEABLE = ("updates", "checkpoint_every", "collapse_patience", "physics", "ppo")
+CHANGEABLE = ("updates", "checkpoint_every", "write_ahead", "collapse_patience", "physics", "ppo")
 """Fields of the configuration that a run may go on with other values of; actors that are there do not use them."""
 
 
