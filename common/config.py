@@ -16,6 +16,7 @@ from typing_extensions import Doc
 
 from common.engines import PhysicsName
 from common.errors import CongraspError
+from common.inputs import file_name
 from common.task.constraints import CONSTRAINTS, PAPER
 from common.task.reward import GRASP
 
@@ -270,16 +271,22 @@ def to_json(config: Any) -> str:
 def run_config_from_json(text: str | bytes) -> RunConfig:
     """The inverse of `to_json` for a `RunConfig`; unknown keys and wrong types are errors that name the key."""
     try:
-        fields = json.loads(text)
+        fields = json.loads(text, parse_constant=_no_constant)
         if not isinstance(fields, dict):
             raise ValueError("it is no object")
-        return dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
+        config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
     except (ValueError, TypeError, RecursionError) as error:  # no UTF-8, null for a number, or nested too deep
         raise CongraspError(
             f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."
         ) from None
     except dacite.DaciteError as error:
         raise CongraspError(f"The configuration does not fit this version: {error}.") from None
+    file_name(config.name, "a run")
+    return config
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"it holds {name}")
 
 
 def digest(config: Any) -> str:

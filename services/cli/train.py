@@ -8,6 +8,7 @@ import tyro
 
 import actors.physics  # noqa: F401 - registers the engines that --physics offers
 from common.config import MetricWriter, RunConfig
+from common.inputs import file_name
 from learner.run_directory import CONFIG_FILE, open_run
 from services.train.presets import get_preset, with_hand
 
@@ -60,7 +61,7 @@ def train(
     config = with_hand(config, hand)
     return run_training(
         config,
-        run_dir or pathlib.Path("runs") / f"{config.name}-{time.strftime('%Y%m%d-%H%M%S')}",
+        run_dir or pathlib.Path("runs") / f"{file_name(config.name, 'a run')}-{time.strftime('%Y%m%d-%H%M%S')}",
         actors=actors,
         resume=resume,
         initial=initial,
