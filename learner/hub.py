@@ -96,7 +96,7 @@ class LearnerHub:
         self._rate_limit = RateLimit()
         if durable is not None:
             self._restore(durable)
-        self._recovered = Recovered([], [])
+        self._recovered: Recovered | None = Recovered([], [])
         if log is not None:
             self._recovered = log.recover(staleness.version, run_id, form, schema)
         if audit is not None:
@@ -163,8 +163,9 @@ class LearnerHub:
         with self._changed:
             self._bundle = SharedMessage(bundle.arrays, bundle.meta)
             self._staleness.publish(version)
-            self._take_up(self._recovered)
-            self._recovered = Recovered([], [])
+            if self._recovered is not None:
+                self._take_up(self._recovered)
+                self._recovered = None
         self._transport.publish(self.keys.announcement, Message(meta=self._state()))
 
     def finish(self) -> None:
@@ -315,7 +316,7 @@ class LearnerHub:
             if verdict == "accepted":
                 self._queue.append((header, message))
             (taken if verdict == "accepted" else stale).append(identity)
-        if self._audit is not None and (taken or stale or recovered.damaged):
+        if self._audit is not None:
             self._audit.recovered(taken, stale, recovered.damaged)
         if taken or stale:
             self._event("info", f"Took up {len(taken)} accepted rollouts of before; {len(stale)} are too old.")

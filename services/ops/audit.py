@@ -131,6 +131,8 @@ class _Session:
     """What it accepted was on disk before it was acknowledged; older versions of congrasp kept nothing."""
     falls_back: bool
     """It began from an earlier checkpoint than the newest, which was damaged or gone."""
+    started: bool
+    """It took up what was on disk, from when on it accepts."""
     taken: set[Identity] = dataclasses.field(default_factory=set)
     unwritten: set[Identity] = dataclasses.field(default_factory=set)
     waiting: set[Identity] | None = None
@@ -168,20 +170,22 @@ def _outcomes(books: Iterable[list[dict[str, Any]]]) -> _Outcomes:
 
 
 def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
-    """The sessions of one learner, in their order."""
+    """The sessions of one learner, in their order, without those that were killed before they took anything up."""
     sessions: list[_Session] = []
     saved = -1
     for entry in book:
         if "life" in entry:
             begin = entry["life"], entry["epoch"], entry["version"], entry["max_staleness"]
-            sessions.append(_Session(*begin, entry.get("kept") is True, entry["version"] < saved))
+            kept = entry.get("kept") is True
+            sessions.append(_Session(*begin, kept, entry["version"] < saved, started=not kept))
         saved = entry.get("saved", entry["version"] if "life" in entry else saved)
         if sessions:
+            sessions[-1].started |= "taken" in entry
             sessions[-1].taken.update(_rows(entry, "taken"))
             sessions[-1].unwritten.update(_rows(entry, "unwritten"))
             if "end" in entry:
                 sessions[-1].waiting = _rows(entry, "end")
-    return sessions
+    return [session for session in sessions if session.started]
 
 
 def _rows(entry: dict[str, Any], name: str) -> set[Identity]:

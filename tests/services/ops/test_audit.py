@@ -35,7 +35,7 @@ def learner(run_dir, *lines):
 
 
 def life(name="x", version=0):
-    return {"life": name, "epoch": "e", "version": version, "max_staleness": 1, "kept": True}
+    return {"life": name, "epoch": "e", "version": version, "max_staleness": 1, "kept": True, "taken": []}
 
 
 def used(*sequences, version=None, checksum=None, lag=0, incarnation="1"):
