@@ -5,6 +5,7 @@ audit`, and by a reader that shares no code with it.
 """
 
 import contextlib
+import functools
 import pathlib
 import random
 import shutil
@@ -96,11 +97,16 @@ def _measure(kind: str, run: RunUnderTest, tries: int, rng: random.Random) -> Re
             began = time.monotonic()
             if not run.alive:
                 run.start()
-            until(lambda before=version: run.status().get("version", -1) > before + 1)
+            until(functools.partial(_is_past, run, version + 1))
             seconds.append(time.monotonic() - began)
     finally:
         run.stop()
     return Result(kind, seconds, audit(run.run_dir), read_again(run.run_dir))
+
+
+def _is_past(run: RunUnderTest, version: int) -> bool:
+    """Whether the learner has published a newer version."""
+    return bool(run.status().get("version", -1) > version)
 
 
 def _stop(number: signal.Signals) -> Fault:
