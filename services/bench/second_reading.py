@@ -45,8 +45,9 @@ def read_again(run_dir: pathlib.Path) -> Verdict:
         if path.name.startswith("learner-"):
             books.append(lines)
             continue
+        who = "", ""
         for line in lines:
-            who = line["actor"], line["incarnation"]
+            who = (line["actor"], line["incarnation"]) if "actor" in line else who
             starts.add(who)
             if "made" in line:
                 made[*who, line["made"]] = line["version"], line["checksum"]
