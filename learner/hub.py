@@ -13,7 +13,7 @@ import collections
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from common.errors import CongraspError
@@ -238,6 +238,14 @@ class LearnerHub:
             self._log.end_checkpoint()
         if self._audit is not None:
             self._audit.saved(self._staleness.version)
+
+    def discard(self, batch: Sequence[Message]) -> None:
+        """Drops the rollouts of a batch that nothing can be learnt from, so that no resume takes them up."""
+        identities = [(m.meta["actor"], m.meta["incarnation"], m.meta["sequence"]) for m in batch]
+        if self._audit is not None:
+            self._audit.dropped(identities)
+        if self._log is not None:
+            self._log.discard(identities)
 
     def _restore(self, durable: Mapping[str, Any]) -> None:
         if durable["run_id"] != self.run_id:

@@ -309,6 +309,7 @@ class _Learner:
             with self._ranks.watchdog():
                 self._state, metrics = self._algorithm.update(self._state, batch, self._ranks.mesh)
         except NonFiniteUpdate as error:
+            self._hub.discard(messages)
             self._ranks.close()
             folder, number = self._run_dir / "failure", f"-{self._ranks.rank}" if self._ranks.count > 1 else ""
             with contextlib.suppress(CongraspError):

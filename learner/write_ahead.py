@@ -147,10 +147,13 @@ class WriteAheadLog:
 
     def end_checkpoint(self) -> None:
         """Notes that the checkpoint is there: what it covers is removed."""
+        self._saved = self._next
+        self.discard(self._decided)
+
+    def discard(self, identities: Iterable[Identity]) -> None:
+        """Removes rollouts that no resume is to take up."""
         with self._lock:
-            self._saved = self._next
-            paths = [self._files.pop(identity) for identity in self._decided]
-            self._decided = set()
+            paths = [self._files.pop(identity) for identity in identities if identity in self._files]
         for path in paths:
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)

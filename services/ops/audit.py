@@ -249,7 +249,7 @@ def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
     if identity in found.standing:
         return "used"
     if identity in found.dropped:
-        return "dropped as too old"
+        return "dropped"
     if identity in found.spoilt:
         return "damaged on disk"
     accepted_by = {life for outcome, life in rollout.answers if outcome in ("accepted", "duplicate")}

@@ -501,6 +501,15 @@ def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
     assert on_disk(resumed.hub._log) == []
 
 
+def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, log):
+    b = bench(log=log())
+    b.hub.publish_weights(bundle(0), 0)
+    for i in range(3):
+        b.send(i)
+    b.hub.discard(b.hub.next_batch(2, 1))
+    assert on_disk(b.hub._log) == [2]
+
+
 def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     said = []
     b = bench(log=log())

@@ -207,6 +207,9 @@ def test_values_that_are_not_finite_stop_the_run_and_are_kept(tmp_path, hub):
     actor.join(10.0)
     assert "\n" not in str(caught.value)
     assert {path.name for path in (tmp_path / "failure").iterdir()} == {"state.safetensors", "batch.safetensors"}
+    # What waited is taken up by a resume, the batch itself is not.
+    kept = {int(path.stem.split("~")[3]) for path in (tmp_path / "accepted" / "0").iterdir()}
+    assert not kept & {0, 1}
 
 
 @pytest.mark.timeout(120)
