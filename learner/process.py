@@ -239,7 +239,8 @@ class _Learner:
         if self._ranks.count == 1:
             self._warm_up()
         pace, watch = Pace(), CollapseWatch(self._config.collapse_patience)
-        end, saved, due = None, -1, False
+        # After a resume soon: rollouts of its versions are near to no checkpoint, and die with it until there is one.
+        end, saved, due = None, -1, not self._is_new
         while self._state.version < self._config.updates and end is None:
             began = time.monotonic()
             end = self._wait(stop, deaths)

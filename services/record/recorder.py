@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from common.inputs import file_name
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message
@@ -60,8 +61,9 @@ class Recorder:
           max_seconds: see `LogWriter`.
           warn: takes a line about what goes wrong.
         """
+        begin = file_name(name, "a recording")
         self._writer = (
-            LogWriter(directory, name, run=run, max_bytes=max_bytes, max_seconds=max_seconds) if directory else None
+            LogWriter(directory, begin, run=run, max_bytes=max_bytes, max_seconds=max_seconds) if directory else None
         )
         self._subscription = transport.subscribe(Keys(run).logs, depth=depth)
         self._sinks, self._warn = tuple(sinks), warn

@@ -9,7 +9,6 @@ from typing import IO
 from mcap.writer import CompressionType, IndexType, Writer
 
 from common.errors import CongraspError
-from common.inputs import file_name
 from services.record.channels import CONVENTIONS, Channel, Entry
 
 PART = ".part"
@@ -46,13 +45,13 @@ class LogWriter:
           open_file: opens a new file for writing.
 
         Raises:
-          CongraspError: the directory cannot be made, or the name is none of a file.
+          CongraspError: the directory cannot be made.
         """
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise CongraspError(f"The folder {directory} cannot be made: {error.strerror}.") from None
-        self._directory, self._name, self._run = directory, file_name(name, "a recording"), run
+        self._directory, self._name, self._run = directory, name, run
         self._max_bytes, self._max_ns, self._open_file = max_bytes, round(1e9 * max_seconds), open_file
         self._number = 0
         self._file: IO[bytes] | None = None
