@@ -82,8 +82,7 @@ class WriteAheadLog:
         """
         self._saved = self._next = version
         found = Recovered([], [])
-        for path in self._folder.glob(f"*{PART}"):  # never acknowledged
-            path.unlink(missing_ok=True)
+        _remove(self._folder.glob(f"*{PART}"))  # never acknowledged
         for path in sorted(self._folder.glob("*.safetensors")):
             if (name := _NAME.fullmatch(path.name)) is None:
                 continue
@@ -99,7 +98,7 @@ class WriteAheadLog:
                 found.damaged.append(identity)
                 continue
             if header.run_id != run_id:
-                path.unlink(missing_ok=True)
+                _remove([path])
                 continue
             self._files[identity] = path
             found.rollouts.append((header, message))
@@ -121,8 +120,7 @@ class WriteAheadLog:
             part.write_bytes(encode(message))
             part.rename(path)
         except OSError as error:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
+            _remove([part])
             with self._lock:
                 self._files.pop(identity, None)
                 first, self._full = not self._full, True
@@ -154,6 +152,11 @@ class WriteAheadLog:
         """Removes rollouts that no resume is to take up."""
         with self._lock:
             paths = [self._files.pop(identity) for identity in identities if identity in self._files]
-        for path in paths:
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
+        _remove(paths)
+
+
+def _remove(paths: Iterable[pathlib.Path]) -> None:
+    """Removes files; one that stays is passed over, or too old, when it is read again."""
+    for path in paths:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)

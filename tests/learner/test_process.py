@@ -105,6 +105,15 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
     assert actor.versions == sorted(actor.versions)
 
 
+@pytest.mark.timeout(120)
+def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub):
+    """As where they stay on a device: `audit=False`."""
+    create_run(tmp_path, CONFIG)
+    MadeUpActor(MemoryTransport(hub))
+    assert learn(tmp_path, hub, audit=False).version == 3
+    assert not (tmp_path / "accepted").exists() and not (tmp_path / "audit").exists()
+
+
 LEARNER = """
 import dataclasses, pathlib, sys, threading
 from common.transport.zenoh_transport import ZenohTransport
