@@ -87,6 +87,7 @@ class LearnerHub:
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
         self._sequences: collections.OrderedDict[Owner, Sequences] = collections.OrderedDict()
         self._forgotten_missing = 0
+        self._being_written: set[tuple[Owner, int]] = set()  # accepted, and not acknowledged yet
         self._bundle: SharedMessage | None = None
         self._alive: set[Alive] = set()
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
@@ -298,9 +299,13 @@ class LearnerHub:
             return self._answer("stale", why=f"It is of run id {header.run_id}, not {self.run_id}.")
         with self._changed:
             answer = self._admit(header, ticket, message)
-        if answer.meta["outcome"] == "accepted" and not self._write_ahead(header, message) and self._closed:
-            return self._answer("retry", why="The learner is stopping.")
-        return answer
+            if answer.meta["outcome"] != "accepted":
+                return answer
+            self._being_written.add((header.owner, header.sequence))
+        written = self._write_ahead(header, message)
+        with self._changed:
+            self._being_written.remove((header.owner, header.sequence))
+        return answer if written or not self._closed else self._answer("retry", why="The learner is stopping.")
 
     def _write_ahead(self, header: RolloutHeader, message: Message) -> bool:
         """Keeps an accepted rollout on disk if a resume could use it; one that the disk refuses is noted."""
@@ -336,6 +341,8 @@ class LearnerHub:
             return self._answer("retry", why="The learner is starting.")
         if self._closed:
             return self._answer("retry", why="The learner is stopping.")
+        if (header.owner, header.sequence) in self._being_written:
+            return self._answer("retry", why="It is being written.")
         sequences = self._sequences_of(header.owner)
         if header.sequence in sequences.refused:
             self._staleness.redeem(header.owner, ticket)

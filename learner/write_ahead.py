@@ -107,31 +107,30 @@ class WriteAheadLog:
     def add(self, header: RolloutHeader, message: Message) -> bool:
         """Writes an accepted rollout if a resume could use it; false if it should be there and cannot be written."""
         identity = *header.owner, header.sequence
-        with self._lock:
+        with self._lock:  # also while it is written: another thread may be at the same rollout
             distance = min(abs(header.version - version) for version in (self._saved, self._next))
             if not self.write or identity in self._files or distance > self._max_staleness:
                 return True
             path = self._folder / f"{self._number:012d}~{'~'.join(map(str, identity))}.safetensors"
-            self._files[identity] = path
-            self._number += 1
-        part = path.with_name(path.name + PART)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(encode(message))
-            part.rename(path)
-        except OSError as error:
-            _remove([part])
-            with self._lock:
-                self._files.pop(identity, None)
-                first, self._full = not self._full, True
-            if first:
-                self._log_error(
-                    f"Accepted rollouts cannot be written to {self._folder} ({error.strerror}): until they can, "
-                    "they do not survive the learner."
-                )
-            return False
-        self._full = False
-        return True
+            part = path.with_name(path.name + PART)
+            try:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                part.write_bytes(encode(message))
+                part.rename(path)
+            except OSError as error:
+                _remove([part])
+                is_new, self._full, why = not self._full, True, error.strerror
+            else:
+                self._files[identity] = path
+                self._number += 1
+                self._full = False
+                return True
+        if is_new:
+            self._log_error(
+                f"Accepted rollouts cannot be written to {self._folder} ({why}): until they can, they do not survive "
+                "the learner."
+            )
+        return False
 
     def begin_checkpoint(self, version: int) -> None:
         """Notes that a checkpoint of this version is about to be written; what a resume from it could use is kept."""

@@ -501,6 +501,26 @@ def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
     assert on_disk(resumed.hub._log) == []
 
 
+def test_nothing_is_acknowledged_before_it_is_written(bench, log):
+    """Neither what is accepted, nor the same that is sent again meanwhile, nor after the end was noted."""
+    written, slow = threading.Event(), log()
+    b = bench(log=slow)
+    b.hub.publish_weights(bundle(0), 0)
+    add = slow.add
+    slow.add = lambda header, message: written.wait(10) and add(header, message)
+    answers = []
+    first = threading.Thread(target=lambda: answers.append(b.send(0)["outcome"]))
+    first.start()
+    while b.ledger()["queued"] == 0:
+        time.sleep(0.01)
+    assert b.send(0)["outcome"] == "retry" and not answers
+    written.set()
+    first.join(5)
+    assert answers == ["accepted"] and b.send(0)["outcome"] == "duplicate" and on_disk(slow) == [0]
+    slow.add = lambda header, message: b.hub.close()  # the disk refuses it, and the learner stops
+    assert b.send(1)["outcome"] == "retry"
+
+
 def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, log):
     b = bench(log=log())
     b.hub.publish_weights(bundle(0), 0)
