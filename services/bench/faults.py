@@ -127,7 +127,7 @@ def _kill_child(role: str) -> Fault:
     """Kills the oldest process of a role."""
 
     def kill(run: RunUnderTest, rng: random.Random) -> None:
-        run.children(role)[0].kill()
+        run.child(role).kill()
 
     return kill
 
@@ -136,7 +136,7 @@ def _freeze_child(role: str) -> Fault:
     """Freezes the oldest process of a role for some seconds; its connections stay open and silent."""
 
     def freeze(run: RunUnderTest, rng: random.Random) -> None:
-        child = run.children(role)[0]
+        child = run.child(role)
         child.suspend()
         time.sleep(_FROZEN)
         child.resume()

@@ -95,6 +95,11 @@ class RunUnderTest:
             return sorted((c for c in self.process.children() if role in c.cmdline()), key=lambda c: c.create_time())
         return []
 
+    def child(self, role: str) -> psutil.Process:
+        """The oldest process of a role, once there is one."""
+        found: list[psutil.Process] = until(lambda: self.children(role))
+        return found[0]
+
     def status(self) -> dict[str, Any]:
         """The learner's; empty while there is none."""
         assert self._transport is not None

@@ -20,7 +20,7 @@ class Verdict(NamedTuple):
     unmatched: int
     corrupted: int
     unreadable: int
-    """Lines that are cut or damaged, or that a full disk refused: then missing lines are no evidence of a loss."""
+    """Lines that are cut or damaged, or that a full disk refused: then what no line tells of is no evidence."""
 
 
 class _Actors(NamedTuple):
@@ -61,7 +61,7 @@ def read_again(run_dir: pathlib.Path) -> Verdict:
     return Verdict(
         0 if unreadable else len(lost),
         sum(len(sums) > 1 for sums in used.values()),
-        sum(rollout not in made for rollout in known),
+        0 if unreadable else sum(rollout not in made for rollout in known),
         sum(any(check != made[rollout][1] for check in sums) for rollout, sums in known.items() if rollout in made),
         unreadable,
     )

@@ -139,6 +139,17 @@ def test_what_a_torn_line_told_is_no_surplus(run_dir):
     assert report.counts["used, not in the journals"] == 4
 
 
+def test_a_line_that_a_killed_process_left_unfinished_is_no_damage(run_dir):
+    """Its writer comes back: its next line counts the unfinished one, and what it told is not judged."""
+    learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
+    path = run_dir / AUDIT / "a.jsonl"
+    path.write_bytes(path.read_bytes()[:-30])
+    assert (audit(run_dir).holes, audit(run_dir).damaged) == (1, 0)
+    Journal(path).write(actor="a", incarnation="2")
+    report = audit(run_dir)
+    assert (report.holes, report.damaged, report.exit_code, report.counts["accepted"]) == (1, 0, 0, 5)
+
+
 def test_journals_of_older_versions_are_read_and_reported_as_unchecked(run_dir, capsys):
     learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
     for path in (run_dir / AUDIT).iterdir():
