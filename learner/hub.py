@@ -97,13 +97,7 @@ class LearnerHub:
         self._rate_limit = RateLimit()
         if durable is not None:
             self._restore(durable)
-        self._recovered: Recovered | None = Recovered([], [])
-        if log is not None:
-            self._recovered = log.recover(staleness.version, run_id, form, schema)
-        if audit is not None:
-            kept = log is not None and log.write
-            session = self.session_id, run_id, staleness.version, staleness.max_staleness
-            staleness.note_undone(audit.begin(*session, kept=kept))
+        self._recovered: Recovered | None = self._begin()
         transport.serve(self.keys.config, self._on_config)
         charging = self._rate_limit.charging
         transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._turn_away)
@@ -247,6 +241,17 @@ class LearnerHub:
             self._audit.dropped(identities)
         if self._log is not None:
             self._log.discard(identities)
+
+    def _begin(self) -> Recovered:
+        """Reads what earlier sessions left on disk, and notes that this one begins."""
+        staleness, log = self._staleness, self._log
+        version = staleness.version
+        recovered = Recovered([], []) if log is None else log.recover(version, self.run_id, self._form, self._schema)
+        if self._audit is not None:
+            kept = log is not None and log.write
+            session = self.session_id, self.run_id, version, staleness.max_staleness
+            staleness.note_undone(self._audit.begin(*session, kept=kept))
+        return recovered
 
     def _restore(self, durable: Mapping[str, Any]) -> None:
         if durable["run_id"] != self.run_id:
