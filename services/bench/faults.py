@@ -156,20 +156,19 @@ def _fill_disk(run: RunUnderTest, rng: random.Random) -> None:
     filler.unlink()
 
 
-def _damage(run: RunUnderTest, rng: random.Random) -> None:
-    """Kills all processes, and flips a bit in the newest checkpoint, an accepted rollout, a journal or the policy."""
-    run.kill()
-    folder = run.run_dir
-    groups = [
-        sorted(folder.glob("checkpoints/checkpoint_*.safetensors"))[-1:],
-        sorted(folder.glob("accepted/*/*.safetensors")),
-        sorted(folder.glob("audit/*.jsonl")),
-        [folder / "policy.safetensors", folder / "version"],
-    ]
-    path = rng.choice(rng.choice([group for group in groups if group]))
-    data = bytearray(path.read_bytes())
-    data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-    path.write_bytes(data)
+def _damage(pattern: str, newest: int) -> Fault:
+    """Kills all processes, and flips a bit in one of the `newest` files of a pattern, by their names."""
+
+    def damage(run: RunUnderTest, rng: random.Random) -> None:
+        until(lambda: list(run.run_dir.glob(pattern)))
+        run.kill()
+        if found := sorted(run.run_dir.glob(pattern))[-newest:]:
+            path = rng.choice(found)
+            data = bytearray(path.read_bytes())
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+            path.write_bytes(data)
+
+    return damage
 
 
 FAULTS: dict[str, Fault] = {
@@ -181,7 +180,10 @@ FAULTS: dict[str, Fault] = {
     "freeze-learner": _freeze_child("learner"),
     "freeze-actor": _freeze_child("actor"),
     "full-disk": _fill_disk,
-    "damage": _damage,
+    "damage-checkpoint": _damage("checkpoints/checkpoint_*.safetensors", 1),
+    "damage-accepted": _damage("accepted/*/*.safetensors", 8),
+    "damage-journal": _damage("audit/*.jsonl", 8),
+    "damage-policy": _damage("policy.safetensors", 1),
 }
 """Kinds of faults by name."""
 
