@@ -2,8 +2,7 @@
 
 A rollout gets its identity (actor, incarnation, sequence) when it is handed over, and is sent under that identity until
 the learner has answered it, across restarts of the learner (`actors.uploads`). Sending happens in the background, so
-that the next rollout is made meanwhile; at most `window` rollouts are on their way, further ones wait in `upload`. What
-another session of the learner has to be sent again goes before any new ticket is asked for.
+that the next rollout is made meanwhile; at most `window` rollouts are on their way, further ones wait in `upload`.
 """
 
 import contextlib
@@ -13,8 +12,6 @@ import threading
 import time
 from concurrent.futures import Future
 from typing import Any, NamedTuple, Self
-
-import numpy as np
 
 from actors.uploads import Outcome, Uploads, backoff, check_timeout
 from common.errors import CongraspError, RefusedError, TransportError
@@ -68,7 +65,6 @@ class ActorLink:
         max_refusals: int = 5,
         request_timeout: float = 10.0,
         patience: float = 300.0,
-        keep: bool = True,
         journal: Journal | None = None,
     ):
         """Announces the actor.
@@ -81,7 +77,6 @@ class ActorLink:
           max_refusals: rollouts refused in a row after which the link fails.
           request_timeout: seconds that one request may take; a rollout gets more, by its size.
           patience: seconds without any answer after which the link gives the learner up.
-          keep: keep accepted rollouts for a learner's next session; needless where actor and learner die together.
           journal: where every rollout and each answer to it is written down; it stays the caller's.
         """
         self.keys = Keys(run)
@@ -98,7 +93,7 @@ class ActorLink:
         self._answered = time.monotonic()
         self._wanted = secrets.token_hex(8)  # the next ticket's id, kept until it is granted
         self._sequence = itertools.count()
-        self._keep, self._journal = keep, journal
+        self._journal = journal
         self._news = threading.Event()
         self._uploads = Uploads(
             transport,
@@ -108,7 +103,6 @@ class ActorLink:
             max_refusals=max_refusals,
             request_timeout=request_timeout,
             patience=patience,
-            keep=keep,
             journal=journal,
         )
         self._closed = self._uploads.closed
@@ -142,12 +136,6 @@ class ActorLink:
         deadline = time.monotonic() + timeout
         while True:
             self._check()
-            if self._uploads.owed:
-                rest = deadline - time.monotonic()
-                if rest <= 0:
-                    return None
-                self._closed.wait(min(_POLL, rest))
-                continue
             self._news.clear()
             try:
                 reply = self._ask(self._ticket_key, self._identity(self._wanted), deadline)
@@ -228,10 +216,7 @@ class ActorLink:
             "sequence": next(self._sequence),
             "epoch": self._info.run_id,
         }
-        arrays = rollout.arrays
-        if self._keep:
-            arrays = {name: np.asarray(array) for name, array in arrays.items()}  # no device memory is held on to
-        message = SharedMessage(arrays, meta)
+        message = SharedMessage(rollout.arrays, meta)
         if self._journal is not None:
             self._write(made=meta["sequence"], version=meta["version"], checksum=checksum(message))
         return self._uploads.put(message)
@@ -267,15 +252,10 @@ class ActorLink:
     def _note(self, meta: Any) -> None:
         """Takes in the learner's state, which comes with every answer and announcement."""
         self._answered = time.monotonic()
-        session = self._learner[1]
         self._learner = int(meta["version"]), str(meta["life"])
         self._finished = bool(meta["finished"])
         if self._info and meta["epoch"] != self._info.run_id:
             self._uploads.failure = _restarted(self._info.run_id, meta["epoch"])
-        if session not in ("", meta["life"]):
-            self._uploads.send_again()
-        elif meta["version"] >= 0:
-            self._uploads.forget(meta["oldest"], meta["saved"])
 
     def _follow(self) -> None:
         """Takes announcements in as they come, whatever the caller is doing meanwhile."""

@@ -40,7 +40,6 @@ def run_actor(
     threads: int = 1,
     patience: float = 60.0,
     on_rollout: Callable[[dict[str, float]], None] = lambda values: None,
-    keep: bool = True,
     journal: Journal | None = None,
 ) -> None:
     """Acts for the learner of `run` until it ends or `stop` is set.
@@ -54,14 +53,13 @@ def run_actor(
       threads: threads of the `native` engine.
       patience: seconds without a learner after which the actor gives up.
       on_rollout: given the metrics of every rollout, its version among them.
-      keep: see `ActorLink`.
       journal: see `ActorLink`.
 
     Raises:
       CongraspError: the learner is gone, or refuses this actor's rollouts.
     """
     while not stop.is_set():
-        with ActorLink(transport, run, actor, patience=patience, keep=keep, journal=journal) as link:
+        with ActorLink(transport, run, actor, patience=patience, journal=journal) as link:
             try:
                 info = link.config(patience)
                 config = run_config_from_json(info.config)

@@ -1,9 +1,4 @@
-"""Rollouts on their way to the learner: each is sent until it has an outcome, and kept for its next session.
-
-A learner that is killed takes with it what it had accepted since its last checkpoint. So accepted rollouts are kept, a
-few in all: those that are fresh, and those that will be when the learner resumes from that checkpoint. Its next session
-is sent them again; what it has after all is a duplicate to it.
-"""
+"""Rollouts on their way to the learner: each is sent until it has an outcome, across restarts of the learner."""
 
 import itertools
 import queue
@@ -28,8 +23,7 @@ class _Upload(NamedTuple):
     """A rollout in the queue."""
 
     message: Message
-    outcome: "Future[Outcome] | None"
-    """None for one that is sent again."""
+    outcome: "Future[Outcome]"
 
 
 class Uploads:
@@ -51,7 +45,6 @@ class Uploads:
         max_refusals: int,
         request_timeout: float,
         patience: float,
-        keep: bool,
         journal: Journal | None,
     ):
         """Starts the threads.
@@ -64,7 +57,6 @@ class Uploads:
           max_refusals: rollouts refused in a row after which nothing more is sent.
           request_timeout: seconds that sending may take, and more by the rollout's size.
           patience: seconds without any answer after which the learner is given up.
-          keep: keep accepted rollouts for a learner's next session.
           journal: where each answer is written down.
         """
         self.failure: CongraspError | None = None
@@ -72,20 +64,12 @@ class Uploads:
         self.closed = threading.Event()
         self._transport, self._key, self._on_reply = transport, key, on_reply
         self._max_refusals, self._timeout, self._patience = max_refusals, request_timeout, patience
-        self._keep, self._journal = keep, journal
+        self._journal = journal
         self._refusals = 0
         self._queue: queue.SimpleQueue[_Upload | None] = queue.SimpleQueue()
         self._pending: set[Future[Outcome]] = set()
-        self._lock = threading.Lock()  # of the next two
-        self._kept: dict[int, Message] = {}
-        self._owed = 0
         for index in range(window):
             threading.Thread(target=self._send_all, daemon=True, name=f"upload-{index}").start()
-
-    @property
-    def owed(self) -> int:
-        """Rollouts that are being sent again."""
-        return self._owed
 
     def put(self, message: Message) -> "Future[Outcome]":
         """Sends a rollout in the background; returns its outcome to be."""
@@ -94,24 +78,6 @@ class Uploads:
         outcome.add_done_callback(self._pending.discard)
         self._queue.put(_Upload(message, outcome))
         return outcome
-
-    def send_again(self) -> None:
-        """Sends what is kept to another session of the learner."""
-        with self._lock:
-            for message in self._kept.values():
-                self._owed += 1
-                self._queue.put(_Upload(message, None))
-            self._kept.clear()
-
-    def forget(self, oldest: int, saved: tuple[int, int]) -> None:
-        """Drops what no session of the learner can use: versions before `oldest`, but for those of `saved`."""
-        first, last = saved
-        with self._lock:
-            self._kept = {
-                sequence: kept
-                for sequence, kept in self._kept.items()
-                if kept.meta["version"] >= oldest or first <= kept.meta["version"] <= last
-            }
 
     def start_over(self) -> None:
         """Forgets failure and refusals."""
@@ -135,9 +101,9 @@ class Uploads:
     def _send_all(self) -> None:
         """Sends rollouts from the queue until it is closed; one thread of `window`."""
         while (upload := self._queue.get()) is not None:
-            outcome = upload.outcome or Future[Outcome]()
+            message, outcome = upload
             try:
-                outcome.set_result(self._deliver(upload.message))
+                outcome.set_result(self._deliver(message))
             except CongraspError as error:
                 self.failure = self.failure or error
                 outcome.set_exception(error)
@@ -145,11 +111,7 @@ class Uploads:
                 self.failure = CongraspError(f"The learner's answer cannot be understood: {error!r}.")
                 outcome.set_exception(self.failure)
             finally:
-                if upload.outcome is None:
-                    with self._lock:
-                        self._owed -= 1
-                else:
-                    self.free.release()
+                self.free.release()
         self._queue.put(None)
 
     def _deliver(self, message: Message) -> Outcome:
@@ -184,9 +146,6 @@ class Uploads:
                     return self._refused(str(reply.meta["why"]))
                 if outcome != "retry":
                     self._refusals = 0
-                    if self._keep and outcome != "stale":
-                        with self._lock:
-                            self._kept[message.meta["sequence"]] = Message(message.arrays, message.meta)
                     return outcome
                 delays = backoff()
                 delay = float(reply.meta["retry_after"])

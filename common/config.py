@@ -16,6 +16,7 @@ from typing_extensions import Doc
 
 from common.engines import PhysicsName
 from common.errors import CongraspError
+from common.inputs import file_name
 from common.task.constraints import CONSTRAINTS, PAPER
 from common.task.reward import GRASP
 
@@ -265,6 +266,9 @@ class RunConfig:
     """Observations travel (and are acted on) as float16."""
     checkpoint_every: int = 25
     """Updates between two checkpoints."""
+    write_ahead: bool = True
+    """Rollouts are on disk before they are acknowledged, until a checkpoint holds their outcome: a resume takes them up
+    whatever was killed. Without, a killed learner takes along what it had accepted since the checkpoint."""
     collapse_patience: int = 60
     """Updates in a row without contact, or with less than half of the best success, that end the run; 0: none do."""
     episode_every: int = 10
@@ -295,16 +299,22 @@ def to_json(config: Any) -> str:
 def run_config_from_json(text: str | bytes) -> RunConfig:
     """The inverse of `to_json` for a `RunConfig`; unknown keys and wrong types are errors that name the key."""
     try:
-        fields = json.loads(text)
+        fields = json.loads(text, parse_constant=_no_constant)
         if not isinstance(fields, dict):
             raise ValueError("it is no object")
-        return dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
-    except (ValueError, RecursionError) as error:  # what is no UTF-8, and what is nested too deep, too
+        config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
+    except (ValueError, TypeError, RecursionError) as error:  # no UTF-8, null for a number, or nested too deep
         raise CongraspError(
             f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."
         ) from None
     except dacite.DaciteError as error:
         raise CongraspError(f"The configuration does not fit this version: {error}.") from None
+    file_name(config.name, "a run")
+    return config
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"it holds {name}")
 
 
 def digest(config: Any) -> str:

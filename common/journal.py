@@ -39,11 +39,11 @@ class Journal:
         self._lock = threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            self._cut = _is_cut(path)
             self._file = path.open("ab", buffering=0)
         except OSError as error:
             raise CongraspError(f"The journal {path} cannot be opened: {error.strerror}.") from None
-        self._cut = self._file.tell() > 0  # whoever wrote the last line may have been killed in it
-        self._lost = 0
+        self._lost, self._refused = int(self._cut), False
 
     def write(self, **entry: Any) -> None:
         """Adds a line; one that the disk refuses is counted in the next that it takes, as `lost`."""
@@ -55,8 +55,9 @@ class Journal:
                 reason = "No space left" if self._cut else ""
             except OSError as error:
                 self._cut, reason = True, error.strerror or str(error)
-            if reason and not self._lost:
+            if reason and not self._refused:
                 self._warn(f"{self._path} could not be written ({reason}); what happens meanwhile is not in it.")
+            self._refused = bool(reason)
             self._lost = self._lost + 1 if reason else 0
 
     def close(self) -> None:
@@ -139,6 +140,15 @@ def is_rows(value: Any, *types: type) -> bool:
 def is_value(value: Any, kind: type) -> bool:
     """Whether a value of a JSON line is of a type; integers only below `MAX_NUMBER`."""
     return type(value) is kind and not (isinstance(value, int) and abs(value) >= MAX_NUMBER)
+
+
+def _is_cut(path: pathlib.Path) -> bool:
+    """Whether a journal ends within a line: its writer was killed in it, or the disk took a part of it."""
+    if not path.exists() or not path.stat().st_size:
+        return False
+    with path.open("rb") as file:
+        file.seek(-1, 2)
+        return file.read() != b"\n"
 
 
 def _line(entry: dict[str, Any]) -> bytes:

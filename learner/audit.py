@@ -1,7 +1,8 @@
 """The learner's journal: which rollouts its updates used, which it dropped, and what a resume undid.
 
 Every session of the learner begins with a line that names the checkpoint's version. What was handed to updates of that
-version or later ones, before, died with the process: these rollouts are undone, and may come again.
+version or later ones, before, died with the process: these rollouts are undone. What the session takes up of them, and
+of those that waited, it notes next.
 """
 
 import pathlib
@@ -10,6 +11,9 @@ from typing import Any, NamedTuple
 
 from common.journal import AUDIT, Journal, JournalLines, has_fields, is_rows, read_journal
 from common.wire.codec import Message, checksum
+from learner.write_ahead import Identity
+
+_ROWS = ("taken", "dropped", "spoilt", "unwritten", "end")
 
 
 class Used(NamedTuple):
@@ -32,21 +36,36 @@ class AuditLog:
         self._path = journal_path(run_dir, name)
         self._journal = Journal(self._path, log_error)
 
-    def begin(self, session_id: str, run_id: str, version: int, max_staleness: int) -> int:
-        """A session begins from a checkpoint of `version`, or 0; returns how many rollouts the run lost by undoing."""
-        self._journal.write(life=session_id, epoch=run_id, version=version, max_staleness=max_staleness)
+    def begin(self, session_id: str, run_id: str, version: int, max_staleness: int, *, kept: bool) -> int:
+        """A session begins from a checkpoint of `version`, or 0; `kept`: what it accepts is on disk, too.
+
+        Returns how many rollouts the run lost by undoing.
+        """
+        self._journal.write(life=session_id, epoch=run_id, version=version, max_staleness=max_staleness, kept=kept)
         return len(replay(read_uses(self._path).intact)[1])
+
+    def recovered(self, taken: Sequence[Identity], stale: Sequence[Identity], damaged: Sequence[Identity]) -> None:
+        """Rollouts that earlier sessions had accepted wait again, are too old by now, and are damaged on disk."""
+        self._journal.write(taken=taken, dropped=stale, spoilt=damaged)
+
+    def unwritten(self, identities: Sequence[Identity]) -> None:
+        """Rollouts were accepted though the disk did not take them: they do not survive this session."""
+        self._journal.write(unwritten=identities)
+
+    def saved(self, version: int) -> None:
+        """There is a checkpoint of this version."""
+        self._journal.write(saved=version)
 
     def used(self, version: int, lags: Sequence[int], messages: Sequence[Message]) -> None:
         """Rollouts are handed to the update that follows `version`."""
         rows = [[*_identity(message), lag, checksum(message)] for lag, message in zip(lags, messages, strict=True)]
         self._journal.write(version=version, used=rows)
 
-    def dropped(self, identities: Iterable[tuple[str, str, int]]) -> None:
+    def dropped(self, identities: Iterable[Identity]) -> None:
         """Accepted rollouts had grown too old."""
         self._journal.write(dropped=list(identities))
 
-    def end(self, waiting: Iterable[tuple[str, str, int]]) -> None:
+    def end(self, waiting: Iterable[Identity]) -> None:
         """The session ends in order, with these accepted rollouts unused."""
         self._journal.write(end=list(waiting))
         self._journal.close()
@@ -68,7 +87,8 @@ def _is_entry(entry: dict[str, Any]) -> bool:
         return has_fields(entry, life=str, epoch=str, version=int, max_staleness=int)
     if "used" in entry:
         return has_fields(entry, version=int) and is_rows(entry["used"], str, str, int, int, str)
-    return any(name in entry and is_rows(entry[name], str, str, int) for name in ("dropped", "end"))
+    rows = [entry[name] for name in _ROWS if name in entry]
+    return all(is_rows(each, str, str, int) for each in rows) and (bool(rows) or has_fields(entry, saved=int))
 
 
 def journalled_version(run_dir: pathlib.Path) -> int:

@@ -1,19 +1,19 @@
 """The learner's end of the link: it takes rollouts in, hands out tickets and weights, and reports the run's status.
 
-A rollout is identified by (actor, incarnation, sequence). It is acknowledged when it is in the queue, and an
-acknowledged one is never taken twice, however often its actor sends it.
+A rollout is identified by (actor, incarnation, sequence). It is acknowledged when it is in the queue and on disk, and
+an acknowledged one is never taken twice, however often its actor sends it.
 
 What a checkpoint keeps of the hub (`durable`) fits the weights beside it: when training resumes from it, what was
-decided after it is undone with the updates that used it. Actors send what they still have of that again; what does not
-come shows as gaps in their sequences, which the counters name `missing`; so do rollouts that later ones have
-overtaken, until they arrive. All others are counted once: as consumed, dropped, queued or stale.
+decided after it is undone with the updates that used it. What the write-ahead log has of that is taken in again before
+the first new rollout; the rest shows as gaps in actors' sequences, which the counters name `missing`; so do rollouts
+that later ones have overtaken, until they arrive. All others are counted once: as consumed, dropped, queued or stale.
 """
 
 import collections
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from common.errors import CongraspError
@@ -25,12 +25,12 @@ from learner.audit import AuditLog
 from learner.deduplication import Sequences
 from learner.rate_limit import DAMAGED, RateLimit, certificate
 from learner.staleness import Owner, StalenessManager
+from learner.write_ahead import Identity, Recovered, WriteAheadLog
 
 _INCARNATIONS = 1024  # whose sequences are kept
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
 _EVENT_SECONDS = 1.0  # between two events of one kind
-_RETURN_SECONDS = 1.0  # that actors have after a resume to send again what the last session had accepted
 
 
 class LearnerHub:
@@ -51,6 +51,7 @@ class LearnerHub:
         durable: Mapping[str, Any] | None = None,
         on_event: Callable[[str, str], None] = lambda level, text: None,
         audit: AuditLog | None = None,
+        log: WriteAheadLog | None = None,
     ):
         """Starts to answer; tickets are granted from the first `publish_weights` on.
 
@@ -67,6 +68,7 @@ class LearnerHub:
           durable: what `durable` returned when the checkpoint was written, to go on from it.
           on_event: given level and text of every event, which it must not hold up.
           audit: keeps the outcome of every rollout.
+          log: keeps accepted rollouts until a checkpoint holds their outcome.
 
         Raises:
           CongraspError: the durable state is of another run.
@@ -85,19 +87,17 @@ class LearnerHub:
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
         self._sequences: collections.OrderedDict[Owner, Sequences] = collections.OrderedDict()
         self._forgotten_missing = 0
+        self._being_written: set[tuple[Owner, int]] = set()  # accepted, and not acknowledged yet
         self._bundle: SharedMessage | None = None
         self._alive: set[Alive] = set()
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
         self._last_event: dict[str, float] = {}
         self._finished = self._closed = False
-        self._audit = audit
-        self._saved = 0 if durable is None else durable["version"]
-        self._held_until = 0.0 if durable is None else float("inf")
+        self._audit, self._log = audit, log
         self._rate_limit = RateLimit()
         if durable is not None:
             self._restore(durable)
-        if audit is not None:
-            staleness.note_undone(audit.begin(self.session_id, run_id, staleness.version, staleness.max_staleness))
+        self._recovered: Recovered | None = self._begin()
         transport.serve(self.keys.config, self._on_config)
         charging = self._rate_limit.charging
         transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._turn_away)
@@ -120,13 +120,12 @@ class LearnerHub:
         with self._changed:
             while True:
                 self._drop_stale()
-                held = max(0.0, self._held_until - time.monotonic())
-                if len(self._queue) >= count and not held:
+                if len(self._queue) >= count:
                     return True
                 rest = deadline - time.monotonic()
                 if rest <= 0:
                     return False
-                self._changed.wait(min(rest, held or rest))
+                self._changed.wait(rest)
 
     def next_batch(self, count: int, timeout: float) -> list[Message] | None:
         """The `count` rollouts of the oldest policies that are fresh enough; None if `timeout` seconds bring fewer."""
@@ -157,10 +156,11 @@ class LearnerHub:
         if (bundle.meta["version"], bundle.meta["epoch"]) != (version, self.run_id):
             raise CongraspError(f"The bundle is not version {version} of run id {self.run_id}.")
         with self._changed:
-            if self._bundle is None and self._held_until:
-                self._held_until = time.monotonic() + _RETURN_SECONDS
             self._bundle = SharedMessage(bundle.arrays, bundle.meta)
             self._staleness.publish(version)
+            if self._recovered is not None:
+                self._take_up(self._recovered)
+                self._recovered = None
         self._transport.publish(self.keys.announcement, Message(meta=self._state()))
 
     def finish(self) -> None:
@@ -169,7 +169,10 @@ class LearnerHub:
         self._transport.publish(self.keys.announcement, Message(meta=self._state()))
 
     def close(self) -> None:
-        """Stops accepting rollouts, though the transport still answers, and notes what waits unused."""
+        """Stops accepting rollouts, though the transport still answers, and notes what waits unused.
+
+        What is being written just then is among these, and acknowledged once it is written.
+        """
         with self._changed:
             self._closed = True
             if self._audit is not None:
@@ -204,6 +207,11 @@ class LearnerHub:
     def durable(self) -> dict[str, Any]:
         """What a checkpoint must keep of the hub, as JSON; call it between two updates, when no batch is in hand."""
         with self._changed:
+            if self._log is not None:
+                self._log.begin_checkpoint(self._staleness.version)
+                for header, message in self._queue:
+                    self._write_ahead(header, message)
+                self._log.cover((*header.owner, header.sequence) for header, _ in self._queue)
             waiting = {(header.owner, header.sequence) for header, _ in self._queue}
             sequences = []
             for owner, known in self._sequences.items():
@@ -219,9 +227,31 @@ class LearnerHub:
                 "sequences": sequences,
             }
 
-    def note_saved(self, durable: Mapping[str, Any]) -> None:
-        """Notes that there is a checkpoint with this; actors may forget what it covers."""
-        self._saved = durable["version"]
+    def note_saved(self) -> None:
+        """Notes that there is a checkpoint with what `durable` returned last; what it covers is kept no longer."""
+        if self._log is not None:
+            self._log.end_checkpoint()
+        if self._audit is not None:
+            self._audit.saved(self._staleness.version)
+
+    def discard(self, batch: Sequence[Message]) -> None:
+        """Drops the rollouts of a batch that nothing can be learnt from, so that no resume takes them up."""
+        identities = [(m.meta["actor"], m.meta["incarnation"], m.meta["sequence"]) for m in batch]
+        if self._audit is not None:
+            self._audit.dropped(identities)
+        if self._log is not None:
+            self._log.discard(identities)
+
+    def _begin(self) -> Recovered:
+        """Reads what earlier sessions left on disk, and notes that this one begins."""
+        staleness, log = self._staleness, self._log
+        version = staleness.version
+        recovered = Recovered([], []) if log is None else log.recover(version, self.run_id, self._form, self._schema)
+        if self._audit is not None:
+            kept = log is not None and log.write
+            session = self.session_id, self.run_id, version, staleness.max_staleness
+            staleness.note_undone(self._audit.begin(*session, kept=kept))
+        return recovered
 
     def _restore(self, durable: Mapping[str, Any]) -> None:
         if durable["run_id"] != self.run_id:
@@ -233,10 +263,7 @@ class LearnerHub:
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1
-        oldest = self._staleness.oldest
-        saved = [self._saved - self._staleness.max_staleness, self._saved + self._staleness.max_staleness]
-        session = {"epoch": self.run_id, "life": self.session_id, "finished": self._finished}
-        return {"version": version, "oldest": oldest, "saved": saved, **session}
+        return {"version": version, "epoch": self.run_id, "life": self.session_id, "finished": self._finished}
 
     def _on_config(self, key: str, request: Message) -> Message:
         arrays = list(self._form.arrays)
@@ -251,7 +278,7 @@ class LearnerHub:
         if meta.get("give_back"):
             self._staleness.give_back(owner, ticket_id)
             return Message(meta=self._state())
-        may = self._bundle is not None and not self._finished and time.monotonic() >= self._held_until
+        may = self._bundle is not None and not self._finished
         ticket = self._staleness.grant(owner, ticket_id) if may else None
         return Message(meta={**self._state(), "granted": ticket is not None, "retry_after": _RETRY_SECONDS})
 
@@ -276,13 +303,51 @@ class LearnerHub:
             self._staleness.refuse_stale(header.owner, ticket)
             return self._answer("stale", why=f"It is of run id {header.run_id}, not {self.run_id}.")
         with self._changed:
-            return self._admit(header, ticket, message)
+            answer = self._admit(header, ticket, message)
+            if answer.meta["outcome"] != "accepted":
+                return answer
+            self._being_written.add((header.owner, header.sequence))
+        written = self._write_ahead(header, message)
+        with self._changed:
+            self._being_written.remove((header.owner, header.sequence))
+        return answer if written or not self._closed else self._answer("retry", why="The learner is stopping.")
+
+    def _write_ahead(self, header: RolloutHeader, message: Message) -> bool:
+        """Keeps an accepted rollout on disk if a resume could use it; one that the disk refuses is noted."""
+        if self._log is None or self._log.add(header, message):
+            return True
+        with self._changed:
+            if self._audit is not None and not self._closed:
+                self._audit.unwritten([(*header.owner, header.sequence)])
+        return False
+
+    def _take_up(self, recovered: Recovered) -> None:
+        """Takes in what earlier sessions had acknowledged since the checkpoint; the caller holds the lock."""
+        taken: list[Identity] = []
+        stale: list[Identity] = []
+        for header, message in recovered.rollouts:
+            sequences, identity = self._sequences_of(header.owner), (*header.owner, header.sequence)
+            if header.sequence in sequences:  # the checkpoint holds its outcome
+                continue
+            verdict = self._staleness.arrive(header.owner, "", header.version, beyond_capacity=True)
+            sequences.add(header, accepted=verdict == "accepted")
+            if verdict == "accepted":
+                self._queue.append((header, message))
+            (taken if verdict == "accepted" else stale).append(identity)
+        if self._audit is not None:
+            self._audit.recovered(taken, stale, recovered.damaged)
+        if taken or stale:
+            self._event("info", f"Took up {len(taken)} accepted rollouts of before; {len(stale)} are too old.")
+        if recovered.damaged:
+            self._event("error", f"{len(recovered.damaged)} accepted rollouts are damaged on disk, and left out.")
 
     def _admit(self, header: RolloutHeader, ticket: str, message: Message) -> Message:
         if self._bundle is None:
             return self._answer("retry", why="The learner is starting.")
         if self._closed:
             return self._answer("retry", why="The learner is stopping.")
+        if (header.owner, header.sequence) in self._being_written:
+            return self._answer("retry", why="It is being written.")
         sequences = self._sequences_of(header.owner)
         if header.sequence in sequences.refused:
             self._staleness.redeem(header.owner, ticket)
@@ -296,8 +361,7 @@ class LearnerHub:
             self._staleness.refuse_stale(header.owner, ticket)
             sequences.add(header, accepted=False)
             return self._answer("stale", why="The run is finished.")
-        returning = time.monotonic() < self._held_until
-        verdict = self._staleness.arrive(header.owner, ticket, header.version, beyond_capacity=returning)
+        verdict = self._staleness.arrive(header.owner, ticket, header.version)
         if verdict == "full":
             return self._answer("retry", why="No more rollouts are needed at this version.")
         sequences.add(header, accepted=verdict == "accepted")

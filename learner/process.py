@@ -6,6 +6,7 @@ take configuration, state and versions from it, and write only journals and what
 
 import contextlib
 import dataclasses
+import functools
 import pathlib
 import secrets
 import threading
@@ -45,6 +46,7 @@ from learner.run_directory import (
 )
 from learner.staleness import Counters, StalenessManager
 from learner.statistics import Pace, overall, summary
+from learner.write_ahead import FOLDER, WriteAheadLog
 
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0
@@ -84,7 +86,8 @@ def run_learner(
       stop_event: ends training after the update that is under way.
       resume: go on from the newest intact checkpoint (of rank 0), which any number of ranks may have written.
       ranks: the learner's processes, where there are several.
-      audit: keep the journal in `audit/`; it needs rollouts on the host, so not where they stay on a device.
+      audit: keep the journal in `audit/` and, where the configuration says so, accepted rollouts in `accepted/`; both
+        need rollouts on the host, so not where they stay on a device.
       recorder: entered while the learner runs, for example one that writes the run's logs.
       on_update: given the metrics of every update.
       on_event: given what is worth a line.
@@ -165,6 +168,9 @@ class _Learner:
         if ranks.count > 1:
             # Before there is a hub, and so before an actor in this process captures its engine's graphs.
             self._warm_up()
+        name, staleness = str(ranks.rank), config.ppo.max_staleness
+        log_error = functools.partial(self._event, "error")
+        folder = run_dir / FOLDER / name
         self._hub = LearnerHub(
             transport,
             run=config.name,
@@ -172,12 +178,14 @@ class _Learner:
             run_id=self._run_id,
             schema=self._spec.schema,
             form=self._form,
-            staleness=StalenessManager(config.ppo.max_staleness, config.ppo.rollouts_per_update),
-            name=str(ranks.rank),
+            staleness=StalenessManager(staleness, config.ppo.rollouts_per_update),
+            name=name,
             durable=_durable(hubs, ranks.rank),
             on_event=notify,
-            audit=AuditLog(run_dir, str(ranks.rank), lambda text: self._event("error", text)) if audit else None,
+            audit=AuditLog(run_dir, name, log_error) if audit else None,
+            log=WriteAheadLog(folder, staleness, write=config.write_ahead, log_error=log_error) if audit else None,
         )
+        self._is_new = not hubs
         if hubs and len(hubs) != ranks.count:
             self._event(
                 "warning", f"The checkpoint is of {len(hubs)} rank(s), this run has {ranks.count}: {_COUNTERS}."
@@ -225,11 +233,14 @@ class _Learner:
 
     def train(self, stop: threading.Event, deaths: list[str], on_update: Callable[[dict[str, float]], None]) -> None:
         """Updates until the end, a stop, or a thread's death; leaves a checkpoint behind in each case."""
+        if self._is_new:  # before anything is accepted: what a kill undoes, a resume can take up
+            self._save_if_possible()
         self._publish()
         if self._ranks.count == 1:
             self._warm_up()
         pace, watch = Pace(), CollapseWatch(self._config.collapse_patience)
-        end, saved, due = None, -1, False
+        # After a resume soon: rollouts of its versions are near to no checkpoint, and die with it until there is one.
+        end, saved, due = None, -1, not self._is_new
         while self._state.version < self._config.updates and end is None:
             began = time.monotonic()
             end = self._wait(stop, deaths)
@@ -299,6 +310,7 @@ class _Learner:
             with self._ranks.watchdog():
                 self._state, metrics = self._algorithm.update(self._state, batch, self._ranks.mesh)
         except NonFiniteUpdate as error:
+            self._hub.discard(messages)
             self._ranks.close()
             folder, number = self._run_dir / "failure", f"-{self._ranks.rank}" if self._ranks.count > 1 else ""
             with contextlib.suppress(CongraspError):
@@ -361,7 +373,7 @@ class _Learner:
                 failure = str(error)
         if failure := self._ranks.exchange({"failure": failure}).meta["entries"][0]["failure"]:
             raise CongraspError(failure)
-        self._hub.note_saved(durable)
+        self._hub.note_saved()
 
     def _save_if_possible(self) -> bool:
         """A checkpoint on the way; one that fails is tried again after the next update, and training goes on."""

@@ -1,9 +1,10 @@
 """The directory of a run.
 
 It holds `config.json`, `initial.safetensors` where training does not begin with random weights, `checkpoints/`,
-`policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `version` (the
-newest version that was ever published, so that versions rise over a crash, too) and, after an update that was not
-finite, `failure/`. What a resume could not read, or does not go on from, is kept beside it as `*.aside`.
+`policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `accepted/`
+(rollouts that no checkpoint holds yet), `version` (the newest version that was ever published, so that versions rise
+over a crash, too) and, after an update that was not finite, `failure/`.
+What a resume could not read, or does not go on from, is kept beside it as `*.aside`.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ from collections.abc import Callable
 from common.config import RunConfig, run_config_from_json, to_json
 from common.errors import CongraspError
 from common.files import write_atomically
+from common.inputs import read_file
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
 from learner.audit import journalled_version
@@ -26,7 +28,8 @@ LOGS = "logs"
 CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
 _MAX_VERSION = 1 << 53
-CHANGEABLE = ("updates", "checkpoint_every", "collapse_patience", "physics", "ppo")
+_MAX_CONFIG = 1 << 20
+CHANGEABLE = ("updates", "checkpoint_every", "write_ahead", "collapse_patience", "physics", "ppo")
 """Fields of the configuration that a run may go on with other values of; actors that are there do not use them."""
 
 
@@ -62,7 +65,7 @@ def open_run(run_dir: pathlib.Path) -> RunConfig:
     """The configuration of a run directory; a CongraspError if it is not one, or the file is damaged."""
     path = run_dir / CONFIG_FILE
     try:
-        text = path.read_bytes()
+        text = read_file(path, _MAX_CONFIG)
     except OSError:
         raise CongraspError(
             f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Name one made by 'congrasp train'."

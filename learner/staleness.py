@@ -114,13 +114,6 @@ class StalenessManager:
         return self._max_staleness
 
     @property
-    def oldest(self) -> int:
-        """Version of the oldest policy whose rollouts are still of use."""
-        source, renamed = self._resumed
-        left = self._max_staleness - (self._version - (renamed or 0))
-        return source - left if left >= 0 else self._version - self._max_staleness
-
-    @property
     def rollouts_per_update(self) -> int:
         """The batch."""
         return self._batch

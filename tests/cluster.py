@@ -30,6 +30,7 @@ from common.wire.schema import RolloutForm
 from learner.audit import AuditLog
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
+from learner.write_ahead import FOLDER, WriteAheadLog
 from services.ops.audit import FAULTS, audit
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -58,7 +59,7 @@ def rollout(steps, value, version):
 # --- the two roles ---
 
 
-def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0):
+def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0, write_ahead=True):
     """Consumes batches and checkpoints after `every` updates, until it is told to stop (SIGTERM) or killed."""
     path = folder / "checkpoint"
     saved = json.loads(path.read_text()) if path.exists() else {"durable": None, "history": [], "version": 0}
@@ -73,6 +74,7 @@ def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0):
             transport, run="chaos", config_json="{}", run_id=epoch, schema="s",
             form=RolloutForm(steps, B, D, A, half=True), staleness=StalenessManager(1, BATCH),
             durable=saved["durable"], audit=AuditLog(folder, "0"),
+            log=WriteAheadLog(folder / FOLDER / "0", 1, write=write_ahead),
         )  # fmt: skip
         save(published, version)
         hub.publish_weights(bundle(version, epoch), version)
@@ -94,7 +96,7 @@ def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0):
             if updates % every == 0:
                 durable = hub.durable()
                 save(path, {"durable": durable, "history": history, "version": version})
-                hub.note_saved(durable)
+                hub.note_saved()
         hub.finish()
         time.sleep(0.5)  # actors hear of it; what is on its way still comes in
         hub.close()

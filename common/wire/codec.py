@@ -107,7 +107,7 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
     """The inverse of `encode`, for bytes that anyone may have sent.
 
     Args:
-      data: the bytes; the arrays of the result are views of them.
+      data: the bytes; the arrays of the result are views of them, and `encode` of it gives them back.
       max_bytes: longer messages are refused.
 
     Raises:
@@ -127,7 +127,9 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
     meta, crc = _metadata(header.pop("__metadata__", None))
     if crc32(section) != crc:
         raise CongraspError("The message's data do not match their checksum.")
-    return Message(_arrays(header, section), meta)
+    message = SharedMessage(_arrays(header, section), meta)
+    vars(message)["encoded"] = data
+    return message
 
 
 def finite(value: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,188 +1,229 @@
-"""How long a small run takes to recover: its processes are killed and stopped, one after another."""
+"""What a run loses when it is killed, stopped, frozen, out of disk and damaged: every kind of fault, many times.
+
+Each kind has a run of its own, which goes on after every fault. Afterwards its journals are judged twice: by `congrasp
+audit`, and by a reader that shares no code with it.
+"""
 
 import contextlib
+import functools
 import pathlib
+import random
+import shutil
 import signal
+import statistics
 import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
-import psutil
 from rich.console import Console
 from rich.table import Table
 
-from common.errors import CongraspError, TransportError
-from common.transport import urls
-from common.transport.keys import Keys
-from common.wire.codec import Message
-from services.ops.audit import audit
+from common.errors import CongraspError
+from services.bench.run_under_test import RunUnderTest, until
+from services.bench.second_reading import Verdict, read_again
+from services.ops.audit import FAULTS as KINDS
+from services.ops.audit import Report, audit
 
-_RUN = "quickstart"
-_SMALL = (
-    *("--updates", "1000000", "--environments", "8", "--rollout-steps", "25", "--checkpoint-every", "1"),
-    *("--objects.count", "2", "--objects.families", "box", "--network.hidden", "32", "--network.encoder", "8"),
-    *("--ppo.epochs", "1", "--ppo.minibatches", "2", "--evaluation", "0", "--collapse-patience", "0"),
-)
-_WINDOW = 10.0  # seconds over which throughput is measured
-_AFTER = 5.0  # seconds after a death
-_DEADLINE = 180.0
-Measure = Callable[[str, float, Callable[[], Any]], None]
-"""Given a name, a time of `time.monotonic`, and what is true once that which is waited for has happened."""
+_DISK = 24 << 20  # bytes of the disk that is filled
+_FROZEN = 4.0  # seconds, longer than a lease
+_FULL = 3.0  # seconds that a disk stays full
+_TRAINS = (0.5, 3.0)  # seconds of training before a fault
+_OPTIONS = ("--checkpoint-every", "2", "--log-rollout-every", "0", "--episode-every", "1000000")
+_RESTARTS = 4  # deaths of one child after which `congrasp train` is started again
+Fault = Callable[[RunUnderTest, random.Random], None]
 
 
-class RunUnderTest:
-    """A run of `congrasp train` and a look at it from outside."""
+class Result(NamedTuple):
+    """What some faults of one kind came to."""
 
-    def __init__(self, process: psutil.Process):
-        """Waits until the run's learner listens."""
-        self._process = process
-        endpoint = _until(lambda: self._argument("learner", "--listen"))
-        self._transport = urls.connect(endpoint, "observer", wait=_DEADLINE)
+    kind: str
+    seconds: list[float]
+    """From each fault, or from when the disk had room again, to the next update."""
+    report: Report
+    second: Verdict
 
-    def _argument(self, role: str, name: str) -> str | None:
-        """An option's value in the command line of the oldest process of a role."""
-        return next((c.cmdline()[c.cmdline().index(name) + 1] for c in self.children(role)), None)
+    @property
+    def fine(self) -> bool:
+        """Whether nothing was lost, duplicated, unmatched or corrupted, in both readings."""
+        first = tuple(self.report.counts[name] for name in Verdict._fields[:4])
+        return first == self.second[:4] == (0, 0, 0, 0)
 
-    def children(self, role: str) -> list[psutil.Process]:
-        """The run's processes of a role, oldest first."""
-        with contextlib.suppress(psutil.NoSuchProcess):
-            return sorted((c for c in self._process.children() if role in c.cmdline()), key=lambda c: c.create_time())
-        return []
 
-    def status(self) -> dict[str, Any]:
-        """The learner's; empty while there is none."""
-        with contextlib.suppress(TransportError):
-            return dict(self._transport.query(Keys(_RUN).status, Message(), timeout=0.5).meta)
-        return {}
+def bench_faults(actors: int, tries: int, kinds: Sequence[str], seed: int = 0) -> bool:
+    """Prints what every kind of fault cost.
 
-    def actors(self) -> dict[str, int]:
-        """Rollouts by incarnation of the actors that are there."""
-        return {r["incarnation"]: r.get("rollouts", 0) for r in self.status().get("roles", ()) if r["role"] == "actor"}
+    Args:
+      actors: actor processes.
+      tries: faults of each kind.
+      kinds: of `FAULTS`; all of them if none is named.
+      seed: of the moments, and of the bits that are flipped.
 
-    def accepted(self) -> int:
-        """Rollouts so far."""
-        return _until(self.status)["ledger"]["accepted"]
+    Returns:
+      Whether it cost nothing that was acknowledged, and both readings agree on that.
 
-    def rate(self) -> float:
-        """Accepted rollouts a second, over a while."""
-        began, before = time.monotonic(), self.accepted()
-        time.sleep(_WINDOW)
-        return (self.accepted() - before) / (time.monotonic() - began)
+    Raises:
+      CongraspError: a kind is unknown; a run did not recover.
+    """
+    if unknown := set(kinds) - FAULTS.keys():
+        raise CongraspError(f"There is no fault '{min(unknown)}'.", f"Choose from: {', '.join(FAULTS)}.")
+    console = Console()
+    results: list[Result] = []
+    for kind in kinds or FAULTS:
+        with tempfile.TemporaryDirectory(prefix="congrasp-") as folder, _disk(folder, kind) as disk:
+            if disk is None:
+                console.print(f"{kind}: left out, for file systems cannot be mounted here.")
+                continue
+            results.append(_measure(kind, RunUnderTest(disk / "run", actors, _OPTIONS), tries, random.Random(seed)))
+        last = results[-1]
+        console.print(f"{kind}: {'nothing lost' if last.fine else last.report.faults[:5]}; {_rest(last)}")
+    console.print(_table(results, actors))
+    return all(result.fine for result in results)
 
-    def close(self) -> None:
-        """Stops looking."""
-        self._transport.close()
+
+def _measure(kind: str, run: RunUnderTest, tries: int, rng: random.Random) -> Result:
+    """Faults of one kind in one run, and the verdict on it."""
+    seconds: list[float] = []
+    try:
+        for number in range(tries):
+            if number % _RESTARTS == 0 and run.alive:
+                run.stop()
+            if not run.alive:
+                run.start()
+            version = until(run.status)["version"]
+            time.sleep(rng.uniform(*_TRAINS))
+            FAULTS[kind](run, rng)
+            began = time.monotonic()
+            if not run.alive:
+                run.start()
+            until(functools.partial(_is_past, run, version + 1))
+            seconds.append(time.monotonic() - began)
+    finally:
+        run.stop()
+    return Result(kind, seconds, audit(run.run_dir), read_again(run.run_dir))
+
+
+def _is_past(run: RunUnderTest, version: int) -> bool:
+    """Whether the learner has published a newer version."""
+    return bool(run.status().get("version", -1) > version)
+
+
+def _stop(number: signal.Signals) -> Fault:
+    """Signals `congrasp train`, and waits until it has ended."""
+
+    def stop(run: RunUnderTest, rng: random.Random) -> None:
+        run.stop(number)
+
+    return stop
+
+
+def _kill_all(run: RunUnderTest, rng: random.Random) -> None:
+    """Kills learner, actors and what started them, all at once."""
+    run.kill()
+
+
+def _kill_child(role: str) -> Fault:
+    """Kills the oldest process of a role."""
+
+    def kill(run: RunUnderTest, rng: random.Random) -> None:
+        run.child(role).kill()
+
+    return kill
+
+
+def _freeze_child(role: str) -> Fault:
+    """Freezes the oldest process of a role for some seconds; its connections stay open and silent."""
+
+    def freeze(run: RunUnderTest, rng: random.Random) -> None:
+        child = run.child(role)
+        child.suspend()
+        time.sleep(_FROZEN)
+        child.resume()
+
+    return freeze
+
+
+def _fill_disk(run: RunUnderTest, rng: random.Random) -> None:
+    """Lets the disk of the run be full for some seconds, and kills all processes at the end of every second time."""
+    filler = run.run_dir.parent / "filler"
+    with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
+        while True:
+            file.write(bytes(4096))
+    time.sleep(_FULL)
+    if rng.random() < 0.5:
+        run.kill()
+    filler.unlink()
+
+
+def _damage(pattern: str, newest: int) -> Fault:
+    """Kills all processes, and flips a bit in one of the `newest` files of a pattern, by their names."""
+
+    def damage(run: RunUnderTest, rng: random.Random) -> None:
+        until(lambda: list(run.run_dir.glob(pattern)))
+        run.kill()
+        if found := sorted(run.run_dir.glob(pattern))[-newest:]:
+            path = rng.choice(found)
+            data = bytearray(path.read_bytes())
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+            path.write_bytes(data)
+
+    return damage
+
+
+FAULTS: dict[str, Fault] = {
+    "sigterm": _stop(signal.SIGTERM),
+    "ctrl-c": _stop(signal.SIGINT),
+    "kill-learner": _kill_child("learner"),
+    "kill-actor": _kill_child("actor"),
+    "kill-all": _kill_all,
+    "freeze-learner": _freeze_child("learner"),
+    "freeze-actor": _freeze_child("actor"),
+    "full-disk": _fill_disk,
+    "damage-checkpoint": _damage("checkpoints/checkpoint_*.safetensors", 1),
+    "damage-accepted": _damage("accepted/*/*.safetensors", 8),
+    "damage-journal": _damage("audit/*.jsonl", 8),
+    "damage-policy": _damage("policy.safetensors", 1),
+}
+"""Kinds of faults by name."""
 
 
 @contextlib.contextmanager
-def _running(run_dir: pathlib.Path, actors: int) -> Iterator[RunUnderTest]:
-    """A run with so many actors that all contribute, while the block runs."""
-    command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(run_dir), "--actors", str(actors)]
-    process = subprocess.Popen([*command, *_SMALL], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def _disk(folder: str, kind: str) -> Iterator[pathlib.Path | None]:
+    """Where a run can be: the folder, or a small disk of its own there; None if that cannot be mounted."""
+    if kind != "full-disk":
+        yield pathlib.Path(folder)
+        return
+    command = ["mount", "-t", "tmpfs", "-o", f"size={_DISK}", "tmpfs", folder]
+    if not shutil.which("mount") or subprocess.run(command, capture_output=True, timeout=10).returncode:
+        yield None
+        return
     try:
-        victim = RunUnderTest(psutil.Process(process.pid))
-        with contextlib.closing(victim):
-            _until(lambda: len(victim.actors()) == actors and min(victim.actors().values()) > 2)
-            yield victim
+        yield pathlib.Path(folder)
     finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(15.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
+        subprocess.run(["umount", "-l", folder], timeout=10, check=True)
 
 
-def _until(look: Callable[[], Any]) -> Any:
-    """What `look` gives once that is something."""
-    deadline = time.monotonic() + _DEADLINE
-    while not (seen := look()):
-        if time.monotonic() > deadline:
-            raise CongraspError(f"Nothing happened within {_DEADLINE:g} s.", "Is the machine busy otherwise?")
-        time.sleep(0.02)
-    return seen
+def _rest(result: Result) -> str:
+    """The outcomes of a kind's rollouts that are no fault, and damage to the journals."""
+    counts = {name: count for name, count in result.report.counts.items() if count}
+    return f"{counts}, lines damaged {result.report.damaged}, missing {result.report.holes}"
 
 
-def bench_faults(actors: int, repeats: int) -> None:
-    """Prints seconds from each fault until it is noticed and until the run has recovered, and the run's audit."""
-    seconds: dict[str, list[float]] = {}
-    shares: list[float] = []
-    starts: list[float] = []
-
-    def measure(what: str, since: float, look: Callable[[], Any]) -> None:
-        _until(look)
-        seconds.setdefault(what, []).append(time.monotonic() - since)
-
-    with tempfile.TemporaryDirectory() as folder:
-        run_dir = pathlib.Path(folder, "run")
-        with _running(run_dir, actors) as run:
-            for _ in range(repeats):
-                share, busy = _kill_actor(run, actors, measure)
-                shares.append(share)
-                starts.append(busy)
-                _stop_actor(run, actors, measure)
-                _kill_learner(run, measure)
-        table = Table("", "median, s", "longest, s", title=f"{actors} actors, {repeats} times each")
-        for what, values in seconds.items():
-            table.add_row(what, f"{sorted(values)[len(values) // 2]:.2f}", f"{max(values):.2f}")
-        console = Console()
-        console.print(table)
-        console.print(
-            f"Throughput in the 5 s after a death, as a share of that before: "
-            f"{', '.join(f'{share:.2f}' for share in shares)} ((N-1)/N is {(actors - 1) / actors:.2f})."
-        )
-        console.print(
-            f"Processor seconds of a replacement until it contributed: {', '.join(f'{x:.1f}' for x in starts)}."
-        )
-        report = audit(run_dir)
-        console.print("Audit:", ", ".join(f"{name} {value}" for name, value in report.counts.items()))
-        console.print(f"Lag: mean {report.lag_mean:.2f}, at most {report.lag_max} of {report.max_staleness}.")
-
-
-def _kill_actor(run: RunUnderTest, actors: int, measure: Measure) -> tuple[float, float]:
-    """Kills the oldest actor; returns the throughput of the next seconds as a share of that before, and the processor
-    seconds that its replacement took until it contributed."""
-    before, known = run.rate(), run.actors()
-    run.children("actor")[0].kill()
-    killed = time.monotonic()
-    measure("actor killed: noticed", killed, lambda: len(run.actors()) < actors)
-    counted, since = run.accepted(), time.monotonic()
-    measure("actor killed: next rollout of the others", killed, lambda: run.accepted() > counted)
-    time.sleep(max(0.0, killed + _AFTER - time.monotonic()))
-    share = (run.accepted() - counted) / (time.monotonic() - since) / before
-    measure("actor killed: replacement contributes", killed, lambda: _new_contributes(run, known))
-    times = run.children("actor")[-1].cpu_times()
-    return share, times.user + times.system
-
-
-def _stop_actor(run: RunUnderTest, actors: int, measure: Measure) -> None:
-    """Stops the oldest actor, whose links then stay open and silent, until that is noticed."""
-    victim, known = run.children("actor")[0], run.actors()
-    victim.suspend()
-    halted = time.monotonic()
-    measure("actor stopped, its link silent: noticed", halted, lambda: len(run.actors()) < actors)
-    victim.resume()
-    measure("actor goes on: contributes", time.monotonic(), lambda: _all_contribute(run, known))
-
-
-def _kill_learner(run: RunUnderTest, measure: Measure) -> None:
-    """Kills the learner, whose actors must survive it."""
-    pids, version = {child.pid for child in run.children("actor")}, _until(run.status)["version"]
-    run.children("learner")[0].kill()
-    # The first version of the new session is the checkpoint's policy, the second is new.
-    measure("learner killed: an update later", time.monotonic(), lambda: run.status().get("version", -1) > version + 2)
-    if {child.pid for child in run.children("actor")} != pids:
-        raise CongraspError("An actor did not survive the learner's restart.")
-
-
-def _new_contributes(run: RunUnderTest, known: Collection[str]) -> bool:
-    """Whether an actor that was not known has made a rollout."""
-    return any(count for name, count in run.actors().items() if name not in known)
-
-
-def _all_contribute(run: RunUnderTest, before: dict[str, int]) -> bool:
-    """Whether every actor has made rollouts since."""
-    now = run.actors()
-    return bool(now) and all(now.get(name, 0) > count for name, count in before.items())
+def _table(results: Sequence[Result], actors: int) -> Table:
+    """A row for each kind: both verdicts where they differ."""
+    columns = ("tries", "accepted", "survived", *KINDS, "damaged on disk", "median, s", "longest, s")
+    table = Table("fault", title=f"{actors} actors")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for kind, seconds, report, second in results:
+        counts = report.counts
+        verdicts = [
+            f"{counts[name]}" + (f" ({other})" if (other := getattr(second, name)) != counts[name] else "")
+            for name in KINDS
+        ]
+        survived = counts["used"] + counts.get("waiting", 0)
+        numbers = [len(seconds), counts["accepted"], survived, *verdicts, counts.get("damaged on disk", 0)]
+        times = [f"{statistics.median(seconds):.1f}", f"{max(seconds):.1f}"]
+        table.add_row(kind, *map(str, numbers), *times)
+    return table

@@ -5,6 +5,7 @@ with theirs, in processes of their own over the loopback interface.
 """
 
 import contextlib
+import functools
 import json
 import multiprocessing
 import pathlib
@@ -30,6 +31,7 @@ from common.wire.schema import RolloutForm
 from learner.audit import AuditLog
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
+from learner.write_ahead import FOLDER, WriteAheadLog
 
 _FORM = RolloutForm(steps=20, worlds=340, observation=534, action=26, half=True)
 """Of the human hand's rollouts; these have 8.0 MB."""
@@ -43,10 +45,12 @@ _WEIGHTS_MB = 4.0
 
 def bench_transport(senders: int, seconds: float, repeats: int, actors: int, versions: int) -> None:
     """Prints the throughput of rollouts beside both references, and the delays of weights."""
-    ours, queries, bare = measure_ingest(senders, seconds, repeats)
+    ours, on_disk, queries, bare = measure_ingest(senders, seconds, repeats)
     print(
         f"rollouts of 8 MB: {ours:.0f} MB/s into the learner, {queries:.0f} MB/s as bare Zenoh queries, "
-        f"{bare:.0f} MB/s by PUSH/PULL (ratios {ours / queries:.2f} and {ours / bare:.2f})",
+        f"{bare:.0f} MB/s by PUSH/PULL (ratios {ours / queries:.2f} and {ours / bare:.2f})\n"
+        f"with all of them on disk first, and a checkpoint after each update: {on_disk:.0f} MB/s "
+        f"(ratio {on_disk / ours:.2f})",
         flush=True,
     )
     delays = measure_weights(actors, versions, _WEIGHTS_MB)
@@ -58,8 +62,9 @@ def bench_transport(senders: int, seconds: float, repeats: int, actors: int, ver
 
 
 def measure_ingest(senders: int, seconds: float, repeats: int) -> list[float]:
-    """MB/s into a learner, by bare Zenoh queries and by bare sockets: medians of `repeats` alternating measurements."""
-    ways = _through_the_hub, _through_queries, _through_sockets
+    """MB/s into a learner, into one that writes all rollouts to its disk first, by bare Zenoh queries and by bare
+    sockets: medians of `repeats` alternating measurements."""
+    ways = _through_the_hub, functools.partial(_through_the_hub, write_ahead=True), _through_queries, _through_sockets
     rates = [[way(senders, seconds) for way in ways] for _ in range(repeats)]
     return [statistics.median(each) for each in zip(*rates, strict=True)]
 
@@ -98,7 +103,7 @@ def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]
 
 
 @contextlib.contextmanager
-def _learner(folder: pathlib.Path) -> Iterator[tuple[LearnerHub, str]]:
+def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tuple[LearnerHub, str]]:
     """A learner's hub without a learner, and where it listens."""
     endpoint = local_url()
     with urls.listen(endpoint, "learner") as transport:
@@ -111,6 +116,7 @@ def _learner(folder: pathlib.Path) -> Iterator[tuple[LearnerHub, str]]:
             form=_FORM,
             staleness=StalenessManager(1, _BATCH),
             audit=AuditLog(folder, "0"),
+            log=WriteAheadLog(folder / FOLDER, 1, write=write_ahead),
         )
         yield hub, endpoint
         hub.close()
@@ -132,10 +138,13 @@ def _rollout() -> Message:
     return Message(arrays, {"version": 0, "schema": _SCHEMA, "steps": _FORM.steps * _FORM.worlds})
 
 
-def _through_the_hub(senders: int, seconds: float) -> float:
-    """MB/s through the learner's hub."""
+def _through_the_hub(senders: int, seconds: float, *, write_ahead: bool = False) -> float:
+    """MB/s through the learner's hub; with `write_ahead` there is a checkpoint (of nothing) after each update."""
     size, weights = len(encode(_rollout())), np.zeros(1000, np.float32)
-    with tempfile.TemporaryDirectory() as name, _learner(folder := pathlib.Path(name)) as (hub, endpoint):
+    with (
+        tempfile.TemporaryDirectory() as name,
+        _learner(folder := pathlib.Path(name), write_ahead=write_ahead) as (hub, endpoint),
+    ):
         hub.publish_weights(_bundle(0, weights), 0)
         version = 0
 
@@ -146,6 +155,9 @@ def _through_the_hub(senders: int, seconds: float) -> float:
                 return 0
             version += 1
             hub.publish_weights(_bundle(version, weights), version)
+            if write_ahead:
+                hub.durable()
+                hub.note_saved()
             return size * len(batch)
 
         with _processes(senders, _upload, endpoint, folder):

@@ -123,16 +123,35 @@ def staleness(lag: int = 4, seeds: int = 5, updates: int = 40, worlds: int = 32)
     return 0
 
 
-def faults(actors: int = 3, repeats: int = 3) -> int:
+def faults(actors: int = 2, tries: int = 20, kinds: tuple[str, ...] = (), seed: int = 0) -> int:
+    """What kills, stops, freezes, full disks and damaged files cost a real run of what it had acknowledged: nothing.
+
+    Every kind of fault has a run of its own, whose journals are read twice, by code that has nothing in common. The
+    exit code is 1 if anything was lost, duplicated, unmatched or corrupted.
+
+    Args:
+      actors: Actor processes.
+      tries: Faults of each kind.
+      kinds: Kinds of faults: sigterm, ctrl-c, kill-learner, kill-actor, kill-all, freeze-learner, freeze-actor,
+        full-disk (which needs the right to mount), damage-checkpoint, damage-accepted (rollouts), damage-journal,
+        damage-policy. All of them if none is named.
+      seed: Seed of the moments, and of the bits that are flipped.
+    """
+    from services.bench.faults import bench_faults
+
+    return 0 if bench_faults(actors, tries, kinds, seed) else 1
+
+
+def recovery(actors: int = 3, repeats: int = 3) -> int:
     """Seconds until a run notices and gets over killed and stopped actors and a killed learner, and its audit.
 
     Args:
       actors: Actor processes.
       repeats: How often each is killed.
     """
-    from services.bench.faults import bench_faults
+    from services.bench.recovery import bench_recovery
 
-    bench_faults(actors, repeats)
+    bench_recovery(actors, repeats)
     return 0
 
 
@@ -195,6 +214,7 @@ COMMANDS = {
     "transport": transport,
     "staleness": staleness,
     "faults": faults,
+    "recovery": recovery,
     "recording": recording,
     "scaling": scaling,
 }

@@ -1,5 +1,6 @@
 """`congrasp train`: a learner and its actors on this machine."""
 
+import dataclasses
 import pathlib
 import time
 from typing import Annotated, Any
@@ -8,6 +9,7 @@ import tyro
 
 import actors.physics  # noqa: F401 - registers the engines that --physics offers
 from common.config import MetricWriter, RunConfig, Split
+from common.inputs import file_name
 from common.task.methods import with_method
 from learner.run_directory import CONFIG_FILE, open_run
 from services.train.presets import get_preset, with_hand
@@ -67,9 +69,13 @@ def train(
     from services.train.command import run_training
 
     config = with_hand(config if method is None else with_method(config, method), hand)
+    if constraints is not None or split is not None:
+        given = {"constraints": str(constraints)} if constraints else {}
+        objects = dataclasses.replace(config.objects, **given, split=split or config.objects.split)
+        config = dataclasses.replace(config, objects=objects)
     return run_training(
         config,
-        run_dir or pathlib.Path("runs") / f"{config.name}-{time.strftime('%Y%m%d-%H%M%S')}",
+        run_dir or pathlib.Path("runs") / f"{file_name(config.name, 'a run')}-{time.strftime('%Y%m%d-%H%M%S')}",
         actors=actors,
         resume=resume,
         initial=initial,

@@ -9,6 +9,7 @@ as not in the journals.
 """
 
 import collections
+import dataclasses
 import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -54,7 +55,8 @@ class Report(NamedTuple):
     @property
     def exit_code(self) -> int:
         """0 if nothing was found, else that of the gravest kind."""
-        kinds = {FAULTS[name] for name in FAULTS if self.counts[name]} | ({"damage"} if self.damaged else set())
+        damaged = self.damaged or self.counts.get("damaged on disk")
+        kinds = {FAULTS[name] for name in FAULTS if self.counts[name]} | ({"damage"} if damaged else set())
         return next((code for kind, code in EXIT_CODES.items() if kind in kinds), 0)
 
 
@@ -117,40 +119,83 @@ def _made(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
     return made
 
 
-class _Outcomes(NamedTuple):
-    """What the learner's sessions did with rollouts."""
+@dataclasses.dataclass
+class _Session:
+    """What a session of a learner began with, and what it noted of rollouts that it did not use."""
 
-    sessions: list[dict[str, Any]]
-    running: set[str]
-    """Sessions that have not noted their end."""
+    life: str
+    epoch: str
+    version: int
+    max_staleness: int
+    kept: bool
+    """What it accepted was on disk before it was acknowledged; older versions of congrasp kept nothing."""
+    falls_back: bool
+    """It began from an earlier checkpoint than the newest, which was damaged or gone."""
+    started: bool
+    """It took up what was on disk, from when on it accepts."""
+    taken: set[Identity] = dataclasses.field(default_factory=set)
+    unwritten: set[Identity] = dataclasses.field(default_factory=set)
+    waiting: set[Identity] | None = None
+    """What waited at its end; None while it runs, or if it was killed."""
+
+    def had(self, identity: Identity, accepted_by: set[str]) -> bool:
+        """Whether it accepted a rollout, or took it up from an earlier session."""
+        return self.life in accepted_by or identity in self.taken
+
+
+class _Outcomes(NamedTuple):
+    """What the learners did with rollouts."""
+
+    books: list[list[_Session]]
+    """The sessions of each."""
     standing: dict[Identity, list[Used]]
     undone: set[Identity]
     dropped: set[Identity]
-    waiting: set[Identity]
+    spoilt: set[Identity]
 
 
 def _outcomes(books: Iterable[list[dict[str, Any]]]) -> _Outcomes:
     """The outcomes of which the learners' journals tell."""
-    found = _Outcomes([], set(), collections.defaultdict(list), set(), set(), set())
+    found = _Outcomes([], collections.defaultdict(list), set(), set(), set())
     for book in books:
-        begun = [entry for entry in book if "life" in entry]
-        found.sessions.extend(begun)
-        if begun and "end" not in book[-1]:
-            found.running.add(begun[-1]["life"])
+        found.books.append(_sessions(book))
         stands, lost = replay(book)
         for use in stands:
             found.standing[use.actor, use.incarnation, use.sequence].append(use)
         found.undone.update((use.actor, use.incarnation, use.sequence) for use in lost)
         for entry in book:
-            found.dropped.update((a, i, s) for a, i, s in entry.get("dropped", ()))
-            found.waiting.update((a, i, s) for a, i, s in entry.get("end", ()))
+            found.dropped.update(_rows(entry, "dropped"))
+            found.spoilt.update(_rows(entry, "spoilt"))
     return found
+
+
+def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
+    """The sessions of one learner, in their order, without those that were killed before they took anything up."""
+    sessions: list[_Session] = []
+    saved = -1
+    for entry in book:
+        if "life" in entry:
+            begin = entry["life"], entry["epoch"], entry["version"], entry["max_staleness"]
+            kept = entry.get("kept") is True
+            sessions.append(_Session(*begin, kept, entry["version"] < saved, started=not kept))
+        saved = entry.get("saved", entry["version"] if "life" in entry else saved)
+        if sessions:
+            sessions[-1].started |= "taken" in entry
+            sessions[-1].taken.update(_rows(entry, "taken"))
+            sessions[-1].unwritten.update(_rows(entry, "unwritten"))
+            if "end" in entry:
+                sessions[-1].waiting = _rows(entry, "end")
+    return [session for session in sessions if session.started]
+
+
+def _rows(entry: dict[str, Any], name: str) -> set[Identity]:
+    """The rollouts that a field of a line names."""
+    return {(actor, incarnation, sequence) for actor, incarnation, sequence in entry.get(name, ())}
 
 
 def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals: Sequence[JournalLines]) -> Report:
     """Judges every rollout by what its actor was told and by what the learner's sessions did with it."""
-    sessions, running, standing, undone, dropped, waiting = found
-    begun = {session["life"] for session in sessions}
+    standing = found.standing
     counts = collections.Counter({"made": len(made)})
     faults: list[str] = []
 
@@ -179,37 +224,50 @@ def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals
             counts["used, answer lost" if identity in standing else outcomes[-1] if outcomes else "unanswered"] += 1
             continue
         counts["accepted"] += 1
-        if identity in standing:
-            counts["used"] += 1
-        elif identity in dropped:
-            counts["dropped as too old"] += 1
-        elif outcomes[-1] == "stale" or _too_old_to_return(rollout, sessions):
-            counts["undone" if identity in undone else "too old after a restart"] += 1
-        elif identity in undone:
-            counts["undone"] += 1
-        elif identity in waiting or rollout.answers[-1][1] in running:
-            counts["waiting"] += 1
-        elif any(gaps) or not {session for _, session in rollout.answers} <= begun:
-            counts["not in the journals"] += 1
-        else:
+        outcome = _outcome(identity, rollout, found)
+        if outcome == "lost" and any(gaps):
+            outcome = "not in the journals"
+        if outcome == "lost":
             fault("lost", identity, "accepted, and never seen again")
+        else:
+            counts[outcome] += 1
     lags = [use.lag for uses in standing.values() for use in uses]
     return Report(
         dict(counts) | {name: counts[name] for name in FAULTS},
         faults,
         sum(lags) / max(1, len(lags)),
         max(lags, default=0),
-        max((session["max_staleness"] for session in sessions), default=0),
+        max((session.max_staleness for book in found.books for session in book), default=0),
         sum(journal.lost for journal in journals),
         sum(journal.damaged for journal in journals),
         sum(journal.unchecked for journal in journals),
     )
 
 
-def _too_old_to_return(rollout: Made, sessions: Sequence[dict[str, Any]]) -> bool:
-    """Whether the checkpoint after the session that accepted a rollout is too far from the rollout's policy."""
-    order = [session["life"] for session in sessions]
-    after = order.index(rollout.answers[-1][1]) + 1 if rollout.answers[-1][1] in order else len(sessions)
-    return any(
-        abs(rollout.version - session["version"]) > session["max_staleness"] for session in sessions[after : after + 1]
-    )
+def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
+    """What became of an accepted rollout, by the last session that had it and the one that followed."""
+    if identity in found.standing:
+        return "used"
+    if identity in found.dropped:
+        return "dropped"
+    if identity in found.spoilt:
+        return "damaged on disk"
+    accepted_by = {life for outcome, life in rollout.answers if outcome in ("accepted", "duplicate")}
+    for book in found.books:
+        had = [n for n, session in enumerate(book) if session.had(identity, accepted_by)]
+        if not had:
+            continue
+        last, after = book[had[-1]], book[had[-1] + 1 : had[-1] + 2]
+        if not after:
+            return "waiting" if last.waiting is None or identity in last.waiting else "lost"
+        return _without_trace(identity, rollout.version, last, after[0], undone=identity in found.undone)
+    return "not in the journals"
+
+
+def _without_trace(identity: Identity, version: int, last: _Session, after: _Session, *, undone: bool) -> str:
+    """Why the session after the last that had a rollout did not take it up; it is lost if there is no reason."""
+    if abs(version - after.version) > after.max_staleness or after.epoch != last.epoch:
+        return "undone" if undone else "too old after a restart"
+    if not last.kept or identity in last.unwritten or after.falls_back:
+        return "undone" if undone else "not kept on disk"
+    return "lost"

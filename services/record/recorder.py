@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from common.inputs import file_name
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message
@@ -58,7 +59,8 @@ class Recorder:
           max_seconds: see `LogWriter`.
           warn: takes a line about what goes wrong.
         """
-        self._writer = LogWriter(directory, name, run=run, max_seconds=max_seconds) if directory else None
+        begin = file_name(name, "a recording")
+        self._writer = LogWriter(directory, begin, run=run, max_seconds=max_seconds) if directory else None
         self._subscription = transport.subscribe(Keys(run).logs, depth=depth)
         self._sinks, self._warn = tuple(sinks), warn
         self._convert = Converter()

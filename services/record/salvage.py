@@ -7,6 +7,7 @@ has a CRC-32 of its uncompressed records. Where a record cannot be one, reading 
 import dataclasses
 import io
 import struct
+import zlib
 from collections.abc import Iterator
 from typing import BinaryIO
 
@@ -14,16 +15,19 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
+from mcap.reader import FOOTER_SIZE, make_reader
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-_DAMAGE = (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError)
+DAMAGE = (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError)
+"""What the `mcap` package raises on damaged files."""
 _FRAME = struct.Struct("<BQ")
 _ZSTD = b"\x04\x00\x00\x00zstd"
 _ZSTD_AT = _FRAME.size + 28  # in a chunk's record; before it are times, size and CRC, after it the data's length
 _HEAD = _ZSTD_AT + len(_ZSTD) + 8
+_FOOTER, _CRC = struct.Struct("<QQI"), struct.Struct("<I")
 _LIMIT = 1 << 30
 _BLOCK = 1 << 20
 _PLACES = 5
@@ -87,7 +91,9 @@ def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | N
             elif isinstance(record, Message):
                 if record.channel_id not in channels and not asked:  # it was in a chunk that is damaged
                     asked = True
-                    _add_from_summary(file, schemas, channels)
+                    if summary := intact_summary(file):
+                        schemas.update({**summary.schemas, **schemas})
+                        channels.update({**summary.channels, **channels})
                 if record.channel_id not in channels:
                     dropped.messages += 1
                     continue
@@ -134,7 +140,7 @@ def _chunk(whole: bytes) -> list[McapRecord] | None:
         if compressed and max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data)) > _LIMIT:
             return None
         return breakup_chunk(chunk, validate_crc=True)
-    except _DAMAGE:
+    except DAMAGE:
         return None
 
 
@@ -145,7 +151,7 @@ def _parse(opcode: int, content: bytes) -> list[McapRecord] | None:
         if opcode == Opcode.MESSAGE:
             return [Message.read(stream, len(content))]
         return [Schema.read(stream) if opcode == Opcode.SCHEMA else Channel.read(stream)]
-    except _DAMAGE:
+    except DAMAGE:
         return None
 
 
@@ -175,16 +181,17 @@ def _is_cut(file: BinaryIO, position: int, size: int) -> bool:
     return bool(Opcode.HEADER <= opcode <= Opcode.DATA_END) and position + _FRAME.size + length > size
 
 
-def _add_from_summary(file: BinaryIO, schemas: dict[int, Schema], channels: dict[int, Channel]) -> None:
-    """Adds the schemas and channels that a finished file repeats at its end."""
+def intact_summary(file: BinaryIO) -> Summary | None:
+    """The summary at the end of a finished file; None if there is none, or it does not match its checksum."""
+    end = file.seek(0, io.SEEK_END) - FOOTER_SIZE - len(MCAP0_MAGIC)
     try:
+        start, _, crc = _FOOTER.unpack_from(_read(file, max(0, end), FOOTER_SIZE), _FRAME.size)
+        # The checksum covers the summary and the footer up to the checksum itself.
+        covered = _read(file, start, end + FOOTER_SIZE - _CRC.size - start) if 0 < start < end else b""
         file.seek(0)
-        summary = make_reader(file).get_summary()
-    except _DAMAGE:
-        return
-    if summary is not None:
-        schemas.update({**summary.schemas, **schemas})
-        channels.update({**summary.channels, **channels})
+        return make_reader(file).get_summary() if covered and zlib.crc32(covered) == crc else None
+    except DAMAGE:
+        return None
 
 
 def _read(file: BinaryIO, position: int, count: int) -> bytes:

@@ -107,7 +107,6 @@ def _actor_thread(
                     physics=physics,
                     threads=os.cpu_count() or 1,
                     patience=ROUND_SECONDS,
-                    keep=False,
                 )
         except BaseException as error:
             failures.append(error)

@@ -22,7 +22,7 @@ class Learner:
 
     def __init__(self, hub, *, epoch="e", life="1"):
         self.transport = MemoryTransport(hub)
-        self.state = {"version": 0, "oldest": -1, "saved": [-1, 1], "epoch": epoch, "life": life, "finished": False}
+        self.state = {"version": 0, "epoch": epoch, "life": life, "finished": False}
         self.granted = True
         self.outcomes = []  # what rollouts are told, the last one for ever
         self.received = []
@@ -314,25 +314,3 @@ def test_liveliness(ends):
     hub, make = ends
     link = make()
     assert hub.tokens == [KEYS.alive("actor", "a", link.incarnation)]
-
-
-def test_a_new_life_is_sent_what_the_old_one_may_have_lost(ends):
-    """The old life saved version 4 and is at 9: rollouts of 3 to 5 and from 8 on are of use to the next one."""
-    hub, make = ends
-    learner, link = Learner(hub), make()
-    learner.state |= {"version": 9, "oldest": 8, "saved": [3, 5]}
-    link.config(5)
-    for version in range(2, 10):
-        message = Message({"reward": np.full(3, version)}, {"version": version, "schema": "s", "steps": 3})
-        link.upload(message, TICKET).result(5)
-    link.acquire_ticket(5)
-    learner.outcomes = ["retry", "retry", "duplicate", "stale", "accepted"]
-    learner.received.clear()
-    learner.announce(life="2")
-    eventually(lambda: learner.received)
-    assert link.acquire_ticket(5).version == 9
-    assert [message.meta["version"] for message in learner.received[2:]] == [3, 4, 5, 8, 9]  # before any ticket
-    assert {message.arrays["reward"][0] for message in learner.received} == {3, 4, 5, 8, 9}
-    learner.announce(life="3")
-    eventually(lambda: len(learner.received) >= 7 + 4)
-    assert sorted(message.meta["version"] for message in learner.received[7:]) == [3, 5, 8, 9]  # 4 was stale

@@ -25,11 +25,11 @@ from tests.learner.test_process import CONFIG, MadeUpActor
 
 @pytest.fixture
 def disk(tmp_path):
-    """A file system of 400 kB."""
+    """A file system of 800 kB."""
     place = tmp_path / "disk"
     place.mkdir()
     mount = shutil.which("mount") or "mount"
-    command = [mount, "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)]
+    command = [mount, "-t", "tmpfs", "-o", "size=800k", "tmpfs", str(place)]
     if not shutil.which("mount") or subprocess.run(command, capture_output=True, timeout=10).returncode:
         pytest.skip("file systems cannot be mounted here")
     yield place

@@ -9,7 +9,11 @@ import time
 
 import pytest
 
+from common.journal import AUDIT, read_journal
 from common.wire.codec import Message
+from learner.write_ahead import FOLDER
+from services.bench.second_reading import read_again
+from services.ops.audit import audit
 from tests.cluster import KEYS, Proxy, T, rollout
 
 pytestmark = pytest.mark.timeout(90)
@@ -24,7 +28,7 @@ def contributions(status):
 
 
 def test_a_killed_learner_costs_nobody_a_rollout(cluster):
-    """Killed with rollouts in its queue and in its update, each time; actors send them again, and all are used."""
+    """Killed with rollouts in its queue and in its update, each time; the next takes them up, and all are used."""
     cluster.options["pause"] = 0.05
     learner = cluster.start_learner()
     for name in ("a", "b"):
@@ -37,8 +41,67 @@ def test_a_killed_learner_costs_nobody_a_rollout(cluster):
         learner = cluster.start_learner()
     cluster.wait_for_updates(3)
     final, counts = cluster.stop(learner)
-    assert counts["used"] + counts.get("waiting", 0) + counts.get("dropped as too old", 0) == counts["accepted"]
+    assert counts["used"] + counts.get("waiting", 0) + counts.get("dropped", 0) == counts["accepted"]
     assert final["ledger"]["missing"] <= counts.get("unanswered", 0)
+
+
+def taken_up(folder):
+    """Rollouts that sessions of the learner took up from those before them."""
+    lines = read_journal(folder / AUDIT / "learner-0.jsonl").intact
+    return [tuple(rollout) for line in lines for rollout in line.get("taken", ())]
+
+
+def test_what_was_acknowledged_survives_the_death_of_learner_and_actors_together(cluster):
+    """Nobody is left who could send anything again; others go on in their place."""
+    cluster.options["pause"] = 0.05
+    for attempt in range(3):
+        learner = cluster.start_learner(every=2)
+        actors = [cluster.start_actor(f"{name}{attempt}") for name in "ab"]
+        cluster.wait_for_updates(4)
+        cluster.wait(lambda status: status["queue"]["length"])
+        for process in (*actors, learner):
+            process.kill()
+        learner.wait(5)
+    learner = cluster.start_learner()
+    cluster.start_actor("last")
+    cluster.wait(lambda status: contributions(status).get("last", 0) > 2)
+    cluster.stop(learner)
+    assert len({actor for actor, *_ in taken_up(cluster.folder)}) >= 3
+    assert read_again(cluster.folder)[:4] == (0, 0, 0, 0)
+
+
+def test_an_accepted_rollout_that_is_damaged_on_disk_is_neither_used_nor_called_lost(cluster):
+    learner = cluster.start_learner(pause=1.0)
+    actor = cluster.start_actor()
+    cluster.wait(lambda status: status["queue"]["length"] >= 2)
+    for process in (actor, learner):
+        process.kill()
+        process.wait(5)
+    lines = read_journal(cluster.folder / AUDIT / "a.jsonl").intact
+    last = max(line["answer"] for line in lines if line.get("outcome") == "accepted")
+    (kept,) = (cluster.folder / FOLDER / "0").glob(f"*~a~*~{last}.safetensors")
+    kept.write_bytes(kept.read_bytes()[:-1] + b"?")
+    learner = cluster.start_learner()
+    cluster.start_actor("b")
+    cluster.wait(lambda status: contributions(status).get("b", 0) > 2)
+    _, counts = cluster.stop(learner)
+    assert counts["damaged on disk"] == 1 and ("a", last) not in {(a, n) for a, _, n in taken_up(cluster.folder)}
+    assert audit(cluster.folder).exit_code == 6
+    assert kept.with_name(kept.name + ".aside").exists()
+
+
+def test_without_a_write_ahead_log_a_killed_learner_takes_along_what_it_had(cluster):
+    learner = cluster.start_learner(pause=0.5, write_ahead=False)
+    cluster.start_actor()
+    cluster.wait_for_updates(2)
+    cluster.wait(lambda status: status["queue"]["length"])
+    learner.kill()
+    learner.wait(5)
+    assert not (cluster.folder / FOLDER).exists()
+    learner = cluster.start_learner(write_ahead=False)
+    cluster.wait_for_updates(2)
+    _, counts = cluster.stop(learner)
+    assert counts.get("not kept on disk", 0) + counts.get("undone", 0) >= 1
 
 
 def test_updates_that_die_before_a_checkpoint_are_undone_and_counted(cluster):

@@ -13,6 +13,8 @@ import psutil
 import pytest
 
 from common.policy import bundle as bundles
+from services.bench.second_reading import read_again
+from services.ops.audit import audit
 from services.record.reader import read_episodes, read_metrics, read_rollouts
 
 pytestmark = pytest.mark.timeout(600)
@@ -80,6 +82,7 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path):
     assert process.returncode == 0, output
     assert "actor-0 died" in output or "actor-1 died" in output
     assert "learner died" in output
+    assert audit(run_dir).exit_code == 0 and read_again(run_dir)[:4] == (0, 0, 0, 0)
     policy = bundles.load(run_dir / "policy.safetensors")
     assert policy.transitions == UPDATES * 2 * 4 * 75
     metrics = read_metrics(run_dir)
@@ -92,18 +95,22 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path):
     assert json.loads((run_dir / "config.json").read_text())["updates"] == UPDATES
 
 
-def test_ctrl_c_drains_within_seconds_and_leaves_nobody_behind(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_within_seconds_and_costs_nothing_that_was_accepted(tmp_path, number):
     run_dir = tmp_path / "run"
     command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(run_dir), *SMALL]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
-        _eventually(lambda: len(_children(process, "actor")) == 2, 60, process)
+        _eventually(lambda: _version(run_dir) >= 2, 300, process)
         family = psutil.Process(process.pid).children(recursive=True)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         process.communicate(timeout=20)
     finally:
         if process.poll() is None:
             process.kill()
-    assert process.returncode == 130
+    assert process.returncode == 128 + number
     _, alive = psutil.wait_procs(family, timeout=5)
     assert not alive
+    report = audit(run_dir)
+    assert report.exit_code == 0 and report.counts["used"] >= 4
+    assert read_again(run_dir)[:4] == (0, 0, 0, 0)

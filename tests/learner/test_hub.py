@@ -18,6 +18,7 @@ from learner.batch import collate
 from learner.deduplication import Sequences
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
+from learner.write_ahead import PART, WriteAheadLog
 
 pytestmark = pytest.mark.timeout(30)
 KEYS = Keys("test")
@@ -294,7 +295,7 @@ def test_weights_are_pulled_by_version(bench):
     notices = b.peer.subscribe(KEYS.announcement, depth=4)
     b.hub.publish_weights(bundle(0), 0)
     assert notices.receive(5)[1].meta == {
-        "version": 0, "oldest": -1, "saved": [-1, 1], "epoch": "e", "life": b.hub.session_id, "finished": False,
+        "version": 0, "epoch": "e", "life": b.hub.session_id, "finished": False,
     }  # fmt: skip
     pulled = b.peer.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5)
     assert pulled.meta == bundle(0).meta and pulled.arrays["actor/w"][0] == 0
@@ -441,18 +442,134 @@ def _header(sequence):
     return RolloutHeader("a", "01", sequence, 0, "e", "s", 1)
 
 
-def test_a_resumed_learner_waits_for_what_was_accepted_before_and_uses_the_oldest_first(bench):
-    b = bench(batch=2)
+@pytest.fixture
+def log(tmp_path):
+    return lambda **options: WriteAheadLog(tmp_path / "log", 1, **options)
+
+
+def on_disk(log):
+    """Sequences of the rollouts on disk, in the order of their acceptance."""
+    return [int(path.stem.split("~")[3]) for path in sorted(log._folder.glob("*.safetensors"))]
+
+
+def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(bench, log):
+    b = bench(batch=2, log=log(), durable={**bench().hub.durable(), "version": 3})
     b.hub.publish_weights(bundle(3), 3)
-    resumed = bench(batch=2, durable=b.hub.durable())
-    resumed.hub.publish_weights(bundle(5), 5)  # 4 died with the first session, and 5 is 3 under another number
-    assert not resumed.ticket()["granted"]
-    versions = [4, 4, 3, 3, 2, 2]  # more than there are tickets for, none of which they have any more
-    assert {resumed.send(i, version=version)["outcome"] for i, version in enumerate(versions)} == {"accepted"}
-    assert resumed.send(9, version=1)["outcome"] == "stale"
+    for i, version in enumerate((3, 2, 3, 2)):
+        assert b.send(i, version=version)["outcome"] == "accepted"
+        assert on_disk(b.hub._log) == list(range(i + 1))  # before it is acknowledged
+    assert sequences(b.hub.next_batch(2, 1)) == [1, 3]
+    b.hub.publish_weights(bundle(4), 4)
+    assert b.send(4, version=4)["outcome"] == "accepted"
+    b.hub.publish_weights(bundle(5), 5)
+    assert b.send(5, version=5)["outcome"] == "accepted"  # two versions from the checkpoint: of no use to a resume
+    assert on_disk(b.hub._log) == [0, 1, 2, 3, 4]
+
+    resumed = bench(batch=2, log=log(), durable={**bench().hub.durable(), "version": 3})
+    resumed.hub.publish_weights(bundle(7), 7)  # which is 3 under another number
+    assert resumed.ledger()["queued"] == 5 and not resumed.ticket()["granted"]
+    assert resumed.send(1, version=2)["outcome"] == "duplicate"
     batches = []
-    for version in (6, 7, 8):
-        batches.append(sequences(resumed.hub.next_batch(2, 5 if version < 8 else 0.05) or []))
+    for version in (8, 9, 10):
+        batches.append(sequences(resumed.hub.next_batch(2, 5 if version < 10 else 0.05) or []))
         resumed.hub.publish_weights(bundle(version), version)
-    assert batches == [[0, 1], [2, 3], []]  # of 4 and 2, one update away from 3, only one batch could be used
-    assert resumed.ticket()["granted"]
+    assert batches == [[1, 3], [0, 2], []]  # of 2 and 4, one update away from 3, only one batch could be used
+    assert resumed.ledger()["dropped"] == 1 and resumed.ticket()["granted"]
+
+
+def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
+    b = bench(batch=2, log=log())
+    b.hub.publish_weights(bundle(5), 5)
+    for i in range(3):
+        assert b.send(i, version=5)["outcome"] == "accepted"
+    assert on_disk(b.hub._log) == []  # there is no checkpoint from which these would be fresh
+    assert sequences(b.hub.next_batch(2, 1)) == [0, 1]
+    b.hub.publish_weights(bundle(6), 6)
+    durable = b.hub.durable()
+    assert on_disk(b.hub._log) == [2]
+    assert b.send(3, version=6)["outcome"] == "accepted"  # while the checkpoint is written
+    b.hub.note_saved()
+    assert on_disk(b.hub._log) == [2, 3]
+
+    resumed = bench(batch=2, log=log(), durable=durable)
+    resumed.hub.publish_weights(bundle(6), 6)
+    assert sequences(resumed.hub.next_batch(2, 1)) == [2, 3]
+    resumed.hub.publish_weights(bundle(7), 7)
+    resumed.hub.durable()
+    assert on_disk(resumed.hub._log) == [2, 3]  # the checkpoint might yet fail
+    resumed.hub.note_saved()
+    assert on_disk(resumed.hub._log) == []
+
+
+def test_nothing_is_acknowledged_before_it_is_written(bench, log):
+    """Neither what is accepted, nor the same that is sent again meanwhile, nor after the end was noted."""
+    written, slow = threading.Event(), log()
+    b = bench(log=slow)
+    b.hub.publish_weights(bundle(0), 0)
+    add = slow.add
+    slow.add = lambda header, message: written.wait(10) and add(header, message)
+    answers = []
+    first = threading.Thread(target=lambda: answers.append(b.send(0)["outcome"]))
+    first.start()
+    while b.ledger()["queued"] == 0:
+        time.sleep(0.01)
+    assert b.send(0)["outcome"] == "retry" and not answers
+    written.set()
+    first.join(5)
+    assert answers == ["accepted"] and b.send(0)["outcome"] == "duplicate" and on_disk(slow) == [0]
+    slow.add = lambda header, message: b.hub.close()  # the disk refuses it, and the learner stops
+    assert b.send(1)["outcome"] == "retry"
+
+
+def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, log):
+    b = bench(log=log())
+    b.hub.publish_weights(bundle(0), 0)
+    for i in range(3):
+        b.send(i)
+    b.hub.discard(b.hub.next_batch(2, 1))
+    assert on_disk(b.hub._log) == [2]
+
+
+def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
+    said = []
+    b = bench(log=log())
+    b.hub.publish_weights(bundle(0), 0)
+    for i in range(4):
+        assert b.send(i)["outcome"] == "accepted"
+    folder = b.hub._log._folder
+    damaged, renamed = sorted(folder.iterdir())[1:3]
+    damaged.write_bytes(damaged.read_bytes()[:-3] + b"xyz")
+    renamed.rename(folder / renamed.name.replace("~2.", "~9."))
+    (folder / f"000000000009~a~01~5.safetensors{PART}").write_bytes(b"torn, and so never acknowledged")
+    (folder / "notes.txt").write_text("not ours")
+    resumed = bench(log=log(), on_event=lambda *event: said.append(event))
+    resumed.hub.publish_weights(bundle(1), 1)
+    assert sequences(resumed.hub.next_batch(2, 1)) == [0, 3]
+    assert ("error", "2 accepted rollouts are damaged on disk, and left out.") in said
+    kinds = sorted(path.suffix for path in folder.iterdir())
+    assert kinds == [".aside", ".aside", ".safetensors", ".safetensors", ".txt"]
+    other = bench(log=log(), run_id="f")
+    other.hub.publish_weights(bundle(0, epoch="f"), 0)
+    assert not on_disk(other.hub._log) and other.ledger()["queued"] == 0
+
+
+def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, log):
+    b = bench(log=log())
+    b.hub.publish_weights(bundle(0), 0)
+    b.send(0)
+    resumed = bench(log=log(write=False))
+    resumed.hub.publish_weights(bundle(1), 1)
+    assert resumed.send(1, version=1)["outcome"] == "accepted"
+    assert on_disk(resumed.hub._log) == [0] and sequences(resumed.hub.next_batch(2, 1)) == [0, 1]
+
+
+def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
+    said = []
+    (tmp_path / "file").touch()
+    b = bench(batch=3, log=WriteAheadLog(tmp_path / "file" / "log", 1, log_error=said.append))
+    b.hub.publish_weights(bundle(0), 0)
+    assert [b.send(i)["outcome"] for i in range(3)] == ["accepted"] * 3
+    assert len(said) == 1 and "they do not survive the learner" in said[0]
+    (tmp_path / "file").unlink()
+    assert b.send(3)["outcome"] == "accepted"
+    assert on_disk(b.hub._log) == [3]

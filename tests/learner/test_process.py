@@ -105,6 +105,15 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
     assert actor.versions == sorted(actor.versions)
 
 
+@pytest.mark.timeout(120)
+def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub):
+    """As where they stay on a device: `audit=False`."""
+    create_run(tmp_path, CONFIG)
+    MadeUpActor(MemoryTransport(hub))
+    assert learn(tmp_path, hub, audit=False).version == 3
+    assert not (tmp_path / "accepted").exists() and not (tmp_path / "audit").exists()
+
+
 LEARNER = """
 import dataclasses, pathlib, sys, threading
 from common.transport.zenoh_transport import ZenohTransport
@@ -207,6 +216,9 @@ def test_values_that_are_not_finite_stop_the_run_and_are_kept(tmp_path, hub):
     actor.join(10.0)
     assert "\n" not in str(caught.value)
     assert {path.name for path in (tmp_path / "failure").iterdir()} == {"state.safetensors", "batch.safetensors"}
+    # What waited is taken up by a resume, the batch itself is not.
+    kept = {int(path.stem.split("~")[3]) for path in (tmp_path / "accepted" / "0").iterdir()}
+    assert not kept & {0, 1}
 
 
 @pytest.mark.timeout(120)

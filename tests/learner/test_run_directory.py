@@ -41,7 +41,28 @@ def test_a_command_line_that_resumes_starts_from_the_runs_own_configuration(run)
     assert defaults(["--or-resume", "--run-dir", str(folder / "none")])["config"] == get_preset("quickstart")
 
 
-@pytest.mark.parametrize("text", [b"\x89MCAP\xff\xfe", b"[1, 2]", b"7", b'{"name": "x", "ppo": 3}', b"[" * 9000, b""])
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"\x89MCAP\xff\xfe",
+        b"[1, 2]",
+        b"7",
+        b'{"name": "x", "ppo": 3}',
+        b"[" * 9000,
+        b"",
+        b'{"ppo": null}',
+        b'{"ppo": {"clip": null}}',
+        b'{"network": {"hidden": null}}',
+        b'{"updates": null}',
+        b'{"task": {"reward": {"height": [null]}}}',
+        b'{"ppo": {"learning_rate_range": [null, 1]}}',
+        b"\x00" * 70,
+        b'{"name": null}',
+        b'{"name": "../x"}',
+        b'{"name": "", "seed": 1}',
+        b'{"ppo": {"clip": NaN}}',
+    ],
+)
 def test_a_configuration_that_is_none_is_one_line_that_names_the_file(run, text):
     folder, _ = run
     (folder / "config.json").write_bytes(text)
@@ -77,7 +98,7 @@ def test_versions_go_on_from_the_journals_where_the_version_file_is_damaged(run,
     (folder / "version").write_bytes(damage)
     assert published_version(folder) == (0 if damage == b"0" * 20 + b"\n" else -1)
     log = AuditLog(folder, "0")
-    log.begin("session", "run", 3, 1)
+    log.begin("session", "run", 3, 1, kept=True)
     assert published_version(folder) == 3
     log.used(21, [], [])
     assert published_version(folder) == 22

@@ -2,14 +2,14 @@
 
 import pathlib
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 from mcap.reader import make_reader
 
 from common.errors import CongraspError
 from common.wire.codec import Message, decode
-from services.record.reader import is_complete, is_episode, log_files, read_records
+from services.record.reader import is_episode, log_files, read_records
+from services.record.salvage import DAMAGE, intact_summary
 from services.record.scene import EPISODE_SCHEMA
 
 MOST = 60
@@ -85,26 +85,33 @@ def _row(key: str, message: Message) -> dict[str, Any]:
     }
 
 
-def _within(file: pathlib.Path, begin: int, end: int) -> Iterator[tuple[int, str, bytes]]:
+def _within(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, bytes]]:
     """Time (ns), topic and bytes of a file's raw episodes between two times."""
-    if not is_complete(file):  # being written, or cut off: no index, so all of it is read
-        for record in read_records(file, is_episode):
-            if record.schema == EPISODE_SCHEMA and begin <= record.time <= end:
-                yield record.time, record.topic, record.data
-        return
+    if (found := _by_index(file, begin, end)) is not None:
+        return found
+    return [
+        (record.time, record.topic, record.data)
+        for record in read_records(file, is_episode)
+        if record.schema == EPISODE_SCHEMA and begin <= record.time <= end
+    ]
+
+
+def _by_index(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, bytes]] | None:
+    """The same of a finished file, in which little is read; None if it is unfinished, or damaged where it is read."""
     try:
         with file.open("rb") as stream:
-            reader = make_reader(stream)
-            summary = reader.get_summary()
-            if summary is None or summary.statistics is None:
-                return
-            if summary.statistics.message_start_time > end or summary.statistics.message_end_time < begin:
-                return
+            if (summary := intact_summary(stream)) is None or (statistics := summary.statistics) is None:
+                return None
+            if statistics.message_start_time > end or statistics.message_end_time < begin:
+                return []
             topics = [channel.topic for channel in summary.channels.values() if is_episode(channel.topic)]
-            if not topics:
-                return
-            for schema, channel, message in reader.iter_messages(topics, starting_at=begin, ending_at=end):
-                if schema is not None and schema.name == EPISODE_SCHEMA:
-                    yield message.log_time, channel.topic, message.data
+            messages = make_reader(stream, validate_crcs=True).iter_messages(topics, begin, end) if topics else ()
+            return [
+                (message.log_time, channel.topic, message.data)
+                for schema, channel, message in messages
+                if schema is not None and schema.name == EPISODE_SCHEMA
+            ]
+    except DAMAGE:
+        return None
     except OSError as error:
         raise CongraspError(f"{file} cannot be read: {error.strerror}.") from None

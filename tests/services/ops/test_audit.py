@@ -35,7 +35,7 @@ def learner(run_dir, *lines):
 
 
 def life(name="x", version=0):
-    return {"life": name, "epoch": "e", "version": version, "max_staleness": 1}
+    return {"life": name, "epoch": "e", "version": version, "max_staleness": 1, "kept": True, "taken": []}
 
 
 def used(*sequences, version=None, checksum=None, lag=0, incarnation="1"):
@@ -51,7 +51,7 @@ def faults(run_dir):
 def test_all_is_well(run_dir):
     learner(run_dir, life(), used(0, 1, lag=1), used(2, 3), {"dropped": [["a", "1", 4]]}, {"end": [["a", "1", 5]]})
     report = audit(run_dir)
-    assert faults(run_dir) == {"dropped as too old": 1, "waiting": 1}
+    assert faults(run_dir) == {"dropped": 1, "waiting": 1}
     assert (report.counts["made"], report.counts["accepted"], report.counts["used"]) == (6, 6, 4)
     assert (report.lag_mean, report.lag_max, report.max_staleness) == (0.5, 1, 1)
     assert not report.faults and command(run_dir) == 0
@@ -137,6 +137,17 @@ def test_what_a_torn_line_told_is_no_surplus(run_dir):
     report = audit(run_dir)
     assert (report.holes, report.damaged, report.faults) == (2, 0, [])
     assert report.counts["used, not in the journals"] == 4
+
+
+def test_a_line_that_a_killed_process_left_unfinished_is_no_damage(run_dir):
+    """Its writer comes back: its next line counts the unfinished one, and what it told is not judged."""
+    learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
+    path = run_dir / AUDIT / "a.jsonl"
+    path.write_bytes(path.read_bytes()[:-30])
+    assert (audit(run_dir).holes, audit(run_dir).damaged) == (1, 0)
+    Journal(path).write(actor="a", incarnation="2")
+    report = audit(run_dir)
+    assert (report.holes, report.damaged, report.exit_code, report.counts["accepted"]) == (1, 0, 0, 5)
 
 
 def test_journals_of_older_versions_are_read_and_reported_as_unchecked(run_dir, capsys):

@@ -1,11 +1,14 @@
 """What is known of a run: curves, a hundred actors, and episodes found by their time."""
 
 import pathlib
+import struct
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import MCAP0_MAGIC
 
 from common.errors import CongraspError
 from common.transport.keys import Keys
@@ -133,6 +136,24 @@ def test_episodes_around_a_time_come_from_finished_and_from_growing_files(tmp_pa
     assert reach == 15.0 and [row["actor"] for row in rows] == ["a001"]
     with pytest.raises(CongraspError, match="not among those"):
         recordings.episode("nothing")
+
+
+def test_damage_to_a_finished_file_costs_no_more_than_what_is_damaged(tmp_path: pathlib.Path, caplog: Any) -> None:
+    made_up.record(tmp_path, [(BEGIN + n, n) for n in range(3)])
+    file = next(tmp_path.glob("*.mcap"))
+    intact = file.read_bytes()
+    made_up.record(tmp_path, [(BEGIN + 700 + n, n) for n in range(3, 6)])
+
+    def found(place: int) -> list[str]:
+        file.write_bytes(intact[:place] + bytes([intact[place] ^ 1]) + intact[place + 1 :])
+        return [row["actor"] for row in Recordings(tmp_path).around(BEGIN, 1000.0)[1]]
+
+    everyone = [f"a{n:03d}" for n in range(6)]
+    (summary_start,) = struct.unpack_from("<Q", intact, len(intact) - len(MCAP0_MAGIC) - 20)
+    assert all(found(place) == everyone for place in range(summary_start, len(intact) - len(MCAP0_MAGIC), 241))
+    caplog.clear()
+    assert found(intact.index(b"zstd") + 400) == everyone[3:]
+    assert f"{file} is damaged in 1 place" in caplog.text
 
 
 def test_of_many_episodes_the_nearest_are_taken(tmp_path: pathlib.Path) -> None:

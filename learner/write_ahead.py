@@ -1,0 +1,161 @@
+"""Accepted rollouts on disk, so that an acknowledgement outlives the processes that gave and got it.
+
+A rollout is written before it is acknowledged: the message as it came over the wire, with its checksums, in a file of
+its own that takes its name once it is whole. It is removed when a checkpoint holds its outcome. Only rollouts that a
+resume could use are written: those whose policy is at most `max_staleness` versions from that of the newest checkpoint,
+or of the one that is being written. So the folder holds no more than admission lets in within `2 max_staleness + 1`
+versions, and what waits at a checkpoint.
+
+Files survive the death of all processes. They are not flushed to the disk, so a power cut may cost them.
+"""
+
+import contextlib
+import pathlib
+import re
+import threading
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from common.errors import CongraspError
+from common.wire.codec import Message, decode, encode
+from common.wire.messages import RolloutForm, RolloutHeader, validate_rollout
+from learner.checkpoint import set_aside
+
+FOLDER = "accepted"
+"""Folder of a run directory with a folder for each rank."""
+PART = ".part"
+"""Suffix of a file that is being written."""
+Identity = tuple[str, str, int]
+"""Actor, incarnation and sequence."""
+_NAME = re.compile(r"(\d{12})~([^~]+)~([^~]+)~(\d+)\.safetensors")
+
+
+class Recovered(NamedTuple):
+    """What a session of the learner finds of those before it."""
+
+    rollouts: list[tuple[RolloutHeader, Message]]
+    """In the order in which they were accepted."""
+    damaged: list[Identity]
+    """Rollouts whose files are not what was written; these are kept as `*.aside`."""
+
+
+class WriteAheadLog:
+    """The accepted rollouts of one learner that no checkpoint holds. Safe to call from several threads."""
+
+    def __init__(
+        self,
+        folder: pathlib.Path,
+        max_staleness: int,
+        *,
+        write: bool = True,
+        log_error: Callable[[str], None] = lambda text: None,
+    ):
+        """Uses a folder, which is made when it is needed.
+
+        Args:
+          folder: the learner's own.
+          max_staleness: eta, versions.
+          write: whether rollouts are written; what is there is recovered in any case.
+          log_error: given one line when the disk refuses rollouts, until it takes one again.
+        """
+        self.write = write
+        self._folder, self._max_staleness, self._log_error = folder, max_staleness, log_error
+        self._lock = threading.Lock()
+        self._files: dict[Identity, pathlib.Path] = {}
+        self._decided: set[Identity] = set()
+        self._saved = self._next = 0
+        self._number = 0
+        self._full = False
+
+    def recover(self, version: int, run_id: str, form: RolloutForm, schema: str) -> Recovered:
+        """Reads what earlier sessions left behind; to be called once, before all else.
+
+        Files of another training are removed.
+
+        Args:
+          version: that of the checkpoint from which the learner resumes, 0 where there is none.
+          run_id: the training's.
+          form: see `validate_rollout`, as `schema`.
+
+        Raises:
+          CongraspError: a damaged file cannot be renamed.
+        """
+        self._saved = self._next = version
+        found = Recovered([], [])
+        _remove(self._folder.glob(f"*{PART}"))  # never acknowledged
+        for path in sorted(self._folder.glob("*.safetensors")):
+            if (name := _NAME.fullmatch(path.name)) is None:
+                continue
+            self._number = int(name[1]) + 1
+            identity = name[2], name[3], int(name[4])
+            try:
+                message = decode(path.read_bytes())
+                header = validate_rollout(message, form, schema=schema)
+                if (*header.owner, header.sequence) != identity:
+                    raise CongraspError("The file's name is that of another rollout.")
+            except (CongraspError, OSError):
+                set_aside(path)
+                found.damaged.append(identity)
+                continue
+            if header.run_id != run_id:
+                _remove([path])
+                continue
+            self._files[identity] = path
+            found.rollouts.append((header, message))
+        return found
+
+    def add(self, header: RolloutHeader, message: Message) -> bool:
+        """Writes an accepted rollout if a resume could use it; false if it should be there and cannot be written."""
+        identity = *header.owner, header.sequence
+        with self._lock:  # also while it is written: another thread may be at the same rollout
+            distance = min(abs(header.version - version) for version in (self._saved, self._next))
+            if not self.write or identity in self._files or distance > self._max_staleness:
+                return True
+            path = self._folder / f"{self._number:012d}~{'~'.join(map(str, identity))}.safetensors"
+            part = path.with_name(path.name + PART)
+            try:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                part.write_bytes(encode(message))
+                part.rename(path)
+            except OSError as error:
+                _remove([part])
+                is_new, self._full, why = not self._full, True, error.strerror
+            else:
+                self._files[identity] = path
+                self._number += 1
+                self._full = False
+                return True
+        if is_new:
+            self._log_error(
+                f"Accepted rollouts cannot be written to {self._folder} ({why}): until they can, they do not survive "
+                "the learner."
+            )
+        return False
+
+    def begin_checkpoint(self, version: int) -> None:
+        """Notes that a checkpoint of this version is about to be written; what a resume from it could use is kept."""
+        with self._lock:
+            self._next = version
+
+    def cover(self, waiting: Iterable[Identity]) -> None:
+        """Notes what the coming checkpoint holds the outcome of: all that is here but the rollouts that still wait."""
+        with self._lock:
+            self._decided = self._files.keys() - set(waiting)
+
+    def end_checkpoint(self) -> None:
+        """Notes that the checkpoint is there: what it covers is removed."""
+        self._saved = self._next
+        self.discard(self._decided)
+
+    def discard(self, identities: Iterable[Identity]) -> None:
+        """Removes rollouts that no resume is to take up."""
+        with self._lock:
+            paths = [self._files.pop(identity) for identity in identities if identity in self._files]
+        _remove(paths)
+
+
+def _remove(paths: Iterable[pathlib.Path]) -> None:
+    """Removes files; one that stays is passed over, or too old, when it is read again."""
+    for path in paths:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
