@@ -1,5 +1,9 @@
 """Errors that a user can act on: one line that names the input and the remedy."""
 
+import re
+
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
 
 class CongraspError(Exception):
     """Bad input or a broken surrounding, said in one line.
@@ -13,7 +17,7 @@ class CongraspError(Exception):
     code = ""
 
     def __init__(self, what: str, remedy: str = ""):
-        super().__init__(f"{what} {remedy}".strip().replace("\n", " "))
+        super().__init__(_UNPRINTABLE.sub(" ", f"{what} {remedy}".strip()))
 
 
 class PhysicsError(CongraspError):

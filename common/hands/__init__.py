@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from common.errors import CongraspError
 from common.hands.allegro import ALLEGRO
-from common.hands.files import hand_from_text, read_hand
+from common.hands.files import MAX_BYTES, hand_from_text, read_hand
 from common.hands.human import HUMAN
 from common.hands.mano import own_mano_hand
 from common.hands.sharpa import SHARPA
@@ -36,9 +36,31 @@ def hands_folder() -> pathlib.Path:
     return pathlib.Path(os.environ.get(VARIABLE) or pathlib.Path(config, "congrasp", "hands"))
 
 
-@functools.cache
+def check_reference(reference: object) -> str:
+    """Returns what a message or a file may call a hand: a name of the package's, or all of the hand's own text.
+
+    What others send names no file of this machine, so that they neither learn what is there nor make anything wait.
+
+    Raises:
+      CongraspError: it is neither.
+    """
+    name = reference if isinstance(reference, str) and len(reference) <= MAX_BYTES else ""
+    if name in HANDS or name.lstrip().startswith("{"):
+        return name
+    raise CongraspError(
+        f"{ascii(reference)[:60]} is no hand that a message can name.", f"It is one of: {', '.join(sorted(HANDS))}."
+    )
+
+
+def known_hand(reference: object) -> Hand:
+    """The hand that a message or a recording names; a CongraspError as `check_reference` and `get_hand`."""
+    name = check_reference(reference)
+    return get_hand(name) if name in HANDS else hand_from_text(name)
+
+
+@functools.lru_cache(maxsize=64)
 def get_hand(reference: str) -> Hand:
-    """A hand, the same object every time for the same words.
+    """A hand, the same object every time for the same words; `known_hand` is for words that come from others.
 
     Args:
       reference: the name of a hand of the package or of one in `hands_folder`, the path of a hand file, or all of its

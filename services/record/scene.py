@@ -17,7 +17,7 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
+from common.hands import known_hand
 from common.hands.mjcf import WRIST_JOINTS
 from common.hands.spec import Capsule, Hand, Link, link_origin
 from common.wire.codec import Message, encode
@@ -57,7 +57,7 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
     """
     topic = f"/episode/{actor}"
     arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
-    hand = get_hand(episode.meta["hand"])
+    hand = known_hand(episode.meta["hand"])
     step = round(1e9 * episode.meta["control_dt"])
     yield Entry(opaque_channel(f"{topic}/raw", EPISODE_SCHEMA), start, encode(episode))
     yield _protobuf(f"{topic}/scene", start, _static_scene(hand, actor, arrays, episode.meta, start), latched=True)
