@@ -6,6 +6,7 @@ take configuration, state and versions from it, and write only journals and what
 
 import contextlib
 import dataclasses
+import functools
 import pathlib
 import secrets
 import threading
@@ -25,6 +26,7 @@ from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode, finite
 from common.wire.schema import RolloutForm
+from learner.admission import Admission
 from learner.algorithms import make_algorithm
 from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
 from learner.audit import AuditLog
@@ -32,6 +34,7 @@ from learner.batch import collate
 from learner.checkpoint import Checkpoints, checksum, flatten, restore
 from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
+from learner.ranges import task_ranges
 from learner.ranks import Ranks, ended_by
 from learner.run_directory import (
     CHECKPOINTS,
@@ -177,6 +180,7 @@ class _Learner:
             durable=_durable(hubs, ranks.rank),
             on_event=notify,
             audit=AuditLog(run_dir, str(ranks.rank), lambda text: self._event("error", text)) if audit else None,
+            admission=Admission(functools.partial(task_ranges, config.task, config.curriculum)),
         )
         if hubs and len(hubs) != ranks.count:
             self._event(

@@ -137,7 +137,7 @@ def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int
                 f"The {spec.kind}'s meta entry '{name}' has {len(value)} characters, more than {LONGEST_TEXT}."
             )
         if isinstance(value, int) and abs(value) > _COUNTS:
-            raise CongraspError(f"The {spec.kind}'s meta entry '{name}' is no number that a count can be.")
+            raise CongraspError(f"The {spec.kind}'s meta entry '{name}' is beyond all counts.")
     for name, array_spec in spec.arrays.items():
         if not name.endswith("/*") and not array_spec.optional and name not in message.arrays:
             raise CongraspError(f"The {spec.kind} lacks the array '{name}'.")
