@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from learner.ranges import Ranges
 
 _DENSITY = (-100.0, 10.0)  # nats of a log probability for each action; 14 standard deviations, and one of 2e-5
+_ACTIONS = 256  # where a rollout has a log probability and no action
 _ROWS = 128
 _NAMES = 1024  # of actors whose refused rollouts are counted
 _HALF_MAGNITUDE = 0x7FFF
@@ -58,7 +59,8 @@ class Admission:
             elif name == "action":
                 _within(name, array, -ranges.action, ranges.action)
             elif name == "log_probability":
-                _within(name, array, *(arrays["action"].shape[-1] * bound for bound in _DENSITY))
+                actions = arrays["action"].shape[-1] if "action" in arrays else _ACTIONS
+                _within(name, array, *(actions * bound for bound in _DENSITY))
 
     def accept(self, actor: str) -> None:
         """Notes that a rollout of an actor was accepted."""

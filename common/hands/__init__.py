@@ -12,6 +12,7 @@ from common.hands.human import HUMAN
 from common.hands.mano import own_mano_hand
 from common.hands.sharpa import SHARPA
 from common.hands.spec import Hand
+from common.inputs import LONGEST_NAME
 
 HANDS: dict[str, Callable[[], Hand]] = {
     "human": lambda: HUMAN,
@@ -37,25 +38,38 @@ def hands_folder() -> pathlib.Path:
 
 
 def check_reference(reference: object) -> str:
-    """Returns what a message or a file may call a hand: a name of the package's, or all of the hand's own text.
-
-    What others send names no file of this machine, so that they neither learn what is there nor make anything wait.
+    """Returns what a policy may call its hand: a name, or all of the hand's own text, but no path.
 
     Raises:
       CongraspError: it is neither.
     """
     name = reference if isinstance(reference, str) and len(reference) <= MAX_BYTES else ""
-    if name in HANDS or name.lstrip().startswith("{"):
+    if (name.isidentifier() and len(name) <= LONGEST_NAME) or name.lstrip().startswith("{"):
         return name
-    raise CongraspError(
-        f"{ascii(reference)[:60]} is no hand that a message can name.", f"It is one of: {', '.join(sorted(HANDS))}."
-    )
+    raise _unknown(reference)
 
 
 def known_hand(reference: object) -> Hand:
-    """The hand that a message or a recording names; a CongraspError as `check_reference` and `get_hand`."""
+    """The hand that a message or a recording names: one of the package, or one whose text it brings along.
+
+    What others send opens no file of this machine, so that they neither learn what is there nor make anything wait.
+
+    Raises:
+      CongraspError: it is neither, or the text is no hand.
+    """
     name = check_reference(reference)
-    return get_hand(name) if name in HANDS else hand_from_text(name)
+    if name in HANDS:
+        return get_hand(name)
+    if name.isidentifier():
+        raise _unknown(reference)
+    return hand_from_text(name)
+
+
+def _unknown(reference: object) -> CongraspError:
+    """The error of a hand that a message cannot name."""
+    return CongraspError(
+        f"{ascii(reference)[:60]} is no hand that a message can name.", f"It is one of: {', '.join(sorted(HANDS))}."
+    )
 
 
 @functools.lru_cache(maxsize=64)
