@@ -61,8 +61,13 @@ class Entry(NamedTuple):
 @functools.lru_cache(maxsize=4096)
 def protobuf_channel(topic: str, kind: type[Protobuf], *, latched: bool = False) -> Channel:
     """A channel of one of Foxglove's messages, with the descriptors a reader needs."""
-    schema = build_file_descriptor_set(kind).SerializeToString()
-    return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", schema, latched)
+    return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", _descriptors(kind), latched)
+
+
+@functools.cache
+def _descriptors(kind: type[Protobuf]) -> bytes:
+    """The schema of one of Foxglove's messages, one object for all channels."""
+    return build_file_descriptor_set(kind).SerializeToString()
 
 
 @functools.lru_cache(maxsize=4096)
