@@ -275,7 +275,7 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         raise CongraspError(
             f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."
         ) from None
-    except dacite.DaciteError as error:
+    except (dacite.DaciteError, TypeError, OverflowError) as error:
         raise CongraspError(f"The configuration does not fit this version: {error}.") from None
 
 

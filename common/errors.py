@@ -2,6 +2,7 @@
 
 import re
 
+_LONGEST = 2000  # characters: a line may quote what somebody else wrote
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
@@ -17,7 +18,8 @@ class CongraspError(Exception):
     code = ""
 
     def __init__(self, what: str, remedy: str = ""):
-        super().__init__(_UNPRINTABLE.sub(" ", f"{what} {remedy}".strip()))
+        text = _UNPRINTABLE.sub(" ", f"{what} {remedy}".strip())
+        super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}")
 
 
 class PhysicsError(CongraspError):

@@ -177,7 +177,7 @@ def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
 
 def _checked(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """The same of arrays whose shapes and values are right; a file without times has 10 ms a frame."""
-    if position.ndim != 2 or position.shape[1] != 3 or quaternion.shape != (len(position), 4):
+    if position.ndim != 2 or position.shape[1:] != (3,) or quaternion.shape != (len(position), 4) or not len(position):
         raise CongraspError(
             f"{path} has positions {position.shape} and quaternions {quaternion.shape}.",
             "A frame is x, y, z and a quaternion w, x, y, z.",

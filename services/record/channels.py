@@ -61,11 +61,12 @@ class Entry(NamedTuple):
 @functools.lru_cache(maxsize=4096)
 def protobuf_channel(topic: str, kind: type[Protobuf], *, latched: bool = False) -> Channel:
     """A channel of one of Foxglove's messages, with the descriptors a reader needs."""
-    return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", _descriptors(kind), latched)
+    own: Any = kind  # hashable, which its type does not say
+    return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", _descriptors(own), latched)
 
 
 @functools.cache
-def _descriptors(kind: type[Protobuf]) -> bytes:
+def _descriptors(kind: Any) -> bytes:
     """The schema of one of Foxglove's messages, one object for all channels."""
     return build_file_descriptor_set(kind).SerializeToString()
 
