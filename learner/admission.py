@@ -7,16 +7,13 @@ A peer that lies within these ranges is believed. One whose rollout is refused i
 import collections
 import threading
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from common.errors import CongraspError
 from common.wire.codec import Message
 from learner.rate_limit import PutOff
-
-if TYPE_CHECKING:
-    from learner.ranges import Ranges
 
 _DENSITY = (-100.0, 10.0)  # nats of a log probability for each action; 14 standard deviations, and one of 2e-5
 _ACTIONS = 256  # where a rollout has a log probability and no action
@@ -25,10 +22,23 @@ _NAMES = 1024  # of actors whose refused rollouts are counted
 _HALF_MAGNITUDE = 0x7FFF
 
 
+class Ranges(NamedTuple):
+    """Largest magnitudes that a task can produce (`learner.ranges`)."""
+
+    observation: np.ndarray
+    """(D,)."""
+    reward: float
+    """Of a control step."""
+    action: float
+    """In units of action: targets are clipped long before."""
+    episodes: dict[str, tuple[float, float]]
+    """Least and largest value of each metric of an episode, by its name on the wire: no others are known."""
+
+
 class Admission:
     """Compares the values of rollouts with a task's ranges, and puts offenders off; for any number of threads."""
 
-    def __init__(self, ranges: "Callable[[], Ranges] | None" = None):
+    def __init__(self, ranges: Callable[[], Ranges] | None = None):
         """The function is called with the first rollout, whose answer waits for it; without one, values may be any."""
         self._ranges = ranges
         self._lock = threading.Lock()

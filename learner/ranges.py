@@ -7,7 +7,7 @@ ranges of a constraint or a term that is added from outside follow as well.
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from common.task.metrics import DIVERGED, FORCES, episode_fields
 from common.task.observation import observe
 from common.task.reward import reward_terms
 from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
+from learner.admission import Ranges
 
 _STATES = 128
 _SLACK = 2.0
@@ -33,19 +34,6 @@ _FORCE = 1e3  # N; terms and observations clip or squash forces far below
 _FLAGS = ("success", "held", DIVERGED)
 _LARGEST = 1e6  # of an error or a force, in its unit
 _ACTION = 1e3
-
-
-class Ranges(NamedTuple):
-    """Largest magnitudes."""
-
-    observation: np.ndarray
-    """(D,)."""
-    reward: float
-    """Of a control step."""
-    action: float
-    """In units of action: targets are clipped long before."""
-    episodes: dict[str, tuple[float, float]]
-    """Least and largest value of each metric of an episode, by its name on the wire: no others are known."""
 
 
 @functools.lru_cache(maxsize=8)

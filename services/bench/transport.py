@@ -27,6 +27,7 @@ from common.transport import urls
 from common.transport.ports import free_port, local_url
 from common.wire.codec import Message, encode
 from common.wire.schema import RolloutForm
+from learner.admission import Admission, Ranges
 from learner.audit import AuditLog
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
@@ -101,6 +102,7 @@ def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]
 def _learner(folder: pathlib.Path) -> Iterator[tuple[LearnerHub, str]]:
     """A learner's hub without a learner, and where it listens."""
     endpoint = local_url()
+    ranges = Ranges(np.full(_FORM.observation, 100.0), 100.0, 100.0, {})
     with urls.listen(endpoint, "learner") as transport:
         hub = LearnerHub(
             transport,
@@ -111,6 +113,7 @@ def _learner(folder: pathlib.Path) -> Iterator[tuple[LearnerHub, str]]:
             form=_FORM,
             staleness=StalenessManager(1, _BATCH),
             audit=AuditLog(folder, "0"),
+            admission=Admission(lambda: ranges),
         )
         yield hub, endpoint
         hub.close()

@@ -35,9 +35,8 @@ from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message, encode
 from common.wire.schema import RolloutForm
-from learner.admission import Admission
+from learner.admission import Admission, Ranges
 from learner.hub import LearnerHub
-from learner.ranges import Ranges
 from learner.staleness import StalenessManager
 from services.assets.objects.sources import read_mesh
 from services.export.motion_file import load_motion, motion_of_episode, save_motion

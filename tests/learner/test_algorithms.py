@@ -17,10 +17,10 @@ from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
+from learner.admission import Ranges
 from learner.algorithms import ALGORITHMS, make_algorithm
 from learner.batch import collate, partition_specs
 from learner.process import run_learner
-from learner.ranges import Ranges
 from learner.run_directory import create_run
 from services.bench import toy
 from tests.learner.a2c import A2C, SCHEMA

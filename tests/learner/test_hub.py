@@ -14,11 +14,10 @@ from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message, encode
 from common.wire.schema import RolloutForm
-from learner.admission import Admission
+from learner.admission import Admission, Ranges
 from learner.batch import collate
 from learner.deduplication import Sequences
 from learner.hub import LearnerHub
-from learner.ranges import Ranges
 from learner.staleness import StalenessManager
 
 pytestmark = pytest.mark.timeout(30)
