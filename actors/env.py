@@ -21,33 +21,9 @@ from common.task.constraints import blocks
 from common.task.constraints.base import Scene
 from common.task.control import decode
 from common.task.features import features
+from common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
 from common.task.reward import reward_terms, terms
 from common.task.types import Action, Array, Goal, SceneState, Surface
-
-_FORCES = ("force_sum", "force_link_max")
-_DIVERGED = "bad"  # the metric's name on the wire and in recordings
-
-
-def metric_names(task: TaskConfig) -> tuple[str, ...]:
-    """Metrics of a finished episode: outcome, errors of the constraints, forces, and which blocks were active."""
-    return (
-        "success",
-        "held",
-        "return",
-        "length",
-        "links_at_removal",
-        "moved_at_removal",
-        *(spec.name for spec in metrics.specs(task)),
-        *_FORCES,
-        _DIVERGED,
-        *(f"mask_{name}" for name in blocks(task)),
-        "object_index",
-    )
-
-
-def episode_fields(task: TaskConfig) -> tuple[str, ...]:
-    """Columns of `EnvState.finished`: the metrics, then the sums of the reward's terms."""
-    return (*(f"episode/{name}" for name in metric_names(task)), *(f"term/{name}" for name in terms(task)))
 
 
 class Settings(NamedTuple):
@@ -140,7 +116,7 @@ class GraspEnv:
         batch = initial.reset_state.q.shape[0]
         zero, no, index = jnp.zeros(batch), jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32)
         reset_state = initial.reset_state
-        sums = {**metrics.empty_sums(self.task, batch), **dict.fromkeys(("return", *_FORCES), zero)}
+        sums = {**metrics.empty_sums(self.task, batch), **dict.fromkeys(("return", *FORCES), zero)}
         state = EnvState(
             physics=physics if self.physics.compiled else None,
             scene=(),
@@ -299,8 +275,8 @@ class GraspEnv:
             "links_at_removal": known.links_at_removal,
             "moved_at_removal": known.moved_at_removal,
             **metrics.episode_errors(task, sums),
-            **{name: sums[name] / after for name in _FORCES},
-            _DIVERGED: known.diverged,
+            **{name: sums[name] / after for name in FORCES},
+            DIVERGED: known.diverged,
             **{f"mask_{name}": state.goal.active[name] for name in blocks(task)},
             "object_index": state.reset_state.object_index,
         }

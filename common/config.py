@@ -303,11 +303,11 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         if not isinstance(fields, dict):
             raise ValueError("it is no object")
         config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
-    except (ValueError, TypeError, RecursionError) as error:  # no UTF-8, null for a number, or nested too deep
+    except (ValueError, RecursionError) as error:  # no UTF-8, or nested too deep
         raise CongraspError(
             f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."
         ) from None
-    except dacite.DaciteError as error:
+    except (dacite.DaciteError, TypeError, OverflowError) as error:  # such as null for a number
         raise CongraspError(f"The configuration does not fit this version: {error}.") from None
     file_name(config.name, "a run")
     return config

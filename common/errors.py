@@ -1,5 +1,10 @@
 """Errors that a user can act on: one line that names the input and the remedy."""
 
+import re
+
+_LONGEST = 2000  # characters: a line may quote what somebody else wrote
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
 
 class CongraspError(Exception):
     """Bad input or a broken surrounding, said in one line.
@@ -13,7 +18,8 @@ class CongraspError(Exception):
     code = ""
 
     def __init__(self, what: str, remedy: str = ""):
-        super().__init__(f"{what} {remedy}".strip().replace("\n", " "))
+        text = _UNPRINTABLE.sub(" ", f"{what} {remedy}".strip())
+        super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}")
 
 
 class PhysicsError(CongraspError):

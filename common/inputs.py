@@ -1,9 +1,11 @@
 """What comes from outside: names that become files, and files of bounded size."""
 
+import json
 import os
 import pathlib
 import re
 import stat
+from typing import Any, BinaryIO
 
 from common.errors import CongraspError
 
@@ -42,15 +44,30 @@ def read_file(path: pathlib.Path, largest: int, remedy: str = "") -> bytes:
       CongraspError: it is larger, or no regular file (a pipe would never end).
       OSError: it cannot be read.
     """
-    with open(path, "rb", opener=_without_waiting) as file:
-        found = os.fstat(file.fileno())
-        if not stat.S_ISREG(found.st_mode):
-            raise CongraspError(f"{path} is no regular file.", remedy)
-        if found.st_size > largest:
-            raise CongraspError(f"{path} has {found.st_size} bytes, more than the {largest} that are read.", remedy)
-        return file.read(found.st_size)
+    with open_file(path, remedy) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > largest:
+            raise CongraspError(f"{path} has {size} bytes, more than the {largest} that are read.", remedy)
+        return file.read(size)
 
 
-def _without_waiting(path: str, flags: int) -> int:
-    """Opens a file; a pipe without a writer does not block."""
-    return os.open(path, flags | os.O_NONBLOCK)
+def open_file(path: pathlib.Path, remedy: str = "") -> BinaryIO:
+    """Opens a regular file for reading, without waiting; raises as `read_file` does."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    raise CongraspError(f"{path} is no regular file.", remedy)
+
+
+def read_json(path: pathlib.Path, largest: int, remedy: str = "") -> Any:
+    """What a JSON file holds; raises as `read_file` does, and a CongraspError if it is no JSON or nested too deep."""
+    return parse_json(read_file(path, largest, remedy), str(path), remedy)
+
+
+def parse_json(text: bytes, what: str, remedy: str = "") -> Any:
+    """What JSON text holds; a CongraspError if it is no JSON or nested too deep."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        raise CongraspError(f"{what} is not JSON.", remedy) from None

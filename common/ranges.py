@@ -1,4 +1,4 @@
-"""What a task and its networks may be set to where a file or a message says it: sizes that a machine can hold."""
+"""What a task and its networks may be set to where a file or a message says it, and how far a simulation may go."""
 
 import dataclasses
 import math
@@ -8,6 +8,10 @@ from typing import Any
 from common.config import NetworkConfig, TaskConfig
 from common.objects.spec import SURFACE_POINTS
 
+MAX_SPEED = 400.0
+"""A joint faster than this (m/s or rad/s) marks a diverged environment."""
+MAX_DISTANCE = 25.0
+"""A joint position beyond this (m or rad) marks a diverged environment; free fall of 2 s stays below it."""
 MAX_NUMBER = 1e6
 """Largest number of any field."""
 MAX_INPUTS, MAX_ACTIONS = 16_384, 256

@@ -18,11 +18,13 @@ from typing import Any
 
 from common.errors import CongraspError
 from common.transport.base import Transport
-from common.transport.keys import Alive, Keys, check_name, parse_alive
+from common.transport.keys import Keys, check_name, parse_alive
 from common.wire.codec import Message, SharedMessage
 from common.wire.messages import TICKET, RolloutForm, RolloutHeader, validate, validate_bundle, validate_rollout
+from learner.admission import Admission
 from learner.audit import AuditLog
 from learner.deduplication import Sequences
+from learner.members import Members
 from learner.rate_limit import DAMAGED, RateLimit, certificate
 from learner.staleness import Owner, StalenessManager
 from learner.write_ahead import Identity, Recovered, WriteAheadLog
@@ -52,6 +54,7 @@ class LearnerHub:
         on_event: Callable[[str, str], None] = lambda level, text: None,
         audit: AuditLog | None = None,
         log: WriteAheadLog | None = None,
+        admission: Admission | None = None,
     ):
         """Starts to answer; tickets are granted from the first `publish_weights` on.
 
@@ -69,6 +72,7 @@ class LearnerHub:
           on_event: given level and text of every event, which it must not hold up.
           audit: keeps the outcome of every rollout.
           log: keeps accepted rollouts until a checkpoint holds their outcome.
+          admission: checks the values of rollouts; by default their form alone is checked.
 
         Raises:
           CongraspError: the durable state is of another run.
@@ -89,7 +93,8 @@ class LearnerHub:
         self._forgotten_missing = 0
         self._being_written: set[tuple[Owner, int]] = set()  # accepted, and not acknowledged yet
         self._bundle: SharedMessage | None = None
-        self._alive: set[Alive] = set()
+        self._members = Members()
+        self._admission = admission or Admission()
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
         self._last_event: dict[str, float] = {}
         self._finished = self._closed = False
@@ -186,22 +191,27 @@ class LearnerHub:
             span = min(_RATE_SECONDS, max(1.0, now - self._arrivals[0][0])) if self._arrivals else _RATE_SECONDS
             missing = self._forgotten_missing + sum(each.missing for each in self._sequences.values())
             roles: list[dict[str, Any]] = []
-            for alive in sorted(self._alive):
+            arrived = collections.defaultdict[Owner, list[int]](list)
+            for _, owner, steps in self._arrivals:
+                arrived[owner].append(steps)
+            for alive in self._members.listed():
                 known = self._sequences.get((alive.id, alive.incarnation)) if alive.role == "actor" else None
                 entry = {"rollouts": known.rollouts, "version": known.version} if known else {}
                 entry |= {"lag": self.lag(known.version)} if known and known.rollouts else {}
-                own = [steps for _, owner, steps in self._arrivals if owner == (alive.id, alive.incarnation)]
-                roles.append({**alive._asdict(), **entry, **(_rates(own, span) if alive.role == "actor" else {})})
+                entry |= self._admission.counts(alive.id) if alive.role == "actor" else {}
+                own = _rates(arrived[alive.id, alive.incarnation], span) if alive.role == "actor" else {}
+                roles.append({**alive._asdict(), **entry, **own})
             return {
                 **self._state(),
                 "time": time.time(),
                 "run": self.keys.run,
                 "schema": self._schema,
                 "roles": roles,
+                "unlisted": self._members.unlisted,
                 "rates": _rates([steps for *_, steps in self._arrivals], span),
                 "queue": {"length": len(self._queue), "limit": self._limit},
                 "ledger": self._staleness.counters()
-                | {"missing": missing, "turned_away": self._rate_limit.turned_away},
+                | {"missing": missing, "turned_away": self._rate_limit.turned_away + self._admission.turned_away},
             }
 
     def durable(self) -> dict[str, Any]:
@@ -295,9 +305,11 @@ class LearnerHub:
         try:
             header = validate_rollout(message, self._form, schema=self._schema)
             _check_sender(key, header.actor)
+            self._admission.check(message)
         except CongraspError as error:
             self._staleness.refuse_damaged((_sender(key), str(meta.get("incarnation"))), ticket)
-            self._event("warning", f"A rollout was refused: {error}", kind="refused")
+            self._admission.refuse(_sender(key))
+            self._event("warning", f"A rollout of {_sender(key)} was refused: {error}", kind="refused")
             return self._answer("refused", why=str(error))
         if header.run_id != self.run_id:
             self._staleness.refuse_stale(header.owner, ticket)
@@ -369,6 +381,7 @@ class LearnerHub:
             why = f"It was made by version {header.version}, and the learner is at {self._staleness.version}."
             self._event("info", f"A rollout of {header.actor} was refused. {why}", kind="stale")
             return self._answer("stale", why=why)
+        self._admission.accept(header.actor)
         self._queue.append((header, message))
         now = time.monotonic()
         self._arrivals.append((now, header.owner, header.steps))
@@ -407,7 +420,10 @@ class LearnerHub:
         self._event("warning", f"Dropped as too old at version {self._staleness.version}: {len(stale)} of {actors}.")
 
     def _turn_away(self, key: str) -> Message | None:
-        """The answer to an actor over its rate limit, before its request is decoded; None for all others."""
+        """The answer to an actor that is put off or over its rate limit, before its request is decoded; or None."""
+        if seconds := self._admission.turn_away(_sender(key)):
+            retry = self._answer("retry", why="A rollout of yours was refused: come again later.")
+            return Message(meta={**retry.meta, "granted": False, "retry_after": seconds})
         if self._rate_limit.admits(key):
             return None
         self._event("warning", f"Too many useless requests of {_sender(key)}: turned away.", kind="turned away")
@@ -424,7 +440,9 @@ class LearnerHub:
         if who is None:
             return
         with self._changed:
-            (self._alive.add if alive else self._alive.discard)(who)
+            counts = self._members.note(who, alive)
+        if not counts:
+            return
         if alive:
             if who.role == "actor":  # it may have missed what was announced
                 self._transport.publish(self.keys.announcement, Message(meta=self._state()))

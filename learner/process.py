@@ -11,7 +11,7 @@ import pathlib
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -26,6 +26,7 @@ from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode, finite
 from common.wire.schema import RolloutForm
+from learner.admission import Admission
 from learner.algorithms import make_algorithm
 from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
 from learner.audit import AuditLog
@@ -33,6 +34,7 @@ from learner.batch import collate
 from learner.checkpoint import Checkpoints, checksum, flatten, restore
 from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
+from learner.ranges import task_ranges
 from learner.ranks import Ranks, ended_by
 from learner.run_directory import (
     CHECKPOINTS,
@@ -51,6 +53,7 @@ from learner.write_ahead import FOLDER, WriteAheadLog
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0
 _SHUTDOWN_SECONDS = 3.0
+_MOST_DROPPED = 5  # batches in a row that nothing could be learnt from, before it is no longer the batches' fault
 _COUNTERS = "counters and sequences of ranks that are gone are dropped, new ones begin with none"
 
 Notify = Callable[[str, str], None]
@@ -95,7 +98,7 @@ def run_learner(
     Raises:
       CongraspError: the directory is not a run's; the checkpoint does not fit; the disk is full; a thread of this
         process died; training collapsed; another rank ended the run.
-      PhysicsError: a value was not finite; state and batch are in `failure/`.
+      PhysicsError: batch after batch, a value was not finite; state and last batch are in `failure/`.
     """
     ranks = ranks or Ranks()
     try:
@@ -164,6 +167,7 @@ class _Learner:
         )
         self._checkpoints = Checkpoints(run_dir / CHECKPOINTS)
         self._state, meta = self._first_state(resume)
+        self._dropped = self._dropped_in_a_row = 0
         self._run_id, self._skipped, hubs = meta["run_id"], meta["skipped"], meta["hubs"]
         if ranks.count > 1:
             # Before there is a hub, and so before an actor in this process captures its engine's graphs.
@@ -184,6 +188,7 @@ class _Learner:
             on_event=notify,
             audit=AuditLog(run_dir, name, log_error) if audit else None,
             log=WriteAheadLog(folder, staleness, write=config.write_ahead, log_error=log_error) if audit else None,
+            admission=Admission(functools.partial(task_ranges, config.task, config.curriculum)),
         )
         self._is_new = not hubs
         if hubs and len(hubs) != ranks.count:
@@ -309,19 +314,35 @@ class _Learner:
         try:
             with self._ranks.watchdog():
                 self._state, metrics = self._algorithm.update(self._state, batch, self._ranks.mesh)
+            self._dropped_in_a_row = 0
         except NonFiniteUpdate as error:
             self._hub.discard(messages)
-            self._ranks.close()
-            folder, number = self._run_dir / "failure", f"-{self._ranks.rank}" if self._ranks.count > 1 else ""
-            with contextlib.suppress(CongraspError):
-                write_atomically(folder / f"batch{number}.safetensors", encode(Message(batch, {})))
-                if self._ranks.rank == 0:
-                    write_atomically(folder / "state.safetensors", encode(Message(flatten(error.state), {})))
-            self._event("fatal", str(error))
-            raise PhysicsError(str(error), f"State and batch are in {folder}.") from None
+            self._state, metrics = self._drop(batch, error), {}
         self._publish()
         everyone = self._ranks.exchange(mine).meta["entries"]
-        return {**metrics, **overall(everyone)}, sum(entry["steps"] for entry in everyone)
+        return {**metrics, "batches_dropped": float(self._dropped), **overall(everyone)}, sum(
+            entry["steps"] for entry in everyone
+        )
+
+    def _drop(self, batch: Mapping[str, Any], error: NonFiniteUpdate) -> TrainState:
+        """The state after a batch that nothing can be learnt from: a version on, with the same policy.
+
+        Batch and state are kept in `failure/`. All ranks come to the same decision, by their common update.
+        """
+        self._dropped, self._dropped_in_a_row = self._dropped + 1, self._dropped_in_a_row + 1
+        folder, number = self._run_dir / "failure", f"-{self._ranks.rank}" if self._ranks.count > 1 else ""
+        with contextlib.suppress(CongraspError):
+            write_atomically(folder / f"batch{number}.safetensors", encode(Message(batch, {})))
+            if self._ranks.rank == 0:
+                write_atomically(folder / "state.safetensors", encode(Message(flatten(error.state), {})))
+        if self._dropped_in_a_row < _MOST_DROPPED:
+            self._event("error", f"{error} The batch was dropped; state and batch are in {folder}.")
+            return error.state._replace(version=error.state.version + 1)
+        self._ranks.close()
+        self._event("fatal", str(error))
+        raise PhysicsError(
+            f"{error} It was the {self._dropped_in_a_row}th batch in a row.", f"State and batch are in {folder}."
+        ) from None
 
     def _publish(self) -> None:
         if self._ranks.rank == 0:

@@ -1,4 +1,4 @@
-"""Rate limit of useless work, a token bucket for each actor's certificate.
+"""Rate limit of useless work, a token bucket for each actor's certificate; and how long an offender is put off.
 
 A request that helps training costs nothing: a ticket that is granted, a rollout that is accepted. All others (asked for
 in vain, refused, too old, sent twice) cost tokens by their size. Whoever has none left is told to come again later
@@ -16,6 +16,7 @@ from common.wire.codec import Message
 DAMAGED = 1 << 20
 """Bytes that a message is charged for which cannot be decoded."""
 _NAMES = 1024
+_LONGEST = 600.0  # seconds that anybody is put off
 
 
 class RateLimit:
@@ -80,6 +81,40 @@ class RateLimit:
     def _level(self, name: str) -> float:
         level, since = self._levels.get(name, (self._most, 0.0))
         return min(self._most, level + (self._clock() - since) * self._per_second)
+
+
+class PutOff:
+    """Who offends is told to come again later: at once the first time, then after 1, 2, 4, … seconds.
+
+    Offences are counted for each certificate, and one is forgiven for each useful rollout. Not safe for several
+    threads.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic):
+        """Nobody has offended; `clock` counts seconds, monotonic."""
+        self._clock = clock
+        self._known: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
+
+    def offend(self, actor: str) -> None:
+        """Notes an offence of an actor."""
+        name = certificate(actor)
+        count = self._known.get(name, (0, 0.0))[0] + 1
+        seconds = 0.0 if count == 1 else min(_LONGEST, 2.0 ** min(count - 2, 20))
+        self._known[name] = count, self._clock() + seconds
+        self._known.move_to_end(name)
+        if len(self._known) > _NAMES:
+            self._known.popitem(last=False)
+
+    def forgive(self, actor: str) -> None:
+        """Notes something useful of an actor."""
+        name = certificate(actor)
+        count, until = self._known.pop(name, (0, 0.0))
+        if count > 1:
+            self._known[name] = count - 1, until
+
+    def seconds(self, actor: str) -> float:
+        """Seconds until the actor may come again, 0 for most."""
+        return max(0.0, self._known.get(certificate(actor), (0, 0.0))[1] - self._clock())
 
 
 def certificate(actor: str) -> str:

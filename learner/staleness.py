@@ -9,22 +9,28 @@ that its updates have used or that wait for one, and `running` the tickets that 
 only be thrown away, unless its actor is slow. A rollout that arrives more than `max_staleness` versions after the
 policy that made it is refused, and dropped if it grows that old while it waits.
 
-A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes.
+A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes. Who gets one, and until when,
+also depends on what has come of earlier ones (`learner.tickets`).
 
 The lag of a rollout is the number of updates between the policy that acted and the current one. A learner that resumes
 from a checkpoint gives its policy a new number; what acted under the versions before is measured from the checkpoint's:
 rollouts of that very policy are as fresh as ever, those of policies that died with the killed learner are not.
 """
 
+import collections
 import dataclasses
 import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Literal, NamedTuple
 
+from learner.rate_limit import certificate
+from learner.tickets import TicketBudget
+
 Owner = tuple[str, str]
 """Actor and incarnation."""
 Verdict = Literal["accepted", "stale", "full"]
+_EXPIRED = 256  # tickets that are remembered, to learn how long their rollouts take
 
 
 class Ticket(NamedTuple):
@@ -35,6 +41,7 @@ class Ticket(NamedTuple):
     """Chosen by the owner, so that asking twice yields one ticket."""
     version: int
     """Policy version when it was granted."""
+    granted: float
     deadline: float
 
 
@@ -86,17 +93,19 @@ class StalenessManager:
         Args:
           max_staleness: eta, versions.
           rollouts_per_update: the batch.
-          ticket_seconds: seconds until an unused ticket expires.
+          ticket_seconds: seconds until an unused ticket expires, at most.
           tickets_per_owner: tickets that one owner can hold, so that nobody takes all there are.
           clock: seconds, monotonic.
         """
         self._max_staleness = max_staleness
         self._batch = rollouts_per_update
-        self._seconds = ticket_seconds
+        slots = (max_staleness + 1) * rollouts_per_update
+        self._budget = TicketBudget(slots, rollouts_per_update, ticket_seconds, clock)
         self._per_owner = tickets_per_owner
         self._clock = clock
         self._lock = threading.RLock()
         self._tickets: dict[tuple[Owner, str], Ticket] = {}
+        self._expired: collections.OrderedDict[tuple[Owner, str], Ticket] = collections.OrderedDict()
         self._version = 0
         self._in_update = 0
         # Where the last resume began: the version of the checkpoint, and the one that its policy got instead.
@@ -145,9 +154,11 @@ class StalenessManager:
             if held := self._tickets.get((owner, ticket_id)):
                 return held
             mine = sum(ticket.owner == owner for ticket in self._tickets.values())
-            if mine >= self._per_owner or self.capacity <= 0:
+            shared = sum(certificate(ticket.owner[0]) == certificate(owner[0]) for ticket in self._tickets.values())
+            if mine >= self._per_owner or not self._budget.admits(owner[0], shared) or self.capacity <= 0:
                 return None
-            ticket = Ticket(owner, ticket_id, self._version, self._clock() + self._seconds)
+            now = self._clock()
+            ticket = Ticket(owner, ticket_id, self._version, now, now + self._budget.lasts(owner[0]))
             self._tickets[owner, ticket_id] = ticket
             self._counters.granted += 1
             return ticket
@@ -186,6 +197,8 @@ class StalenessManager:
             self._expire()
             if (owner, ticket_id) not in self._tickets and self.capacity <= 0 and not beyond_capacity:
                 return "full"
+            if ticket := self._tickets.get((owner, ticket_id)) or self._expired.pop((owner, ticket_id), None):
+                self._budget.deliver(owner[0], self._clock() - ticket.granted)
             self.redeem(owner, ticket_id)
             self._counters.accepted += 1
             return "accepted"
@@ -278,5 +291,8 @@ class StalenessManager:
         now = self._clock()
         late = [key for key, ticket in self._tickets.items() if ticket.deadline <= now]
         for key in late:
-            del self._tickets[key]
+            self._expired[key] = self._tickets.pop(key)
+            self._budget.expire(key[0][0])
+        while len(self._expired) > _EXPIRED:
+            self._expired.popitem(last=False)
         self._counters.expired += len(late)

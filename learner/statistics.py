@@ -51,30 +51,38 @@ def overall(summaries: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], int]:
-    """Sum and number of each figure's values, and the number of episodes."""
-    columns: dict[str, list[np.ndarray]] = collections.defaultdict(list)
+    """Sum and number of each figure's values, and the number of episodes; rollouts need not name the same figures."""
+    sums: dict[str, list[float]] = {}
+    episodes = 0
     for message in messages:
-        for name, values in message.arrays.items():
-            if name.startswith(_EPISODE):
-                columns[name].append(np.asarray(values, np.float64).ravel())
-    joined = {name: np.concatenate(parts) for name, parts in columns.items()}
-    count = max((len(values) for values in joined.values()), default=0)
+        columns = {
+            name: np.asarray(values, np.float64).ravel()
+            for name, values in message.arrays.items()
+            if name.startswith(_EPISODE)
+        }
+        count = max((len(values) for values in columns.values()), default=0)
+        episodes += count
+        for name, values in _figures(columns, count).items():
+            total = sums.setdefault(name, [0.0, 0.0])
+            total[0] += float(np.nansum(values))
+            total[1] += float(np.sum(~np.isnan(values)))
+    return {name: total for name, total in sums.items() if total[1]}, episodes
+
+
+def _figures(columns: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
+    """One rollout's figures (E,), NaN for episodes that they do not concern."""
     none = np.zeros(count)
-    blocks = {block: joined.get(f"episode/mask_{block}", none) > 0 for c in _OPTIONAL for block in c.blocks}
+    blocks = {block: columns.get(f"episode/mask_{block}", none) > 0 for c in _OPTIONAL for block in c.blocks}
     active = {constraint.name: constraint.among(blocks) for constraint in _OPTIONAL}
     active["heading"] = ~np.any(list(active.values()), 0)
-    success = joined.get("episode/success", np.full(count, np.nan))
-    joined |= {f"success/{name}": np.where(rows, success, np.nan) for name, rows in active.items()}
+    success = columns.get("episode/success", np.full(count, np.nan))
+    figures = {**columns, **{f"success/{name}": np.where(rows, success, np.nan) for name, rows in active.items()}}
     for constraint in CONSTRAINTS:
         for spec in constraint.errors:
-            if (name := f"episode/{spec.name}") in joined:
+            if (name := f"episode/{spec.name}") in columns:
                 rows = blocks[spec.block] if spec.block else active[constraint.name]
-                joined[name] = np.where(rows, joined[name], np.nan)
-    return {
-        name: [float(np.nansum(values)), float(np.sum(~np.isnan(values)))]
-        for name, values in joined.items()
-        if not np.isnan(values).all()
-    }, count
+                figures[name] = np.where(rows, columns[name], np.nan)
+    return figures
 
 
 class Pace:

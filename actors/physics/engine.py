@@ -98,9 +98,3 @@ def where_environments(mask: Array, new: Any, old: Any) -> Any:
         return jnp.where(mask.reshape(-1, *([1] * (a.ndim - 1))), a, b)
 
     return jax.tree.map(pick, new, old)
-
-
-MAX_SPEED = 400.0
-"""A joint faster than this (m/s or rad/s) marks a diverged environment."""
-MAX_DISTANCE = 25.0
-"""A joint position beyond this (m or rad) marks a diverged environment; free fall of 2 s stays below it."""

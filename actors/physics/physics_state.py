@@ -5,8 +5,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from actors.physics.engine import MAX_DISTANCE, MAX_SPEED, PhysicsState, ResetState
+from actors.physics.engine import PhysicsState, ResetState
 from actors.physics.scene import SENSOR_WIDTH, Addresses
+from common.ranges import MAX_DISTANCE, MAX_SPEED
 from common.task.types import CONTACTS_PER_LINK, Array
 
 

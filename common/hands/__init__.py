@@ -7,11 +7,12 @@ from collections.abc import Callable
 
 from common.errors import CongraspError
 from common.hands.allegro import ALLEGRO
-from common.hands.files import hand_from_text, read_hand
+from common.hands.files import MAX_BYTES, hand_from_text, read_hand
 from common.hands.human import HUMAN
 from common.hands.mano import own_mano_hand
 from common.hands.sharpa import SHARPA
 from common.hands.spec import Hand
+from common.inputs import LONGEST_NAME
 
 HANDS: dict[str, Callable[[], Hand]] = {
     "human": lambda: HUMAN,
@@ -36,9 +37,44 @@ def hands_folder() -> pathlib.Path:
     return pathlib.Path(os.environ.get(VARIABLE) or pathlib.Path(config, "congrasp", "hands"))
 
 
-@functools.cache
+def check_reference(reference: object) -> str:
+    """Returns what a policy may call its hand: a name, or all of the hand's own text, but no path.
+
+    Raises:
+      CongraspError: it is neither.
+    """
+    name = reference if isinstance(reference, str) and len(reference) <= MAX_BYTES else ""
+    if (name.isidentifier() and len(name) <= LONGEST_NAME) or name.lstrip().startswith("{"):
+        return name
+    raise _unknown(reference)
+
+
+def known_hand(reference: object) -> Hand:
+    """The hand that a message or a recording names: one of the package, or one whose text it brings along.
+
+    What others send opens no file of this machine, so that they neither learn what is there nor make anything wait.
+
+    Raises:
+      CongraspError: it is neither, or the text is no hand.
+    """
+    name = check_reference(reference)
+    if name in HANDS:
+        return get_hand(name)
+    if name.isidentifier():
+        raise _unknown(reference)
+    return hand_from_text(name)
+
+
+def _unknown(reference: object) -> CongraspError:
+    """The error of a hand that a message cannot name."""
+    return CongraspError(
+        f"{ascii(reference)[:60]} is no hand that a message can name.", f"It is one of: {', '.join(sorted(HANDS))}."
+    )
+
+
+@functools.lru_cache(maxsize=64)
 def get_hand(reference: str) -> Hand:
-    """A hand, the same object every time for the same words.
+    """A hand, the same object every time for the same words; `known_hand` is for words that come from others.
 
     Args:
       reference: the name of a hand of the package or of one in `hands_folder`, the path of a hand file, or all of its

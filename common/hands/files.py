@@ -61,7 +61,7 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
     return hand
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=16)
 def _described(text: str) -> tuple[Hand | None, str]:
     """The hand of a file's text, or what is wrong with it."""
     fields = json.loads(text)

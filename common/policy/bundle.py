@@ -20,7 +20,7 @@ import numpy as np
 from common.config import NetworkConfig, TaskConfig
 from common.errors import CongraspError
 from common.files import write_atomically
-from common.hands import get_hand
+from common.hands import check_reference, get_hand
 from common.inputs import read_file
 from common.policy import network, normalizer
 from common.policy.network import Layout, Params
@@ -143,7 +143,7 @@ class PolicyBundle:
             raise CongraspError(f"The policy {source} has format {meta.get('format')}, not {FORMAT}.", _REMEDY)
         try:
             spec = PolicySpec(
-                hand=str(meta["hand"]),
+                hand=check_reference(meta["hand"]),
                 layout=tuple((str(name), int(size)) for name, size in meta["layout"]),
                 action_size=int(meta["action_size"]),
                 network=_dataclass(NetworkConfig, meta["network"]),

@@ -1,13 +1,39 @@
-"""Errors of one control step, with the paper's definitions (section Metrics), and their means over an episode."""
+"""Errors of one control step, with the paper's definitions (section Metrics), and what is told of an episode."""
 
 from collections.abc import Mapping
 
 import jax.numpy as jnp
 
 from common.config import TaskConfig
-from common.task.constraints import error_specs, known
+from common.task.constraints import blocks, error_specs, known
 from common.task.constraints.base import ErrorSpec, Scene
+from common.task.reward import terms
 from common.task.types import Array
+
+FORCES = ("force_sum", "force_link_max")
+DIVERGED = "bad"  # the metric's name on the wire and in recordings
+
+
+def metric_names(task: TaskConfig) -> tuple[str, ...]:
+    """Metrics of a finished episode: outcome, errors of the constraints, forces, and which blocks were active."""
+    return (
+        "success",
+        "held",
+        "return",
+        "length",
+        "links_at_removal",
+        "moved_at_removal",
+        *(spec.name for spec in specs(task)),
+        *FORCES,
+        DIVERGED,
+        *(f"mask_{name}" for name in blocks(task)),
+        "object_index",
+    )
+
+
+def episode_fields(task: TaskConfig) -> tuple[str, ...]:
+    """What an actor reports of a finished episode, by the names on the wire: the metrics, then sums of reward terms."""
+    return (*(f"episode/{name}" for name in metric_names(task)), *(f"term/{name}" for name in terms(task)))
 
 
 def specs(task: TaskConfig) -> tuple[ErrorSpec, ...]:

@@ -52,9 +52,10 @@ class Alive(NamedTuple):
 
 
 def parse_alive(key: str) -> Alive | None:
-    """The owner of a liveliness token; None if the key is none."""
+    """The owner of a liveliness token; None if the key is none, or holds what is no name."""
     parts = key.split("/")
-    return Alive(*parts[3:]) if len(parts) == 6 and parts[2] == "alive" else None
+    named = len(parts) == 6 and parts[2] == "alive" and all(map(_NAME.fullmatch, parts[3:]))
+    return Alive(*parts[3:]) if named else None
 
 
 def matches(expression: str, key: str) -> bool:

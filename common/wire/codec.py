@@ -26,6 +26,7 @@ MAX_MESSAGE = 256 << 20
 """Bytes that a message may have unless the caller says otherwise."""
 MAX_HEADER = 1 << 20
 """Bytes that a header may have."""
+_BEGIN, _DIGITS = b'{"__metadata__":{"checksum":"', 8
 _MAX_DIMENSIONS = 8
 _MAX_ITEMS = 1 << 40
 _DTYPES = {
@@ -84,7 +85,7 @@ def _encode(message: Message) -> bytes:
     arrays = {name: _portable(name, array) for name, array in message.arrays.items()}
     # Wide dtypes first, so that every array starts at a multiple of its item's size.
     order = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
-    header: dict[str, Any] = {"__metadata__": {"meta": meta, "crc32": ""}}
+    header: dict[str, Any] = {"__metadata__": {"checksum": "0" * _DIGITS, "meta": meta}}
     parts, offset, crc = [], 0, 0
     for name in order:
         array = arrays[name]
@@ -93,13 +94,13 @@ def _encode(message: Message) -> bytes:
         parts.append(array.reshape(-1).view(np.uint8).data)
         crc = crc32(parts[-1], crc)
         offset = end
-    header["__metadata__"]["crc32"] = f"{crc:08x}"
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > MAX_HEADER:
         raise CongraspError(
             f"A message's header has {len(text)} bytes.", f"At most {MAX_HEADER} fit: send less meta data."
         )
+    text = b"%s%08x%s" % (_BEGIN, crc32(text, crc), text[len(_BEGIN) + _DIGITS :])
     return b"".join([len(text).to_bytes(8, "little"), text, *parts])
 
 
@@ -122,10 +123,16 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
         raise CongraspError(f"The message's header claims {length} bytes, more than the {MAX_HEADER} that are allowed.")
     if 8 + length > len(data):
         raise CongraspError(f"The message is cut inside its header: {len(data)} bytes of {8 + length} or more.")
-    header = _header(data[8 : 8 + length])
-    section = memoryview(data)[8 + length :]
-    meta, crc = _metadata(header.pop("__metadata__", None))
-    if crc32(section) != crc:
+    text, section = data[8 : 8 + length], memoryview(data)[8 + length :]
+    crc, covers_header = crc32(section), text.startswith(_BEGIN)
+    if covers_header:
+        digits = slice(len(_BEGIN), len(_BEGIN) + _DIGITS)
+        crc = crc32(text[: digits.start] + b"0" * _DIGITS + text[digits.stop :], crc)
+        if text[digits] != b"%08x" % crc:
+            raise CongraspError("The message does not match its checksum.")
+    header = _header(text)
+    meta, older = _metadata(header.pop("__metadata__", None), "checksum" if covers_header else "crc32")
+    if not covers_header and older != f"{crc:08x}":
         raise CongraspError("The message's data do not match their checksum.")
     message = SharedMessage(_arrays(header, section), meta)
     vars(message)["encoded"] = data
@@ -191,14 +198,13 @@ def _no_constant(name: str) -> Any:
     raise CongraspError(f"The message's header holds {name}, which is not JSON.")
 
 
-def _metadata(entry: Any) -> tuple[dict[str, Any], int]:
-    if not isinstance(entry, dict) or not isinstance(entry.get("meta"), str) or not isinstance(entry.get("crc32"), str):
+def _metadata(entry: Any, checked_by: str) -> tuple[dict[str, Any], str]:
+    """The meta data, and the checksum as it stands there under its name."""
+    if not isinstance(entry, dict) or entry.keys() != {"meta", checked_by}:
         raise CongraspError("The message lacks its meta data or its checksum.")
-    try:
-        crc = int(entry["crc32"], 16)
-    except ValueError:
-        raise CongraspError("The message's checksum is not a hexadecimal number.") from None
-    return _header(entry["meta"].encode(errors="replace")), crc
+    if not isinstance(entry["meta"], str) or not isinstance(entry[checked_by], str):
+        raise CongraspError("The message's meta data or checksum is no text.")
+    return _header(entry["meta"].encode(errors="replace")), entry[checked_by]
 
 
 def _arrays(header: dict[str, Any], section: memoryview) -> dict[str, np.ndarray]:

@@ -15,6 +15,8 @@ from common.transport.keys import check_name
 from common.wire.codec import Message
 from common.wire.schema import F32, RECORDED, ArraySpec, RolloutForm
 
+LONGEST_TEXT = 4096
+"""Characters of a text in the meta data; a hand's own text has its own limit (`common.hands.files`)."""
 REAL = ("float32", "float64")
 _INFINITE_HALF = 0x7C00  # exponent bits of a float16 that is infinite or not a number
 _BLOCK = 1 << 16
@@ -130,6 +132,12 @@ def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int
             raise CongraspError(
                 f"The {spec.kind}'s meta entry '{name}' is {ascii(value)[:60]}, not {_type_name(kind)}."
             )
+        if isinstance(value, str) and name != "hand" and len(value) > LONGEST_TEXT:
+            raise CongraspError(
+                f"The {spec.kind}'s meta entry '{name}' has {len(value)} characters, more than {LONGEST_TEXT}."
+            )
+        if isinstance(value, int) and abs(value) > _COUNTS:
+            raise CongraspError(f"The {spec.kind}'s meta entry '{name}' is beyond all counts.")
     for name, array_spec in spec.arrays.items():
         if not name.endswith("/*") and not array_spec.optional and name not in message.arrays:
             raise CongraspError(f"The {spec.kind} lacks the array '{name}'.")

@@ -43,8 +43,10 @@ _CHECKED = (
     "KL divergence",
     "actor gradient",
     "critic gradient",
+    "policy (a KL divergence out of all reason)",
 )
 _FINE = -1  # no term was non-finite; otherwise an index into _CHECKED
+_UNREASONABLE_KL = 10.0  # nats between the policies before and after an update; a hundredth of one is aimed at
 _RATE_FACTOR = 1.5
 
 Learnt = tuple[Params, Any, Array]
@@ -101,7 +103,8 @@ class PPO:
         estimates do not change with them (van Hasselt et al. 2016, arXiv 1602.07714). Rewards are not scaled yet.
 
         Raises:
-          NonFiniteUpdate: naming the first term that was not finite.
+          NonFiniteUpdate: naming the first term that was not finite, or the policy, if it left its trust region by far;
+            the state is that before the update.
           CongraspError: if there are more minibatches than transitions.
         """
         layout, config = self._spec.layout, self._config
@@ -251,7 +254,7 @@ def _program(
     failure = collectives.max(_first_failure(jnp.int32(_FINE), 0, *inputs, evaluation.value))
     key, epochs_key = jax.random.split(key)
     learning_rate = optimizer.hyperparams["learning_rate"]
-    params, optimizer, failure, (terms, norms) = _epochs(
+    moved, moved_optimizer, failure, (terms, norms) = _epochs(
         params,
         _with(optimizer, max_grad_norm=jnp.float32(hyper["max_grad_norm"])),
         failure,
@@ -264,15 +267,19 @@ def _program(
         minibatches,
     )
     kl = jnp.mean(terms.kl[-1])
+    failure = jnp.where((failure == _FINE) & (kl > _UNREASONABLE_KL), len(_CHECKED) - 1, failure)
     metrics = {name: jnp.mean(term) for name, term in terms._asdict().items()}
     metrics |= {f"{name}_grad_norm": jnp.mean(norm) for name, norm in norms.items()}
     metrics |= {
         "kl": kl,
         "learning_rate": learning_rate,
-        "action_std": jnp.mean(jnp.exp(params["actor"]["log_std"])),
+        "action_std": jnp.mean(jnp.exp(moved["actor"]["log_std"])),
     }
     metrics |= _batch_metrics(given, evaluation, collectives)
-    optimizer = _with(optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
+    moved_optimizer = _with(moved_optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
+    params, optimizer = jax.tree.map(
+        lambda new, old: jnp.where(failure == _FINE, new, old), (moved, moved_optimizer), (params, optimizer)
+    )
     return (params, optimizer, key), collectives.gather(normalizer.moments(evaluation.returns)), failure, metrics
 
 
@@ -336,12 +343,8 @@ def _epochs(
             norms["actor"],
             norms["critic"],
         )
-        steps, moved_optimizer = transform.update(gradients, optimizer, params)
-        moved = optax.apply_updates(params, steps)
-        params, optimizer = jax.tree.map(
-            lambda new, old: jnp.where(failure == _FINE, new, old), (moved, moved_optimizer), (params, optimizer)
-        )
-        return (params, optimizer, failure), (terms, norms)
+        steps, optimizer = transform.update(gradients, optimizer, params)
+        return (optax.apply_updates(params, steps), optimizer, failure), (terms, norms)
 
     def epoch(carry: tuple[Params, Any, Array], key: Array):
         order = jax.random.permutation(key, count)[: size * minibatches]

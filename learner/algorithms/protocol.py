@@ -78,7 +78,7 @@ class Algorithm(Protocol):
             a batch of the same shape, and comes to the same state; None if this process is alone.
 
         Raises:
-          NonFiniteUpdate: naming the first term that was not finite.
+          NonFiniteUpdate: naming the first term that was not finite; the batch is dropped.
         """
 
     def policy(self, state: TrainState) -> Policy:
@@ -89,7 +89,7 @@ class NonFiniteUpdate(PhysicsError):
     """A term of an update was not finite.
 
     Attributes:
-      state: the training state before what failed.
+      state: the training state before the update.
     """
 
     def __init__(self, term: str, source: str, state: TrainState):

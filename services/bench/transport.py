@@ -28,6 +28,7 @@ from common.transport import urls
 from common.transport.ports import free_port, local_url
 from common.wire.codec import Message, encode
 from common.wire.schema import RolloutForm
+from learner.admission import Admission, Ranges
 from learner.audit import AuditLog
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
@@ -106,6 +107,7 @@ def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]
 def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tuple[LearnerHub, str]]:
     """A learner's hub without a learner, and where it listens."""
     endpoint = local_url()
+    ranges = Ranges(np.full(_FORM.observation, 100.0), 100.0, 100.0, {})
     with urls.listen(endpoint, "learner") as transport:
         hub = LearnerHub(
             transport,
@@ -117,6 +119,7 @@ def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tup
             staleness=StalenessManager(1, _BATCH),
             audit=AuditLog(folder, "0"),
             log=WriteAheadLog(folder / FOLDER, 1, write=write_ahead),
+            admission=Admission(lambda: ranges),
         )
         yield hub, endpoint
         hub.close()

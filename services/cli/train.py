@@ -70,8 +70,9 @@ def train(
 
     config = with_hand(config if method is None else with_method(config, method), hand)
     if constraints is not None or split is not None:
-        given = {"constraints": str(constraints)} if constraints else {}
-        objects = dataclasses.replace(config.objects, **given, split=split or config.objects.split)
+        objects = config.objects
+        folder = objects.constraints if constraints is None else str(constraints)
+        objects = dataclasses.replace(objects, constraints=folder, split=split or objects.split)
         config = dataclasses.replace(config, objects=objects)
     return run_training(
         config,

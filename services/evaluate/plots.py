@@ -1,6 +1,5 @@
 """Figures of an evaluation from its JSON: the table beside the paper's, rates with intervals, and how errors spread."""
 
-import json
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from common.errors import CongraspError
+from common.inputs import read_json
 from common.task.constraints import CONSTRAINTS
 from services.record.palette import INK
 from services.viz.plots import COLOURS, QUIET, new_figure, save, style
@@ -19,6 +19,7 @@ _TITLES = {
 }
 """Title and unit of each error, by its name in the rows."""
 _COLUMNS = 4
+_LARGEST = 64 << 20  # bytes of a JSON file
 
 
 def plot_evaluation(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str]) -> list[pathlib.Path]:
@@ -36,13 +37,13 @@ def plot_evaluation(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str
       CongraspError: it is no such file.
     """
     try:
-        rows = json.loads(path.read_text())["rows"]
+        rows = read_json(path, _LARGEST)["rows"]
         figures = {"table": _table(rows), "success": _success(rows)}
         if any(row.get("quantiles") for row in rows):
             figures["errors"] = _errors(rows)
     except OSError as error:
         raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (CongraspError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise CongraspError(
             f"{path} is not the result of an evaluation ({type(error).__name__}: {error}).",
             "Name a file that 'congrasp evaluate --json FILE' wrote, or a run's folder.",

@@ -1,6 +1,5 @@
 """A layout for Foxglove that fits a recording: its actors in 3-D, its learning curves, its events."""
 
-import json
 import pathlib
 from collections.abc import Sequence
 
@@ -8,8 +7,9 @@ import foxglove.layouts as fl
 
 from common.errors import CongraspError
 from common.files import write_atomically
+from common.inputs import parse_json
 from services.record.channels import flatten
-from services.record.reader import log_files, read_records
+from services.record.reader import log_files, metrics_of, read_records
 
 CURVES = {
     "Success and return": ("episode/success", "episode/return"),
@@ -47,9 +47,9 @@ def export_layout(recording: pathlib.Path, path: pathlib.Path) -> int:
             if kind == "episode":
                 fields = actors.setdefault(rest[0], set())
                 if rest[1] == "signals":
-                    fields |= set(flatten(json.loads(record.data)))
+                    fields |= set(flatten(parse_json(record.data, "A recording's signals")))
             elif kind == "metrics":
-                metrics.setdefault(record.topic, set()).update(flatten(json.loads(record.data)["values"]))
+                metrics.setdefault(record.topic, set()).update(flatten(metrics_of(record)["values"]))
             else:
                 events = events or record.topic
     if not (actors or metrics):

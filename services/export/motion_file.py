@@ -17,7 +17,7 @@ import numpy as np
 from common.described import check_arrays
 from common.errors import CongraspError
 from common.files import write_atomically
-from common.hands import get_hand
+from common.hands import known_hand
 from common.hands.spec import Hand, capsule_ends
 from common.inputs import file_name
 from common.npz import read_npz
@@ -101,7 +101,7 @@ _FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name != "goal"
 def motion_of_episode(episode: Message) -> GraspMotion:
     """The motion of an episode, whether just made or read from MCAP (`services.record.reader.read_episodes`)."""
     arrays, meta = {name: np.asarray(value) for name, value in episode.arrays.items()}, dict(episode.meta)
-    hand = get_hand(meta.pop("hand"))
+    hand = known_hand(meta.pop("hand"))
     dt = float(meta.pop("control_dt"))
     return GraspMotion(
         hand=hand.name,

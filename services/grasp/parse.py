@@ -4,7 +4,6 @@ Files give positions in metres in the axes and with the origin of the object's o
 sets, which know the object's frame, are taken as they are.
 """
 
-import json
 import os
 import pathlib
 from collections.abc import Callable, Iterable, Mapping
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from common.errors import CongraspError
 from common.hands.spec import Hand
+from common.inputs import read_json
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.task import constraint_sets
@@ -30,6 +30,7 @@ from services.export.motion_file import GraspMotion, load_motion
 
 ABOVE = "above"
 """The heading straight down, whatever the object's pose."""
+_LARGEST = 4 << 20  # bytes of a JSON file
 _FAR = 1.0  # m from an object beyond which nobody grasps it
 _NEAR = 0.004  # m from a part within which a point of the surface belongs to it
 
@@ -303,11 +304,11 @@ def _json(path: pathlib.Path, name: str, keys: tuple[str, ...]) -> dict[str, Any
     """A JSON file that has these keys."""
     remedy = f"Write a JSON file with {', '.join(keys)}, or name a motion (.npz) or a constraint set."
     try:
-        given = json.loads(path.read_text())
+        given = read_json(path, _LARGEST, remedy)
     except OSError as error:
         raise CongraspError(f"{name}: {path} cannot be read: {error.strerror}.", remedy) from None
-    except ValueError:
-        raise CongraspError(f"{name}: {path} is not JSON.", remedy) from None
+    except CongraspError as error:
+        raise CongraspError(f"{name}: {error}") from None
     for key in keys:
         if not isinstance(given, dict) or key not in given:
             raise CongraspError(f"{name}: {path} lacks '{key}'.", remedy)

@@ -4,6 +4,7 @@ What comes out is in metres, in a world whose z axis points up, for the `human` 
 the thumb's side +x, the back of the hand +z.
 """
 
+import io
 import pathlib
 from typing import NamedTuple
 
@@ -11,8 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
+from common.inputs import read_file
 from common.npz import read_npz
 
+_LARGEST, _DEEPEST = 32 << 20, 200
+"""Bytes of a BVH or CSV file, and joints of a BVH chain."""
 _UP = {"y": Rotation.from_euler("X", 90, degrees=True), "z": Rotation.identity()}
 _AXES = {
     f"{sign}{axis}": s * row for axis, row in zip("xyz", np.eye(3), strict=True) for sign, s in (("+", 1), ("-", -1))
@@ -84,14 +88,21 @@ def read_bvh(path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, floa
       CongraspError: the file is damaged, or has no such joint; the line names those that it has.
     """
     try:
-        head, _, tail = path.read_text().partition("MOTION")
-        chain, width, names = _chain(head, joint)
-        if chain is None:
-            raise CongraspError(f"{path} has no joint '{joint}'.", f"Its joints are: {', '.join(names)}.")
-        _, count, *_, seconds, rest = tail.split(maxsplit=5)
-        rows = np.array(rest.split(), float).reshape(int(count), width)
-    except (OSError, UnicodeDecodeError, ValueError, IndexError, KeyError) as error:
-        raise CongraspError(f"{path} cannot be read as BVH: {error}.", "Export it again.") from None
+        return _bvh(read_file(path, _LARGEST, "Cut it into shorter ones.").decode(), path, joint)
+    except (OSError, ValueError, LookupError, StopIteration) as error:
+        raise CongraspError(f"{path} cannot be read as BVH: {str(error)[:200]}.", "Export it again.") from None
+
+
+def _bvh(text: str, path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, float]:
+    """The same of a file's text; a ValueError, LookupError or StopIteration where it is damaged."""
+    head, _, tail = text.partition("MOTION")
+    chain, width, names = _chain(head, joint)
+    if chain is None:
+        raise CongraspError(f"{path} has no joint {ascii(joint)[:60]}.", f"Its joints are: {', '.join(names)[:2000]}.")
+    _, count, *_, seconds, rest = tail.split(maxsplit=5)
+    rows = np.array(rest.split(), float).reshape(int(count), width)
+    if not (np.isfinite(rows).all() and 0.0 < float(seconds) <= 1.0):
+        raise ValueError("it holds numbers that are not finite, or a frame takes more than a second")
     position, rotation = np.zeros((len(rows), 3)), Rotation.identity(len(rows))
     for offset, channels, first in chain:
         values = rows[:, first : first + len(channels)]
@@ -127,6 +138,8 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
             name = next(tokens)
         elif token == "{":
             stack.append((np.zeros(3), [], column))
+            if len(stack) > _DEEPEST:
+                raise ValueError(f"its joints are nested deeper than {_DEEPEST}")
         elif token == "OFFSET":
             stack[-1] = (np.array([float(next(tokens)) for _ in range(3)]), *stack[-1][1:])
         elif token == "CHANNELS":
@@ -143,9 +156,10 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
 def _csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
     """Positions (T, 3), quaternions (T, 4) and seconds between two frames, of a CSV file."""
     try:
-        rows = np.genfromtxt(path, delimiter=",", comments="#", ndmin=2)
-    except ValueError as error:
-        raise CongraspError(f"{path} cannot be read as CSV: {str(error).splitlines()[0]}.") from None
+        text = read_file(path, _LARGEST, "Cut it into shorter ones.").decode(errors="replace")
+        rows = np.genfromtxt(io.StringIO(text), delimiter=",", comments="#", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise CongraspError(f"{path} cannot be read as CSV: {str(error).partition(chr(10))[0][:200]}.") from None
     rows = rows[~np.isnan(rows).all(-1)]  # a line of names
     return _checked(path, rows[:, :3], rows[:, 3:])
 
@@ -163,7 +177,7 @@ def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
 
 def _checked(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """The same of arrays whose shapes and values are right; a file without times has 10 ms a frame."""
-    if position.ndim != 2 or position.shape[1] != 3 or quaternion.shape != (len(position), 4):
+    if position.ndim != 2 or position.shape[1:] != (3,) or quaternion.shape != (len(position), 4) or not len(position):
         raise CongraspError(
             f"{path} has positions {position.shape} and quaternions {quaternion.shape}.",
             "A frame is x, y, z and a quaternion w, x, y, z.",

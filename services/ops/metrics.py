@@ -81,6 +81,7 @@ class LearnerMetrics:
         for name, value in status["rates"].items():
             yield _gauge(name, "Over the last ten seconds.", value)
         yield from self._ledger(status["ledger"])
+        yield _gauge("roles_unlisted", "Processes beyond those that are listed.", status["unlisted"])
         yield from self._roles(status["roles"])
         update = _gauge("update", "Metrics of the last update, by the names of the log.", labels=["figure"])
         for name, value in self._values.items():
@@ -109,14 +110,17 @@ class LearnerMetrics:
         lag = _gauge("actor_lag", "Versions by which an actor's last rollout was behind.", labels=who)
         steps = _gauge("actor_steps_per_second", "Over the last ten seconds.", labels=who)
         rollouts = CounterMetricFamily("congrasp_learner_actor_rollouts", "Accepted of an actor.", labels=who)
+        refused = CounterMetricFamily("congrasp_learner_actor_refused", "Refused of an actor's name.", labels=who)
         for role in roles:
             labels = [role["id"], role["incarnation"]]
             if "lag" in role:
                 lag.add_metric(labels, role["lag"])
                 rollouts.add_metric(labels, role["rollouts"])
+            if "refused" in role:
+                refused.add_metric(labels, role["refused"])
             if "steps_per_second" in role:
                 steps.add_metric(labels, role["steps_per_second"])
-        yield from (alive, lag, steps, rollouts)
+        yield from (alive, lag, steps, rollouts, refused)
 
 
 def _gauge(name: str, help: str, value: float | None = None, labels: Sequence[str] | None = None) -> GaugeMetricFamily:

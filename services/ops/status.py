@@ -20,6 +20,7 @@ _SUMS = {
 }
 """Counters that are the sums of others: no ticket and no accepted rollout is lost."""
 _ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/s", "steps/s")
+_SHOWN = 100  # processes in a table
 
 
 def ask(transport: Transport, run: str) -> dict[str, Any]:
@@ -64,13 +65,15 @@ def tables(status: Mapping[str, Any]) -> Group:
     """The status for a terminal."""
     ended = ", finished" if status["finished"] else ""
     roles = Table(title=f"{status['run']}, version {status['version']}, run id {status['epoch']}{ended}")
-    for column in _ROLE:
+    refused = any(role.get("refused") for role in status["roles"])
+    for column in (*_ROLE, "refused") if refused else _ROLE:
         roles.add_column(column, justify="left" if column in _ROLE[:3] else "right")
-    for role in status["roles"]:
+    for role in status["roles"][:_SHOWN]:
         version = status["version"] if role["role"] == "learner" else role.get("version", "")
         rates = (f"{role[rate]:.2f}" if rate in role else "" for rate in ("rollouts_per_second", "steps_per_second"))
-        counts = (version, role.get("lag", ""), role.get("rollouts", ""))
-        roles.add_row(role["role"], role["id"], role["incarnation"], *map(str, counts), *rates)
+        counts = (version, role.get("lag", ""), role.get("rollouts", ""), *rates)
+        who = (Text(ascii(role[name])[1:70].rstrip("'")) for name in ("role", "id", "incarnation"))
+        roles.add_row(*who, *map(str, counts), *([str(role.get("refused", ""))] if refused else []))
     ledger = Table(title="Counters: tickets and rollouts")
     ledger.add_column("count")
     ledger.add_column("number", justify="right")
@@ -82,4 +85,7 @@ def tables(status: Mapping[str, Any]) -> Group:
         f"{rates['rollouts_per_second']:.2f} rollouts/s, {rates['steps_per_second']:.0f} steps/s; "
         f"{queue['length']} rollout(s) of at most {queue['limit']} waiting"
     )
-    return Group(roles, ledger, Text(line), *(Text(f"Warning: {text}", style="yellow") for text in status["warnings"]))
+    more = len(status["roles"][_SHOWN:]) + status["unlisted"]
+    others = [Text(f"{more} more process(es) show that they are alive.")] if more else []
+    wrong = (Text(f"Warning: {text}", style="yellow") for text in status["warnings"])
+    return Group(roles, *others, ledger, Text(line), *wrong)

@@ -4,6 +4,7 @@ Metrics and signals are JSON with a JSON schema, so that their numbers can be pl
 Protobuf messages, which Rerun reads too; rollouts and raw episodes are the bytes of `common.wire.codec`.
 """
 
+import collections
 import dataclasses
 import functools
 import json
@@ -13,12 +14,17 @@ from typing import Any, NamedTuple
 from google.protobuf.message import Message as Protobuf
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from common.errors import CongraspError
 from common.wire.codec import finite
 
 OPAQUE = "x-safetensors"
 """Encoding of messages that are the bytes of `common.wire.codec`."""
 ROLLOUT_SCHEMA = "congrasp.Rollout"
 """Name of the schema of rollouts."""
+
+_FIELDS, _GROWTHS = 512, 32
+"""Fields of a topic, and times that its schema may grow: every schema is written whole."""
+_LONGEST_NAME, _DEEPEST = 128, 8
 
 CONVENTIONS = {
     "units": "metres, radians, seconds, newtons, kilograms",
@@ -52,36 +58,62 @@ class Entry(NamedTuple):
     data: bytes
 
 
-@functools.cache
+@functools.lru_cache(maxsize=4096)
 def protobuf_channel(topic: str, kind: type[Protobuf], *, latched: bool = False) -> Channel:
     """A channel of one of Foxglove's messages, with the descriptors a reader needs."""
-    schema = build_file_descriptor_set(kind).SerializeToString()
-    return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", schema, latched)
+    own: Any = kind  # hashable, which its type does not say
+    return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", _descriptors(own), latched)
 
 
 @functools.cache
+def _descriptors(kind: Any) -> bytes:
+    """The schema of one of Foxglove's messages, one object for all channels."""
+    return build_file_descriptor_set(kind).SerializeToString()
+
+
+@functools.lru_cache(maxsize=4096)
 def opaque_channel(topic: str, name: str) -> Channel:
     """A channel of encoded `common.wire.codec.Message`s; `name` says of which kind."""
     return Channel(topic, OPAQUE, name, "", b"")
 
 
 class JsonChannels:
-    """Channels of JSON objects whose schemas grow when new fields appear: a schema must name a field to plot it."""
+    """Channels of JSON objects whose schemas grow when new fields appear: a schema must name a field to plot it.
+
+    They grow up to a number of fields and of times; what comes after that is left out.
+    """
 
     def __init__(self) -> None:
         """No topic is known."""
         self._fields: dict[str, dict[str, Any]] = {}
         self._channels: dict[str, Channel] = {}
+        self._growths: collections.Counter[str] = collections.Counter()
 
     def entry(self, topic: str, time: int, value: Mapping[str, Any]) -> Entry:
         """The object as an entry; fields that are NaN or infinite are left out, because JSON has no such numbers."""
         plain = finite(value)
         fields = self._fields.setdefault(topic, {})
+        known = _known(fields, plain)
+        if self._growths[topic] >= _GROWTHS or _count(fields) + _count(plain) - _count(known) > _FIELDS:
+            plain = known
         if _merge(fields, plain) or topic not in self._channels:
+            self._growths[topic] += 1
             # Schemas are known by their name, so every topic has its own.
             schema = json.dumps(_schema(fields)).encode()
             self._channels[topic] = Channel(topic, "json", f"congrasp{topic.replace('/', '.')}", "jsonschema", schema)
         return Entry(self._channels[topic], time, json.dumps(plain, separators=(",", ":")).encode())
+
+    def forget(self, topic: str) -> None:
+        """Forgets a topic that is no longer published."""
+        for known in (self._fields, self._channels, self._growths):
+            known.pop(topic, None)
+
+
+def check_field(name: str) -> str:
+    """Returns a field's name; a CongraspError if it is too long, or a group of groups of too many groups."""
+    if len(name) > _LONGEST_NAME or name.count("/") > _DEEPEST:
+        raise CongraspError(f"{ascii(name)[:60]} is too long or too deep for the name of a metric.")
+    return name
 
 
 def nest(values: Mapping[str, float]) -> dict[str, Any]:
@@ -123,6 +155,20 @@ def _merge(fields: dict[str, Any], value: Mapping[str, Any]) -> bool:
             fields[name] = _kind(item)
             grown = True
     return grown
+
+
+def _known(fields: Mapping[str, Any], value: Mapping[str, Any]) -> dict[str, Any]:
+    """What of an object is in the fields that are known."""
+    kept = {name: item for name, item in value.items() if name in fields}
+    return {
+        name: _known(fields[name], item) if isinstance(item, Mapping) and isinstance(fields[name], dict) else item
+        for name, item in kept.items()
+    }
+
+
+def _count(fields: Mapping[str, Any]) -> int:
+    """Fields at any depth."""
+    return sum(_count(item) if isinstance(item, Mapping) else 1 for item in fields.values())
 
 
 def _kind(item: Any) -> str:

@@ -9,19 +9,39 @@ from typing import Any
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
+from common.errors import CongraspError
+from common.transport.keys import check_name
 from common.wire.codec import Message, encode, finite
-from services.record.channels import ROLLOUT_SCHEMA, Entry, JsonChannels, nest, opaque_channel, protobuf_channel
-from services.record.scene import duration, episode_entries
+from common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
+from services.record.budget import LogBudget, Name
+from services.record.channels import (
+    ROLLOUT_SCHEMA,
+    Entry,
+    JsonChannels,
+    check_field,
+    nest,
+    opaque_channel,
+    protobuf_channel,
+)
+from services.record.scene import check_episode, duration, episode_entries
 
+_AHEAD = 60_000_000_000
+"""ns by which an actor's episodes may be behind one another; those that would come later are left out."""
+_TIMES = 2**62
+"""ns since 1970 that a time may be."""
 _LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
 
 
 class Converter:
-    """Remembers what spans messages: the schemas' fields, the actors' places, and when each actor's episode ends."""
+    """Remembers what spans messages: the schemas' fields, the actors' places, and when each actor's episode ends.
+
+    All that is kept is bounded, for every identity by itself (`services.record.budget`).
+    """
 
     def __init__(self) -> None:
         """Nothing has come yet."""
         self._json = JsonChannels()
+        self._budget = LogBudget(self._forget)
         self._slots: dict[str, int] = {}
         self._ends: dict[str, int] = {}
         self._kinds: dict[str, Callable[[str, str, Message, int], Iterator[Entry]]] = {
@@ -36,15 +56,32 @@ class Converter:
         """Entries of one message that arrived at `now` (ns since 1970).
 
         Raises:
-          Exception: of any kind, when it is not a whole log message.
+          CongraspError: it is not a whole log message, or beyond what its sender may record.
         """
-        *_, kind, role, name = key.split("/")
-        plain = Message(message.arrays, finite(message.meta))
-        return list(self._kinds[kind](role, name, plain, now))
+        *_, kind, role, name = ("", "", *key.split("/"))
+        if kind not in self._kinds:
+            raise CongraspError(f"{ascii(kind)[:60]} is no kind of log message.")
+        who = check_name("role", role), check_name("role", name)
+        self._budget.admit(who)
+        try:
+            entries = list(self._kinds[kind](role, name, Message(message.arrays, finite(message.meta)), now))
+        except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
+            raise CongraspError(f"It is no whole {kind} message ({type(error).__name__}).") from None
+        self._budget.charge(who, sum(len(entry.data) for entry in entries))
+        return entries
+
+    def _forget(self, who: Name) -> None:
+        """Frees what is kept of one that has been silent."""
+        role, name = who
+        for topic in (f"/metrics/{role}/{name}", f"/version/{role}/{name}", f"/episode/{name}/signals"):
+            self._json.forget(topic)
+        self._slots.pop(name, None)
+        self._ends.pop(name, None)
 
     def _metrics(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
         """Numbers of an update or a rollout."""
-        values = {key: float(value) for key, value in message.meta["values"].items()}
+        validate(_timed(message, now), METRICS)
+        values = {check_field(key): float(value) for key, value in message.meta["values"].items()}
         yield self._json.entry(f"/metrics/{role}/{name}", now, {**_scalars(message.meta), "values": nest(values)})
 
     def _version(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
@@ -53,9 +90,10 @@ class Converter:
 
     def _event(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
         """A line of the log."""
-        level = _LEVELS.get(str(message.meta["level"]).lower(), Log.UNKNOWN)
-        log = Log(level=level, message=str(message.meta["text"]), name=f"{role}/{name}")
-        log.timestamp.FromNanoseconds(round(1e9 * float(message.meta.get("time", now / 1e9))))
+        validate(event := _timed(message, now), EVENT)
+        level = _LEVELS.get(event.meta["level"].lower(), Log.UNKNOWN)
+        log = Log(level=level, message=event.meta["text"], name=f"{role}/{name}")
+        log.timestamp.FromNanoseconds(max(0, min(_TIMES, round(1e9 * float(event.meta["time"])))))
         yield Entry(protobuf_channel(f"/events/{role}/{name}", Log), now, log.SerializeToString())
 
     def _rollout(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
@@ -64,13 +102,26 @@ class Converter:
 
     def _episode(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
         """An episode's scene, step by step."""
+        check_episode(message)
         # An episode that comes while the one before it still plays waits for its end.
         start = max(now, self._ends.get(name, 0))
-        slot = self._slots.setdefault(name, len(self._slots))
+        if start > now + _AHEAD:
+            raise CongraspError(f"The episodes before it still play for {(start - now) / 1e9:.0f} s.")
+        taken = set(self._slots.values())
+        slot = self._slots.setdefault(name, next(i for i in range(len(taken) + 1) if i not in taken))
         yield from episode_entries(name, message, start, slot, self._json)
         self._ends[name] = start + duration(message)
 
 
+def _timed(message: Message, now: int) -> Message:
+    """The message with the time of its arrival (ns) where it has none of its own."""
+    return Message(message.arrays, {"time": now / 1e9, **message.meta})
+
+
 def _scalars(meta: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a message's meta data is a plain value."""
-    return {key: value for key, value in meta.items() if isinstance(value, bool | int | float | str)}
+    """What of a message's meta data is a plain value of bounded length."""
+    return {
+        check_field(key): value
+        for key, value in meta.items()
+        if isinstance(value, bool | int | float | str) and len(str(value)) <= LONGEST_TEXT
+    }

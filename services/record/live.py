@@ -12,7 +12,9 @@ from common.errors import CongraspError
 from services.record.channels import Channel, Entry
 
 _HOST = "127.0.0.1"
-_BACKLOG = 20000  # entries that may wait for their time; beyond it the newest are left out
+_BACKLOG, _BYTES = 20000, 256 << 20  # entries that may wait for their time; beyond it the newest are left out
+_TOPICS = 4096  # that are open at a time; beyond it the one that was silent for longest is closed
+_KEPT = 64 << 20  # bytes of latched messages that are kept for whoever subscribes later
 
 
 class LiveServer:
@@ -39,9 +41,10 @@ class LiveServer:
             ) from None
         self._sdk = foxglove
         self._context = foxglove.Context()
-        self._channels: dict[Channel, Any] = {}
-        self._topics: dict[str, Any] = {}
-        self._last: dict[str, Entry] = {}
+        self._topics: collections.OrderedDict[str, tuple[Channel, Any]] = collections.OrderedDict()
+        self._last: collections.OrderedDict[str, Entry] = collections.OrderedDict()
+        self._kept = self._held = 0  # bytes of these, and of what waits
+        self._changed = threading.Lock()  # of `_held`, `left_out`
         self._waiting: list[tuple[int, int, Entry]] = []
         self._number = itertools.count()
         self._incoming: queue.SimpleQueue[Entry | str | None] = queue.SimpleQueue()
@@ -66,7 +69,12 @@ class LiveServer:
         self._thread.start()
 
     def write(self, entry: Entry) -> None:
-        """Takes an entry; it is sent at its time."""
+        """Takes an entry; it is sent at its time, or left out if too much waits."""
+        with self._changed:
+            if self._held + len(entry.data) > _BYTES or self._incoming.qsize() > _BACKLOG:
+                self.left_out[entry.channel.topic] += 1
+                return
+            self._held += len(entry.data)
         self._incoming.put(entry)
 
     def close(self, timeout: float = 3.0) -> None:
@@ -90,7 +98,7 @@ class LiveServer:
             try:
                 item = self._incoming.get(timeout=wait)
             except queue.Empty:
-                self._send(heapq.heappop(self._waiting)[2])
+                self._send(self._let_go(heapq.heappop(self._waiting)[2]))
                 continue
             if item is None:
                 return
@@ -100,22 +108,42 @@ class LiveServer:
             elif len(self._waiting) < _BACKLOG:
                 heapq.heappush(self._waiting, (item.time, next(self._number), item))
             else:
-                self.left_out[item.channel.topic] += 1
+                self._let_go(item)
+                with self._changed:
+                    self.left_out[item.channel.topic] += 1
+
+    def _let_go(self, entry: Entry) -> Entry:
+        """Returns an entry that no longer waits."""
+        with self._changed:
+            self._held -= len(entry.data)
+        return entry
 
     def _send(self, entry: Entry) -> None:
         """Sends an entry on its channel."""
-        if entry.channel not in self._channels:
+        topic = entry.channel.topic
+        if self._topics.get(topic, (None,))[0] != entry.channel:
             self._advertise(entry.channel)
+        self._topics.move_to_end(topic)
         if entry.channel.latched:
-            self._last[entry.channel.topic] = entry
-        self._channels[entry.channel].log(entry.data, log_time=entry.time)
+            self._keep(entry)
+        self._topics[topic][1].log(entry.data, log_time=entry.time)
+
+    def _keep(self, entry: Entry) -> None:
+        """Keeps the last message of a latched channel, as long as the newest of all topics have room."""
+        before = self._last.pop(entry.channel.topic, None)
+        self._last[entry.channel.topic] = entry
+        self._kept += len(entry.data) - (len(before.data) if before else 0)
+        while self._kept > _KEPT and len(self._last) > 1:
+            self._kept -= len(self._last.popitem(last=False)[1].data)
 
     def _advertise(self, channel: Channel) -> None:
         """Opens a channel; a topic whose schema has grown gets a new one in place of the old."""
         if channel.topic in self._topics:
-            self._topics[channel.topic].close()
+            self._topics.pop(channel.topic)[1].close()
+        elif len(self._topics) >= _TOPICS:
+            self._topics.popitem(last=False)[1][1].close()
         schema = self._sdk.Schema(name=channel.schema_name, encoding=channel.schema_encoding, data=channel.schema)
         opened = self._sdk.Channel(
             channel.topic, schema=schema, message_encoding=channel.encoding, context=self._context
         )
-        self._channels[channel] = self._topics[channel.topic] = opened
+        self._topics[channel.topic] = channel, opened

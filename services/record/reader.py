@@ -1,20 +1,20 @@
 """Reads recordings, whole, cut off or damaged: a killed writer's file reads up to its last flush."""
 
 import collections
-import json
 import logging
 import pathlib
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.writer import MCAP0_MAGIC
 
 from common.errors import CongraspError
+from common.inputs import open_file, parse_json
 from common.wire.codec import Message, decode
 from services.record.channels import ROLLOUT_SCHEMA, flatten
 from services.record.salvage import Dropped, read_messages
-from services.record.scene import EPISODE_SCHEMA
+from services.record.scene import EPISODE_SCHEMA, check_episode
 from services.record.writer import PART
 
 _log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ def log_files(path: pathlib.Path) -> list[pathlib.Path]:
 
 def is_complete(path: pathlib.Path) -> bool:
     """Whether the file was finished; false for one whose writer was killed."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         file.seek(0, 2)
         size = file.tell()
         file.seek(max(0, size - len(MCAP0_MAGIC)))
@@ -71,7 +71,7 @@ def read_records(
       CongraspError: the file cannot be opened, or is no MCAP file.
     """
     try:
-        file = path.open("rb")
+        file = open_file(path)
     except OSError as error:
         raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
     with file:
@@ -107,7 +107,7 @@ def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]
     for file in log_files(path):
         for record in read_records(file, lambda topic: topic.startswith("/metrics/")):
             first = record.time if first is None else first
-            message = json.loads(record.data)
+            message = metrics_of(record)
             step = message.get("update", message.get("version", (record.time - first) / 1e9))
             for name, value in flatten(message["values"]).items():
                 series[f"{record.topic.removeprefix('/metrics/')}/{name}"][step] = value
@@ -117,9 +117,29 @@ def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]
     }
 
 
+def metrics_of(record: Record) -> dict[str, Any]:
+    """The object of a record of metrics: `values` {name: number, or a group}, and numbers beside it.
+
+    Raises:
+      CongraspError: it is none.
+    """
+    found = parse_json(record.data, f"A record of {ascii(record.topic)[:100]}")
+    values = found.get("values") if isinstance(found, dict) else None
+    steps = [found.get(name, 0) for name in ("update", "version")] if isinstance(found, dict) else []
+    if not isinstance(values, dict) or not all(isinstance(n, int | float) for n in [*flatten(values).values(), *steps]):
+        raise CongraspError(f"A record of {ascii(record.topic)[:100]} holds no metrics.")
+    return found
+
+
 def read_episodes(path: pathlib.Path) -> Iterator[Message]:
-    """The recorded episodes at `path`, a file or a folder, as the actors sent them, in the order of recording."""
-    return _messages(path, EPISODE_SCHEMA, is_episode)
+    """The recorded episodes at `path`, a file or a folder, as the actors sent them, in the order of recording.
+
+    Raises:
+      CongraspError: one is no whole episode.
+    """
+    for episode in _messages(path, EPISODE_SCHEMA, is_episode):
+        check_episode(episode)
+        yield episode
 
 
 def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Message:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from common.errors import CongraspError
 from common.inputs import file_name
 from common.transport.base import Transport
 from common.transport.keys import Keys
@@ -31,7 +32,7 @@ class Recorder:
 
     Attributes:
       messages: log messages recorded.
-      damaged: messages that were not what their key says, and were left out.
+      damaged: messages that were not what their key says, or too many, and were left out.
       error: why recording stopped; empty while it continues.
     """
 
@@ -126,7 +127,8 @@ class Recorder:
         except Exception as error:  # whatever a peer sends, this thread continues
             self.damaged += 1
             if self.damaged == 1:
-                self._warn(f"a log message on '{key}' was left out ({type(error).__name__}: {error})")
+                what = f"a log message on {ascii(key)[:100]} was left out: {str(error)[:300]}"
+                self._warn(str(CongraspError(what)))
             return
         self.messages += 1
         for entry in entries:

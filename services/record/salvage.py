@@ -28,7 +28,7 @@ _ZSTD = b"\x04\x00\x00\x00zstd"
 _ZSTD_AT = _FRAME.size + 28  # in a chunk's record; before it are times, size and CRC, after it the data's length
 _HEAD = _ZSTD_AT + len(_ZSTD) + 8
 _FOOTER, _CRC = struct.Struct("<QQI"), struct.Struct("<I")
-_LIMIT = 1 << 30
+_LIMIT = 512 << 20  # bytes of a record, and of what a chunk inflates to
 _BLOCK = 1 << 20
 _PLACES = 5
 

@@ -17,16 +17,21 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
+from common.errors import CongraspError
+from common.hands import known_hand
 from common.hands.mjcf import WRIST_JOINTS
 from common.hands.spec import Hand, Link, capsule_ends
 from common.wire.codec import Message, encode
+from common.wire.messages import EPISODE, validate
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
 from services.record.goals import active_blocks
 from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, SKIN, TABLE, WAYPOINT
 
 EPISODE_SCHEMA = "congrasp.Episode"
+_MOST = {"T": 2000, "V": 200_000, "Fc": 400_000, "N": 4096, "n": 64}
+_GOAL, _ARRAYS = 10_000, 128
+_OPEN = ("reward/", "error/", "goal/", "active/")
 SPACING = 0.8
 """Metres between two actors' frames in the world."""
 Colour = tuple[float, float, float, float]
@@ -42,6 +47,28 @@ _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 
+def check_episode(episode: Message) -> None:
+    """Checks an episode that anyone may have sent, before anything is made of it.
+
+    Raises:
+      CongraspError: naming the array or the entry, and the rule that it breaks.
+    """
+    hand = known_hand(episode.meta.get("hand"))
+    sizes = validate(episode, EPISODE, L=len(hand.links), F=len(hand.joints))
+    for symbol, most in _MOST.items():
+        if not 1 <= sizes[symbol] <= most:
+            raise CongraspError(f"The episode's {symbol} is {sizes[symbol]}, not 1 to {most}.")
+    if not 0.0 < episode.meta["control_dt"] <= 1.0:
+        raise CongraspError("The episode's control_dt is not above 0 and at most 1 s.")
+    faces = episode.arrays["visual_faces"]
+    if faces.min() < 0 or faces.max() >= sizes["V"]:
+        raise CongraspError("The episode's visual_faces name vertices that are not there.")
+    if any(array.size > _GOAL for name, array in episode.arrays.items() if name.startswith("goal/")):
+        raise CongraspError(f"The episode has a goal array of more than {_GOAL} values.")
+    if sum(name.startswith(_OPEN) for name in episode.arrays) > _ARRAYS:
+        raise CongraspError(f"The episode has more than {_ARRAYS} rewards, errors and goal arrays.")
+
+
 def episode_entries(actor: str, episode: Message, start: int, slot: int, channels: JsonChannels) -> Iterator[Entry]:
     """Everything that a recorder writes for one episode.
 
@@ -53,11 +80,11 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
       channels: schemas of the JSON signals.
 
     Raises:
-      Exception: of any kind, when the message is not a whole episode.
+      LookupError, ValueError: a goal array that an active block needs is absent, or has another shape.
     """
     topic = f"/episode/{actor}"
     arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
-    hand = get_hand(episode.meta["hand"])
+    hand = known_hand(episode.meta["hand"])
     step = round(1e9 * episode.meta["control_dt"])
     yield Entry(opaque_channel(f"{topic}/raw", EPISODE_SCHEMA), start, encode(episode))
     yield _protobuf(f"{topic}/scene", start, _static_scene(hand, actor, arrays, episode.meta, start), latched=True)

@@ -21,8 +21,8 @@ import numpy as np
 
 from common.config import TaskConfig
 from common.errors import CongraspError, LayoutError
-from common.hands import get_hand
 from common.hands.spec import Hand
+from common.inputs import LONGEST_NAME
 from common.task.constraints import known, require_known
 from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from common.wire.codec import Message
@@ -115,8 +115,7 @@ class Layout:
         meta = message.meta
         hand = meta.get("hand", self.hand.name)
         if hand != self.hand.name:
-            get_hand(hand)
-            raise CongraspError(f"The policy is for the hand '{self.hand.name}', not '{hand}'.")
+            raise CongraspError(f"The policy is for the hand '{self.hand.name}', not {ascii(hand)[:60]}.")
         asked = self._asked(meta.get("constraints", ["heading"]))
         vectors = self._packed(message) if PACKED in message.arrays else self._named(message.arrays, asked)[None]
         vectors[:, self._places("asked")] = [constraint.name in asked for constraint in self.known]
@@ -137,7 +136,8 @@ class Layout:
         """The vector (S,) of a query of names; a CongraspError names a field that is unknown, absent or misshapen."""
         unknown = sorted(arrays.keys() - self.shapes.keys() | arrays.keys() & {"asked"})
         if unknown:
-            raise CongraspError(f"The query has an unknown field '{unknown[0]}'.", f"Known: {', '.join(self.shapes)}.")
+            shown = ascii(unknown[0])[:60]
+            raise CongraspError(f"The query has an unknown field {shown}.", f"Known: {', '.join(self.shapes)}.")
         required = [name for name in SceneState._fields if name not in _OPTIONAL_STATE]
         required += ["surface_points"]
         required += [n for n, (c, _, array) in self._arrays.items() if c.name in asked and array.required]
@@ -207,7 +207,7 @@ class Layout:
 
     def _asked(self, names: Any) -> tuple[str, ...]:
         """Names of the constraints that a query asks for, weakest first."""
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        if not isinstance(names, list) or not all(isinstance(n, str) and len(n) <= LONGEST_NAME for n in names):
             raise CongraspError("The query's 'constraints' must be a list of names.")
         require_known(names, self.task)
         leading = [constraint.name for constraint in self.known if constraint.guides]

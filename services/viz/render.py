@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
+from common.hands import known_hand
 from common.hands.spec import Hand
 from common.wire.codec import Message
 from services.record.goals import active_blocks
@@ -31,7 +31,7 @@ _FALL = 0.1  # how far the camera follows a falling object, m
 def episode_shapes(episode: Message, step: int) -> list[Shape]:
     """Hand, object, table and active constraints of one control step of an episode."""
     arrays = episode.arrays
-    hand = get_hand(episode.meta["hand"])
+    hand = known_hand(episode.meta["hand"])
     force = np.linalg.norm(arrays["contact_force"][step], axis=-1)
     share = np.where(force > 1e-3, 0.5 + 0.5 * np.minimum(force / _FULL_CONTACT, 1.0), 0.0)[:, None]
     colours = [tuple(colour) for colour in share * TOUCHING + (1 - share) * SKIN]
@@ -89,7 +89,7 @@ def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -
     """A camera that holds everything that happens in the steps, from where object and touching links show most."""
     points = np.concatenate([_extent(episode, step) for step in steps])
     pictured = [episode_shapes(episode, steps[i]) for i in sorted({len(steps) // 2, len(steps) - 1})]
-    links = sum(len(link.capsules) for link in get_hand(episode.meta["hand"]).links)
+    links = sum(len(link.capsules) for link in known_hand(episode.meta["hand"]).links)
 
     def score(camera: Camera) -> float:
         """How much of object, touching links and constraints a camera shows."""
@@ -217,7 +217,7 @@ def episode_title(episode: Message) -> str:
     shown = [
         f"{name.replace('_', ' ')} {metrics[name]:.3g}" for name in ("return", "links_at_removal") if name in metrics
     ]
-    parts = [f"{get_hand(meta['hand']).name} hand, {meta['object']}", " + ".join(["heading", *names]), result, *shown]
+    parts = [f"{known_hand(meta['hand']).name} hand, {meta['object']}", " + ".join(["heading", *names]), result, *shown]
     return "   |   ".join([*parts, f"policy version {meta['version']}"])
 
 

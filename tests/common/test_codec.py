@@ -30,10 +30,10 @@ json_values = st.recursive(
 metas = st.dictionaries(st.text(), json_values, max_size=4)
 
 
-def packed(header, section=b"", *, crc=None, meta="{}"):
-    """Bytes with any header; the checksum is right unless given."""
-    header = {"__metadata__": {"meta": meta, "crc32": f"{zlib.crc32(section):08x}" if crc is None else crc}, **header}
-    text = json.dumps(header).encode()
+def packed(header, section=b"", *, crc=None, meta="{}", key="crc32"):
+    """Bytes with any header, as older versions wrote them; the checksum of the section is right unless given."""
+    header = {"__metadata__": {key: f"{zlib.crc32(section):08x}" if crc is None else crc, "meta": meta}, **header}
+    text = json.dumps(header, separators=(",", ":")).encode()
     return len(text).to_bytes(8, "little") + text + section
 
 
@@ -139,7 +139,9 @@ TWO = np.array([1, 2], np.float32).tobytes()
         ((2).to_bytes(8, "little") + b"{}", "lacks its meta data"),
         ((13).to_bytes(8, "little") + b'{"a":1,"a":2}', "key twice"),
         (packed({"x": entry()}, TWO, crc="00000000"), "do not match their checksum"),
-        (packed({"x": entry()}, TWO, crc="zz"), "hexadecimal"),
+        (packed({"x": entry()}, TWO, crc="zz"), "do not match their checksum"),
+        (packed({"x": entry()}, TWO, crc=None, key="crc33"), "lacks its meta data or its checksum"),
+        (packed({"x": entry()}, TWO, key="checksum"), "does not match its checksum"),
         (packed({}, meta="[1]"), "not a JSON object"),
         (packed({}, meta='{"a": NaN}'), "NaN"),
         (packed({"x": entry()}, TWO[:-1]), "cut: the array 'x' ends at 8 of 7"),
@@ -180,6 +182,16 @@ def test_length_is_limited():
 
 
 WHOLE = encode(Message({"x": np.arange(6, dtype=np.float32), "b": np.array([True])}, {"actor": "a", "n": 3}))
+
+
+def test_every_flipped_bit_is_found():
+    """In names, dtypes, shapes, meta data and the checksum itself as well as in the data."""
+    for at in range(len(WHOLE)):
+        for bit in range(8):
+            damaged = bytearray(WHOLE)
+            damaged[at] ^= 1 << bit
+            with pytest.raises(CongraspError):
+                decode(bytes(damaged))
 
 
 @settings(deadline=None, max_examples=300)

@@ -24,7 +24,7 @@ class MadeUpActor(threading.Thread):
         self.versions: list[int] = []
         self.ended = ""
         self.stop = threading.Event()
-        self._transport, self._actor, self._reward, self._links, self._seed = transport, name, reward, links, seed
+        self._transport, self._actor, self.reward, self._links, self._seed = transport, name, reward, links, seed
         self._journal = journal
         self.start()
 
@@ -43,7 +43,8 @@ class MadeUpActor(threading.Thread):
             bundle = bundle if newer is None else PolicyBundle.from_message(newer)
             if ticket is None or bundle is None:
                 continue
-            observation = rng.normal(size=(5, 2, sum(size for _, size in bundle.spec.layout))).astype(np.float16)
+            shape = (5, 2, sum(size for _, size in bundle.spec.layout))
+            observation = rng.uniform(-1.0, 1.0, shape).astype(np.float16)  # what every entry of a task can be
             action, log_probability = bundles.sample_action(
                 bundle.spec.layout,
                 bundle.inference_parameters,
@@ -55,7 +56,7 @@ class MadeUpActor(threading.Thread):
                 "last_observation": observation[-1],
                 "action": np.asarray(action),
                 "log_probability": np.asarray(log_probability),
-                "reward": self._reward * rng.normal(size=(4, 2)).astype(np.float32),
+                "reward": self.reward * rng.normal(size=(4, 2)).astype(np.float32),
                 "terminal": rng.random((4, 2)) < 0.3,
             }
             arrays = {name: recorded[name] for name in names} | {

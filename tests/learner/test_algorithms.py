@@ -17,6 +17,7 @@ from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
+from learner.admission import Ranges
 from learner.algorithms import ALGORITHMS, make_algorithm
 from learner.batch import collate, partition_specs
 from learner.process import run_learner
@@ -79,6 +80,8 @@ def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypa
     """Wire check, warm-up, updates, checkpoint, resume and publication follow from its four members alone."""
     monkeypatch.setitem(ALGORITHMS, "a2c", A2C)
     monkeypatch.setattr(bundles, "policy_spec", lambda task, sizes: toy.SPEC)
+    ranges = Ranges(np.full(sum(size for _, size in toy.LAYOUT), 1e6), 1e6, 1e6, {})
+    monkeypatch.setattr("learner.process.task_ranges", lambda task, curriculum: ranges)
     create_run(tmp_path, CONFIG)
     hub, events, stop = MemoryHub(), [], threading.Event()
     actor = ToyActor(MemoryTransport(hub))

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from common.errors import CongraspError, RefusedError
 from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message
+from common.wire.codec import Message, encode
 from common.wire.schema import RolloutForm
+from learner.admission import Admission, Ranges
 from learner.batch import collate
 from learner.deduplication import Sequences
 from learner.hub import LearnerHub
@@ -247,19 +248,87 @@ def test_floods_are_turned_away_and_cost_the_others_nothing(bench):
     b = bench()
     b.hub.publish_weights(bundle(0), 0)
     events = b.peer.subscribe(KEYS.logs, depth=8)
-    message = rollout(actor="1.b")
-    message.arrays["useless"] = np.zeros(16 << 20, np.uint8)
-    outcomes = [b.peer.query(KEYS.rollout("1.b"), message, timeout=5).meta["outcome"] for _ in range(100)]
-    assert outcomes[:20] == ["refused"] * 20 and "retry" in outcomes
+    outcomes = [b.send(0, actor="1.b", epoch="of another training")["outcome"] for _ in range(2500)]
+    assert outcomes[:2000] == ["stale"] * 2000 and "retry" in outcomes
     reply = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
     assert not reply["granted"] and reply["retry_after"] > 0
     assert b.ticket()["granted"] and b.send(0)["outcome"] == "accepted"
     ledger = b.ledger()
-    assert ledger["turned_away"] == outcomes.count("retry") + 1 and ledger["damaged"] == outcomes.count("refused")
+    assert ledger["turned_away"] == outcomes.count("retry") + 1 and ledger["stale"] == outcomes.count("stale")
     texts = []
     while received := events.receive(0.1):
         texts.append(received[1].meta["text"])
     assert any("useless requests of 1.b" in text for text in texts)
+
+
+def test_who_is_refused_again_and_again_is_put_off_and_counted(bench):
+    b = bench()
+    b.hub.publish_weights(bundle(0), 0)
+    b.peer.declare_alive(KEYS.alive("actor", "1.b", "01"))
+    answers = [b.send(0, actor="1.b", steps=1) for _ in range(4)]
+    assert [answer["outcome"] for answer in answers] == ["refused", "refused", "retry", "retry"]
+    assert 0.5 < answers[-1]["retry_after"] <= 1.0
+    asked = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
+    assert not asked["granted"] and asked["retry_after"] > 0.5  # another name of the same certificate
+    assert b.ticket()["granted"] and b.send(0)["outcome"] == "accepted"
+    time.sleep(1.0)
+    assert b.send(0, actor="1.b", steps=1)["outcome"] == "refused"
+    assert 1.5 < b.send(0, actor="1.b", steps=1)["retry_after"] <= 2.0
+    (role,) = [role for role in b.ask(KEYS.status)["roles"] if role["id"] == "1.b"]
+    assert role["refused"] == 3 and b.ledger()["damaged"] == 3
+
+
+def test_values_beyond_the_task_are_refused_with_the_range(bench):
+    ranges = Ranges(np.array([1.0, 1.0, 1.0, 400.0, 2.0]), 65.0, 1e3, {"episode/success": (0.0, 1.0)})
+    b = bench(admission=Admission(lambda: ranges))
+    b.hub.publish_weights(bundle(0), 0)
+    fine = {
+        "observation": np.tile(np.float16([-1, 1, 0, 400, 2]), (T, B, 1)),
+        "reward": np.full((T, B), -65, np.float32),
+        "action": np.full((T, B, A), 1e3, np.float32),
+        "episode/success": np.ones(1, np.float32),
+    }
+    beyond = {
+        "observation": (np.tile(np.float16([0, 0, 0, 400, 2.002]), (T, B, 1)), r"'observation\[4\]' holds 2.002"),
+        "last_observation": (np.full((B, D), -65504, np.float16), r"'last_observation\[0\]' holds 6.55e\+04"),
+        "reward": (np.full((T, B), 1e19, np.float32), r"'reward' holds 1e\+19; the task's are within -65 and 65"),
+        "action": (np.full((T, B, A), -3e38, np.float32), r"'action' holds -3e\+38"),
+        "log_probability": (np.full((T, B), 100, np.float32), "'log_probability' holds 100"),
+        "episode/success": (np.full(1, 1.5, np.float32), "'episode/success' holds 1.5"),
+        "episode/made_up": (np.ones(1, np.float32), "'episode/made_up', which is no metric"),
+    }
+    for number, (name, (array, why)) in enumerate(beyond.items()):
+        good = rollout(0, actor=f"{number}.x")
+        bad = Message({**good.arrays, name: array}, good.meta)
+        reply = b.peer.query(KEYS.rollout(f"{number}.x"), bad, timeout=5).meta
+        assert reply["outcome"] == "refused" and re.search(why, reply["why"]), reply["why"]
+    good = rollout(0)
+    assert b.peer.query(KEYS.rollout("a"), Message({**good.arrays, **fine}, good.meta), timeout=5).meta["outcome"] == (
+        "accepted"
+    )
+
+
+def test_tokens_by_the_thousand_cost_the_others_nothing(bench):
+    b = bench()
+    events = b.peer.subscribe(KEYS.logs, depth=1000)
+    b.peer.declare_alive(KEYS.alive("actor", "0.a", "01"))
+    flood = MemoryTransport(b.peer._hub)
+    for i in range(3000):
+        flood.declare_alive(KEYS.alive("actor", f"1.{i}", "01"))
+    deadline = time.monotonic() + 10
+    while (status := b.ask(KEYS.status))["unlisted"] < 3000 - 64 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    names = [role["id"] for role in status["roles"]]
+    assert status["unlisted"] == 3000 - 64 and len(names) == 66 and "0.a" in names
+    assert len(encode(Message(meta=status))) < 32_000
+    flood.close()
+    while b.ask(KEYS.status)["unlisted"] and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert [role["id"] for role in b.ask(KEYS.status)["roles"] if role["role"] == "actor"] == ["0.a"]
+    told = 0
+    while events.receive(0.05):
+        told += 1
+    assert told == 64  # one for each that was listed
 
 
 def _sized(steps, worlds):
@@ -329,9 +398,16 @@ def test_status_names_everything(bench):
     status = b.ask(KEYS.status)
     assert status["run"] == "test" and status["version"] == 0 and status["queue"] == {"length": 1, "limit": 64}
     rates = {"rollouts_per_second": 1.0, "steps_per_second": T * B}
-    assert {"role": "actor", "id": "a", "incarnation": "01", "rollouts": 1, "version": 0, "lag": 0, **rates} in status[
-        "roles"
-    ]
+    assert {
+        "role": "actor",
+        "id": "a",
+        "incarnation": "01",
+        "rollouts": 1,
+        "version": 0,
+        "lag": 0,
+        "refused": 0,
+        **rates,
+    } in status["roles"]
     assert status["rates"] == rates
 
 

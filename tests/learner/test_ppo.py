@@ -124,12 +124,23 @@ def test_a_value_that_is_not_finite_is_named_and_changes_nothing(field):
     assert caught.value.state.version == 0
 
 
-def test_an_optimisation_that_breaks_is_named_and_keeps_the_last_finite_weights():
-    state = fresh()
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        ({"reward_scale": 1e25}, "value loss"),
+        ({"learning_rate": 3.0, "learning_rate_range": (3.0, 3.0)}, "policy .a KL divergence out of all reason"),
+    ],
+)
+def test_an_optimisation_that_breaks_is_named_and_changes_nothing(wrong, why):
+    """Neither weights nor the optimiser's moments: the next batch goes on from the update before."""
+    algorithm = changed(**wrong)
+    state = algorithm.init(0)
     batch = rollout(toy.bundle_of(state), 0)
-    with pytest.raises(NonFiniteUpdate, match="optimisation of update 1: value loss") as caught:
-        changed(reward_scale=1e25).update(state, batch)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(caught.value.state.params))
+    before = [np.array(leaf) for leaf in jax.tree.leaves((state.params, state.optimizer))]
+    with pytest.raises(NonFiniteUpdate, match=f"optimisation of update 1: {why}") as caught:
+        algorithm.update(state, batch)
+    after = jax.tree.leaves((caught.value.state.params, caught.value.state.optimizer))
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
 
 
 def test_more_minibatches_than_transitions_are_refused():

@@ -22,6 +22,7 @@ from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
+from learner.admission import Admission
 from learner.algorithms import ppo
 from learner.process import run_learner
 from learner.run_directory import create_run, open_run
@@ -207,11 +208,13 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
 
 
 @pytest.mark.timeout(120)
-def test_values_that_are_not_finite_stop_the_run_and_are_kept(tmp_path, hub):
-    create_run(tmp_path, CONFIG)
-    actor = MadeUpActor(MemoryTransport(hub), reward=1e38)
-    with pytest.raises(PhysicsError, match=r"update 1: .*failure") as caught:
-        learn(tmp_path, hub)
+def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a_row(tmp_path, hub, monkeypatch):
+    config = dataclasses.replace(CONFIG, updates=20)
+    create_run(tmp_path, config)
+    monkeypatch.setattr(Admission, "check", lambda self, message: None)  # what is within the ranges breaks nothing
+    actor = MadeUpActor(MemoryTransport(hub), reward=1e37)
+    with pytest.raises(PhysicsError, match=r"update 5: .* 5th batch in a row.*failure") as caught:
+        learn(tmp_path, hub, config)
     actor.stop.set()
     actor.join(10.0)
     assert "\n" not in str(caught.value)
@@ -219,6 +222,29 @@ def test_values_that_are_not_finite_stop_the_run_and_are_kept(tmp_path, hub):
     # What waited is taken up by a resume, the batch itself is not.
     kept = {int(path.stem.split("~")[3]) for path in (tmp_path / "accepted" / "0").iterdir()}
     assert not kept & {0, 1}
+
+
+@pytest.mark.timeout(120)
+def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(tmp_path, hub, monkeypatch):
+    config = dataclasses.replace(CONFIG, updates=8)
+    create_run(tmp_path, config)
+    monkeypatch.setattr(Admission, "check", lambda self, message: None)
+    actor, said, seen = MadeUpActor(MemoryTransport(hub), reward=1e37), [], []
+
+    def on_event(level, text):
+        if "The batch was dropped" in text:
+            said.append((level, text))
+            actor.reward = 1.0
+
+    last = learn(tmp_path, hub, config, on_event=on_event, on_update=seen.append)
+    actor.stop.set()
+    actor.join(10.0)
+    dropped = [values["batches_dropped"] for values in seen]
+    assert 1 <= len(said) == dropped[-1] < 5 and said[0][0] == "error"
+    assert [values["update"] for values in seen] == list(range(1, 9)) and last.version == 8
+    learnt = [values for values in seen if "policy_loss" in values]
+    assert len(learnt) == 8 - len(said) and np.isfinite([values["policy_loss"] for values in learnt]).all()
+    assert np.isfinite(last.value.mean) and abs(last.value.mean) < 100
 
 
 @pytest.mark.timeout(120)

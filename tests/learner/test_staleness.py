@@ -1,5 +1,6 @@
 """Admission: the bound holds, capacity returns, and every rollout is accounted for."""
 
+import math
 import threading
 
 import hypothesis.strategies as st
@@ -155,6 +156,8 @@ class Admission(RuleBasedStateMachine):
         self.in_update = 0
         self.fates = {"accepted": 0, "consumed": 0, "dropped": 0, "stale": 0}
         self.next_id = 0
+        self.delivered = []  # whose rollouts came in under a ticket
+        self.late = set()  # whose tickets have expired: they may be put off
 
     owners = st.sampled_from([A, B, ("c", "2")])
 
@@ -164,11 +167,14 @@ class Admission(RuleBasedStateMachine):
         had = self.staleness.capacity
         held = sum(key[0] == owner for key in self.tickets)
         ticket = self.staleness.grant(owner, str(self.next_id))
-        assert (ticket is not None) == (had > 0 and held < 4)
+        share = math.ceil(6 * self.delivered.count(owner) / max(1, len(self.delivered)))
+        fits = had > 0 and held < min(4, max(3, share))
+        assert fits if ticket else not fits or owner in self.late
         if ticket:
             assert ticket.version == self.staleness.version
+            assert self.now + 5 <= ticket.deadline <= self.now + 10
             self.tickets[owner, ticket.id] = ticket.version
-            self.deadlines[owner, ticket.id] = self.now + 10
+            self.deadlines[owner, ticket.id] = ticket.deadline
 
     @precondition(lambda self: self.tickets)
     @rule(data=st.data())
@@ -189,6 +195,7 @@ class Admission(RuleBasedStateMachine):
             self.fates["stale"] += 1
         elif must_fit or capacity > 0:
             assert verdict == "accepted"
+            self.delivered += [key[0]] if must_fit else []
             self.fates["accepted"] += 1
             self.queue.append(version)
         else:
@@ -217,6 +224,7 @@ class Admission(RuleBasedStateMachine):
     @rule(seconds=st.floats(0, 6))
     def wait(self, seconds):
         self.now += seconds
+        self.late |= {key[0] for key in self.tickets if self.deadlines[key] <= self.now}
         self.tickets = {key: version for key, version in self.tickets.items() if self.deadlines[key] > self.now}
 
     @rule()
@@ -243,6 +251,65 @@ class Admission(RuleBasedStateMachine):
 
 TestAdmission = Admission.TestCase
 TestAdmission.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+
+
+def test_who_holds_tickets_and_delivers_nothing_stops_nobody():
+    """Batch 2 and eta 1 make four tickets. One certificate asks for all it can get, under ever new names, for ever."""
+    now = [0.0]
+    staleness = manager(clock=lambda: now[0])
+    updates, waited, last = 0, [], 0.0
+    for step in range(3000):  # tenths of a second; the honest one makes a rollout in half a second
+        now[0] = step / 10
+        for name in ("9.x", "9.y", f"9.{step}"):
+            staleness.grant((name, str(step)), "held")
+        if step % 5 == 0:
+            for i in range(2):
+                if staleness.grant(("0.a", "1"), f"{step}.{i}"):
+                    now[0] += 0.01
+                    assert staleness.arrive(("0.a", "1"), f"{step}.{i}", staleness.version) == "accepted"
+        if staleness.queued >= 2:
+            for _ in range(2):
+                assert staleness.take(staleness.version)
+            staleness.publish(staleness.version + 1)
+            updates += 1
+            waited.append(now[0] - last)
+            last = now[0]
+    assert updates > 500 and max(waited) < 1.0
+    # Expired tickets put the certificate off, longer each time: it held few of what it asked 9,000 times for.
+    assert 4 < staleness.counters()["expired"] < 40
+
+
+def test_shares_follow_what_was_delivered_and_expiry_what_was_needed():
+    now = [0.0]
+    staleness = manager(batch=4, ticket_seconds=120.0, tickets_per_owner=10, clock=lambda: now[0])  # eight tickets
+
+    def held(name):
+        tickets = [staleness.grant((name, "1"), str(i)) for i in range(8)]
+        for ticket in tickets:
+            if ticket:
+                staleness.give_back(*ticket[:2])
+        return sum(ticket is not None for ticket in tickets)
+
+    assert held("0.a") == held("1.b") == 4
+    assert staleness.grant(("0.a", "1"), "z").deadline == 120.0  # nothing is known yet
+    for i in range(8):
+        name = "0.a" if i < 6 else "1.b"
+        ticket = staleness.grant((name, "1"), f"r{i}")
+        now[0] += 2.0
+        assert staleness.arrive(*ticket[:2], staleness.version) == "accepted"
+        staleness.take(staleness.version)
+        if i % 4 == 3:
+            staleness.publish(staleness.version + 1)
+    # Six of eight are 0.a's, whose share is six; 1.b keeps what leaves a batch to the others.
+    staleness.forget(("0.a", "1"))
+    assert (held("0.a"), held("1.b")) == (6, 4)
+    assert staleness.grant(("0.a", "1"), "z").deadline == now[0] + 4 * 2.0
+    assert staleness.grant(("2.new", "1"), "z").deadline == now[0] + 4 * 2.0  # as the others need
+    now[0] += 8.0
+    assert staleness.running == 0 and staleness.counters()["expired"] == 2
+    # One that comes after all teaches how long its actor needs.
+    assert staleness.arrive(("0.a", "1"), "z", staleness.version) == "accepted"
+    assert staleness.grant(("0.a", "1"), "y").deadline == now[0] + 4 * 8.0
 
 
 @pytest.mark.timeout(30)

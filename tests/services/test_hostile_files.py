@@ -210,7 +210,10 @@ def _recomputed(data: bytes) -> bytes:
     try:
         length = int.from_bytes(data[:8], "little")
         header = json.loads(data[8 : 8 + length])
-        header["__metadata__"]["crc32"] = f"{zlib.crc32(data[8 + length :]):08x}"
+        header["__metadata__"] = {
+            "meta": header["__metadata__"]["meta"],
+            "crc32": f"{zlib.crc32(data[8 + length :]):08x}",
+        }
         text = json.dumps(header).encode()
         return len(text).to_bytes(8, "little") + text + data[8 + length :]
     except (ValueError, KeyError, TypeError):

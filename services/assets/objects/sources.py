@@ -105,6 +105,8 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Tri
     if len(mesh.faces) == 0:
         points = f"only {len(mesh.vertices)} points" if len(mesh.vertices) else "nothing that can be read as a mesh"
         raise CongraspError(f"{path} has no triangles: it holds {points}.", f"Export it as a triangle mesh ({kind}).")
+    if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+        raise CongraspError(f"{path} has points that are not of three numbers.", "Export it again, or convert it.")
     if len(mesh.faces) > MAX_FACES or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise CongraspError(f"{path} has triangles without vertices, or too many.", "Export it again, or convert it.")
     finite = repair.without_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), said)
@@ -113,8 +115,9 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Tri
         raise CongraspError(f"{path} has {bad} vertices that are not finite numbers.", "Repair or export it again.")
     mesh = trimesh.Trimesh(*repair.reduced(*finite, said), process=False)
     mesh.merge_vertices()
-    mesh.update_faces(mesh.nondegenerate_faces())
-    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces):
+        mesh.update_faces(mesh.nondegenerate_faces())
+        mesh.remove_unreferenced_vertices()
     if len(mesh.faces) < 4:
         raise CongraspError(f"{path} has no volume: only {len(mesh.faces)} proper triangles.", "Export a closed mesh.")
     return mesh

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
+from common.hands import known_hand
 from common.task.constraints import CONSTRAINTS
 from common.task.constraints.base import ErrorSpec
 from common.wire.codec import Message
@@ -81,7 +81,7 @@ def for_page(episode: Message) -> Message:
         arrays |= {f"lane/{name}/met": lane.met, f"lane/{name}/counts": lane.counts}
         arrays |= {f"lane/{name}/{unit}": np.asarray(value, np.float32) for unit, value in lane.errors.items()}
     if "pose" in active_constraints(episode.arrays):
-        hand, turn = get_hand(str(episode.meta["hand"])), _turn(episode.arrays["goal/pose_quaternion"])
+        hand, turn = known_hand(episode.meta["hand"]), _turn(episode.arrays["goal/pose_quaternion"])
         position, quaternion = mujoco_link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
         arrays["ghost_position"] = (turn.apply(position) + episode.arrays["goal/pose_position"]).astype(np.float32)
         arrays["ghost_quaternion"] = (turn * _turn(quaternion)).as_quat(scalar_first=True).astype(np.float32)

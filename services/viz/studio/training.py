@@ -6,7 +6,6 @@ It takes log messages and the learner's status from whoever receives them; it kn
 import bisect
 import collections
 import dataclasses
-import json
 import pathlib
 import threading
 import time
@@ -22,7 +21,7 @@ from common.transport.keys import Keys
 from common.wire.codec import Message, decode
 from services.ops import status as statuses
 from services.record.channels import flatten
-from services.record.reader import Record, is_episode, log_files, read_records
+from services.record.reader import Record, is_episode, log_files, metrics_of, read_records
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows first."""
@@ -129,7 +128,7 @@ class TrainingWindow:
                 if kind == "episode":
                     newest[role] = record
                     continue
-                meta = json.loads(record.data)
+                meta = metrics_of(record)
                 with self._lock:
                     self._metrics(role, name, {**meta, "values": flatten(meta["values"])}, record.time / 1e9)
         for name, record in newest.items():

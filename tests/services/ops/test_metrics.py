@@ -30,6 +30,7 @@ STATUS = {
         {"role": "actor", "id": "a", "incarnation": "1", "version": 6, "lag": 1, "rollouts": 8, "steps_per_second": 9},
         {"role": "learner", "id": "0", "incarnation": "2"},
     ],
+    "unlisted": 0,
 }
 
 

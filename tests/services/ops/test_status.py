@@ -1,13 +1,16 @@
 """`congrasp status` against a live learner's end."""
 
 import copy
+import io
 import json
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from common.errors import TransportError
 from common.transport.keys import Keys
@@ -17,7 +20,7 @@ from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from services.cli.status import status
-from services.ops.status import ask, warnings
+from services.ops.status import ask, tables, warnings
 from tests.rollouts import ACTION, OBSERVATION, SCHEMA, bundle, rollout
 
 
@@ -90,3 +93,27 @@ def test_watching_goes_on_until_it_is_interrupted(endpoint):
 def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
     with pytest.raises(TransportError, match="other"):
         status(endpoint, "other")
+
+
+def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_markup(endpoint):
+    """6,000 liveliness tokens of one certificate, some with names that a terminal or a table would take for more."""
+    found = ask_with_tokens(endpoint, 6_000)
+    assert len(found["roles"]) == 66 and found["unlisted"] == 6_000 - 64
+    assert any(role["id"] == "worker-7" for role in found["roles"])
+    named = {**found["roles"][0], "id": "[red]\x1b[2J[/nonsense]" * 10, "refused": 3}
+    console = Console(file=io.StringIO(), width=200)
+    console.print(tables({**found, "roles": [named] * 150}))
+    text = console.file.getvalue()
+    assert "[red]" in text and "\x1b" not in text and "refused" in text and len(text) < 50_000
+    assert f"{50 + found['unlisted']} more process(es)" in text
+
+
+def ask_with_tokens(endpoint, count):
+    """The status beside an actor that shows so many tokens."""
+    with ZenohTransport(connect=[endpoint]) as evil, ZenohTransport(connect=[endpoint]) as observer:
+        for i in range(count):
+            evil.declare_alive(Keys("r").alive("actor", f"9.{i}", "1"))
+        deadline = time.monotonic() + 60.0
+        while (found := ask(observer, "r"))["unlisted"] < count - 64 and time.monotonic() < deadline:
+            time.sleep(0.2)
+    return found

@@ -1,5 +1,7 @@
 """Queries: where their fields land, what is completed, and what is refused."""
 
+import os
+
 import jax
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
+from common.hands.files import hand_text
 from common.wire.codec import Message
 from services.serve.requests import Layout
 
@@ -101,11 +104,23 @@ def test_bad_queries_name_the_field_and_the_rule(constraints, changes, words):
         parse(constraints, **changes)
 
 
-def test_another_hand_is_refused():
-    with pytest.raises(CongraspError, match="no hand 'paw'"):
-        parse(meta={"hand": "paw"})
-    with pytest.raises(CongraspError, match="list of names"):
-        parse(meta={"constraints": "heading"})
+def test_another_hand_is_refused_without_looking_for_it(tmp_path):
+    """Whatever a peer calls a hand: no file is opened (a pipe waits for ever), and the answer is one short line."""
+    known, pipe = tmp_path / "known.json", tmp_path / "pipe.json"
+    known.write_text(hand_text(HAND))
+    os.mkfifo(pipe)
+    odd = ["paw", str(known), str(pipe), hand_text(HAND), "x" * 500_000, None, 7, 1e300, True, [], ["human"], {"a": 1}]
+    for name in odd:
+        with pytest.raises(CongraspError, match="for the hand 'human', not") as caught:
+            parse(meta={"hand": name})
+        assert len(str(caught.value)) < 120 and str(caught.value).isascii()
+
+
+def test_odd_constraints_are_refused_in_one_short_line():
+    for names in (None, 7, "heading", [["heading"]], [None], ["x" * 500_000], {"heading": 1}, ["heading", 3]):
+        with pytest.raises(CongraspError, match="list of names") as caught:
+            LAYOUT.parse(Message(arrays(), {"constraints": names}))
+        assert len(str(caught.value)) < 120
 
 
 def test_a_packed_query_is_the_vector_of_the_named_one():

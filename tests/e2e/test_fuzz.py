@@ -1,0 +1,339 @@
+"""Mutated messages at every key, and mutated files at every loader: no traceback, no growth, no hang.
+
+Each takes half of `CONGRASP_FUZZ_SECONDS`, 10 by default, from the seed `CONGRASP_FUZZ_SEED`, 0 by default:
+
+    CONGRASP_FUZZ_SECONDS=600 pytest tests/e2e/test_fuzz.py -n 0
+"""
+
+import contextlib
+import json
+import logging
+import os
+import pathlib
+import pickle
+import random
+import threading
+import time
+
+import numpy as np
+import pytest
+import trimesh
+
+from common.config import NetworkConfig, RunConfig, TaskConfig, run_config_from_json, to_json
+from common.errors import CongraspError, TransportError
+from common.hands import get_hand
+from common.hands.files import hand_text, read_hand
+from common.journal import Journal, read_journal
+from common.objects import store
+from common.objects.procedural import generate
+from common.pickles import read_pickle
+from common.policy import bundle as bundles
+from common.policy import network, normalizer
+from common.policy.bundle import PolicyBundle
+from common.transport.keys import Keys
+from common.transport.ports import free_port
+from common.transport.zenoh_transport import ZenohTransport
+from common.wire.codec import Message, encode
+from common.wire.schema import RolloutForm
+from learner.admission import Admission, Ranges
+from learner.hub import LearnerHub
+from learner.staleness import StalenessManager
+from services.assets.objects.sources import read_mesh
+from services.export.motion_file import load_motion, motion_of_episode, save_motion
+from services.grasp.wrist_paths import read_bvh, read_wrist_path
+from services.record.entries import Converter
+from services.record.reader import read_episodes, read_metrics
+from services.record.recorder import Recorder
+from services.record.writer import LogWriter
+from services.serve.requests import Layout
+from services.serve.server import PolicyServer
+from tests.cluster import bundle
+from tests.episodes import episode
+from tests.rollouts import random_arrays
+from tests.services.serve.test_requests import arrays as query_arrays
+from tests.services.test_hostile_inputs import BVH
+
+SECONDS = float(os.environ.get("CONGRASP_FUZZ_SECONDS", "10")) / 2
+SEED = int(os.environ.get("CONGRASP_FUZZ_SEED", "0"))
+KEYS = Keys("chaos")
+FORM = RolloutForm(3, 2, 32, 4, half=True)
+GROWTH, LONGEST = 150 << 20, 20.0  # bytes of memory; seconds of one message or file
+pytestmark = pytest.mark.timeout(240 + 2 * SECONDS)
+ODD = [None, True, -1, 0, 2**53, 10**30, 1e300, 0.5, "", "x" * 70_000, "../../etc/passwd", "/dev/zero", "a.json", "{",
+       "\ud800", "\x1b[2J", "*", "a/b", [], [[]], ["x"] * 1000, {}, {"a": {"b": {}}}]  # fmt: skip
+DTYPES = ["f2", "f4", "f8", "i4", "i8", "u1", "?"]
+
+
+def odd_tree(rng, tree):
+    """A JSON value with one place of it replaced, dropped or doubled."""
+    if isinstance(tree, (dict, list)) and tree and rng.random() < 0.8:
+        changed = dict(tree) if isinstance(tree, dict) else list(tree)
+        at = rng.choice(list(changed) if isinstance(changed, dict) else range(len(changed)))
+        if rng.random() < 0.1:
+            del changed[at]
+        else:
+            changed[at] = odd_tree(rng, changed[at])
+        return changed
+    return rng.choice(ODD)
+
+
+def odd_array(rng, array):
+    """An array of another shape, dtype or with other values."""
+    kind = rng.randrange(5)
+    if kind == 0:
+        return np.zeros([rng.choice([0, 1, 2, 7, 99]) for _ in range(rng.randrange(4))], rng.choice(DTYPES))
+    if kind == 1:
+        with np.errstate(all="ignore"):
+            return np.asarray(array).astype(rng.choice(DTYPES))
+    if kind == 2:
+        return np.asarray(array)[..., None]
+    changed = np.array(array)
+    if changed.size:
+        worst = [np.nan, np.inf, -3e38, 65504.0, 1e19, 0.0, -1.0] if changed.dtype.kind == "f" else [0, 1, 127]
+        changed.reshape(-1)[rng.randrange(changed.size)] = np.asarray(rng.choice(worst)).astype(changed.dtype)
+    return changed
+
+
+def odd_bytes(rng, data):
+    """Bytes with flips, cuts, doubled parts and noise."""
+    changed = bytearray(data)
+    for _ in range(rng.randrange(1, 4)):
+        at = rng.randrange(len(changed) + 1) if rng.random() < 0.5 else rng.randrange(min(2000, len(changed)) + 1)
+        kind = rng.randrange(5)
+        if kind == 0 and at < len(changed):
+            changed[at] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            del changed[at:]
+        elif kind == 2:
+            changed[at:at] = changed[at : at + rng.randrange(64)]
+        elif kind == 3:
+            noise = rng.choice([b"9" * 9, b"-1", b"1e99", b"null", b"[[[[", b'"', b"NaN", b"\xff" * 8, b"\0" * 8])
+            changed[at : at + len(noise)] = noise
+        else:
+            changed[at : at + rng.randrange(16)] = rng.randbytes(rng.randrange(16))
+    return bytes(changed)
+
+
+def mutated(rng, message):
+    """The bytes of a message with something odd in it, whose checksum is mostly right."""
+    arrays, meta = dict(message.arrays), dict(message.meta)
+    with contextlib.suppress(CongraspError, ValueError, OverflowError, UnicodeEncodeError):
+        for _ in range(rng.randrange(3)):
+            meta = odd_tree(rng, meta)
+            meta = meta if isinstance(meta, dict) else {}
+        if arrays and rng.random() < 0.5:
+            name = rng.choice(list(arrays))
+            arrays[rng.choice([name, name, "made/up", "episode/" + "x" * 300])] = odd_array(rng, arrays.pop(name))
+        data = encode(Message(arrays, meta))
+        return data if rng.random() < 0.7 else odd_bytes(rng, data)
+    return odd_bytes(rng, encode(message))
+
+
+@contextlib.contextmanager
+def no_tracebacks():
+    """Fails if anything is logged with a traceback, or a thread dies, while the block runs."""
+    found = []
+
+    class Handler(logging.Handler):
+        def emit(self, record):
+            if record.exc_info:
+                found.append(f"{record.getMessage()}: {record.exc_info[1]!r}")
+
+    handler, before = Handler(), threading.excepthook
+    logging.getLogger().addHandler(handler)
+    threading.excepthook = lambda arguments: found.append(repr(arguments.exc_value))
+    try:
+        yield
+    finally:
+        logging.getLogger().removeHandler(handler)
+        threading.excepthook = before
+    assert not found, found[:3]
+
+
+def memory():
+    """Bytes that this process has in memory."""
+    return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
+
+
+# --- messages ---
+
+
+def requests():
+    """A valid message for every key that is asked, and for every one that is published under."""
+    who = {"actor": "NAME", "incarnation": "01"}
+    rollout = {**who, "sequence": 0, "version": 0, "epoch": "e", "schema": "s", "steps": 6, "ticket": "t"}
+    named = {**random_arrays(FORM), "episode/success": np.ones(1, np.float32)}
+    vector = np.zeros((2, LAYOUT.size), np.float32)
+    asked = {
+        KEYS.config: Message(),
+        KEYS.status: Message(),
+        KEYS.weights: Message(meta={"newer_than": 3, "life": "x"}),
+        KEYS.ticket("NAME"): Message(meta={**who, "ticket": "t", "give_back": False}),
+        KEYS.rollout("NAME"): Message({name: np.clip(a, -1, 1) for name, a in named.items()}, rollout),
+        KEYS.act: Message(query_arrays(), QUERY),
+        KEYS.health: Message(),
+    }
+    packed = Message({"packed": vector}, {"constraints": ["heading"], "layout": LAYOUT.digest})
+    told = {
+        KEYS.log("metrics", "actor", "NAME"): Message(meta={"time": 1.0, "update": 1, "values": {"a/b": 1.0, "c": 2}}),
+        KEYS.log("event", "actor", "NAME"): Message(meta={"time": 1.0, "level": "info", "text": "x"}),
+        KEYS.log("version", "actor", "NAME"): Message(meta={"version": 1, "epoch": "e"}),
+        KEYS.log("episode", "actor", "NAME"): episode(3),
+        KEYS.log("rollout", "actor", "NAME"): Message(named, {"actor": "a", "version": 1}),
+        KEYS.log("odd", "actor", "NAME"): Message(),
+        KEYS.announcement: Message(meta={"version": 1, "epoch": "e", "life": "x", "finished": False}),
+    }
+    return [*asked.items(), (KEYS.act, packed)], list(told.items())
+
+
+QUERY = {"constraints": ["heading"], "hand": "human", "timeout": 1.0, "layout": True}
+LAYOUT = Layout(get_hand("human"), TaskConfig(surface_points=8, trajectory_points=3))
+
+
+@contextlib.contextmanager
+def served(endpoint, folder):
+    """Everything that listens: a learner's hub, what a policy server makes of a query, and a recorder."""
+
+    def act(key, request):
+        PolicyServer._deadline(request.meta.get("timeout", 1.0))
+        LAYOUT.parse(request)
+        return Message()
+
+    ranges = Ranges(np.full(32, 1.0), 10.0, 100.0, {"episode/success": (0.0, 1.0)})
+    with ZenohTransport(listen=[endpoint]) as transport:
+        hub = LearnerHub(
+            transport, run="chaos", config_json="{}", run_id="e", schema="s", form=FORM,
+            staleness=StalenessManager(1, 2, ticket_seconds=1.0), admission=Admission(lambda: ranges),
+        )  # fmt: skip
+        hub.publish_weights(bundle(0, "e"), 0)
+        transport.serve(KEYS.act, act, workers=2, depth=64)
+        transport.serve(KEYS.health, lambda key, request: Message(meta={"ready": True}))
+        with Recorder(transport, "chaos", folder, warn=lambda text: None, max_bytes=4 << 20) as recorder:
+            yield hub, recorder
+
+
+def test_mutated_messages_at_every_key(tmp_path):
+    rng, endpoint = random.Random(SEED), f"tcp/127.0.0.1:{free_port()}"
+    asked, told = requests()
+    with no_tracebacks(), served(endpoint, tmp_path) as (hub, recorder), ZenohTransport(connect=[endpoint]) as raw:
+        began, first, sent = time.monotonic(), 0, 0
+        while (now := time.monotonic()) < began + SECONDS:
+            key, message = rng.choice(asked if rng.random() < 0.7 else told)
+            name = f"{rng.randrange(2000)}.x"
+            meta = {k: name if v == "NAME" else v for k, v in message.meta.items()}
+            session = raw._session(key)
+            data, key = mutated(rng, Message(message.arrays, meta)), key.replace("NAME", name)
+            if "/log/" in key or "announce" in key:
+                session.put(key, data, attachment=rng.choice([None, b"", rng.randbytes(16)]))
+            else:
+                answers = list(session.get(key, payload=data, timeout=LONGEST))
+                assert time.monotonic() - now < 2 * LONGEST, key
+                for answer in answers:
+                    text = b"" if answer.ok else answer.err.payload.to_bytes()
+                    assert b"failed on" not in text and len(text) < 1500 and b"\n" not in text, (key, text)
+            sent += 1
+            if sent % 50 == 0:
+                shown = f"congrasp/chaos/alive/{rng.choice(['actor', 'server'])}/{name}/x"
+                token = raw._session(KEYS.status).liveliness().declare_token(shown)
+                token.undeclare() if rng.random() < 0.5 else None
+                assert hub.status()["run"] == "chaos"
+            if not first and time.monotonic() > began + SECONDS / 3:
+                first = memory()
+            while len(list(tmp_path.glob("*.mcap"))) > 2:
+                next(tmp_path.glob("*.mcap")).unlink()
+        assert memory() - first < GROWTH, f"grew by {(memory() - first) >> 20} MiB in {sent} messages"
+        # An honest one is served as ever.
+        hub.next_batch(2, 0.0)
+        hub.publish_weights(bundle(1, "e"), 1)
+        fine = Message(meta={"actor": "77777.a", "incarnation": "1", "ticket": "t"})
+        assert raw.query(KEYS.ticket("77777.a"), fine, timeout=10.0).meta["version"] == 1
+        with contextlib.suppress(TransportError):
+            raw.query(KEYS.act, Message(query_arrays(), {}), timeout=10.0)
+        assert not recorder.error and recorder.messages and recorder.damaged
+    print(f"{sent} messages, {recorder.messages} log messages recorded, {recorder.damaged} left out")
+
+
+# --- files ---
+
+
+def _files(folder):
+    """A valid file for every loader, and the loader."""
+    task, sizes = TaskConfig(surface_points=4, trajectory_points=2), NetworkConfig((2,), 2)
+    spec = bundles.policy_spec(task, sizes)
+    seen = normalizer.empty((sum(size for _, size in spec.layout),))
+    params = network.init(0, spec.layout, spec.action_size, sizes)
+    bundles.save(PolicyBundle(spec, task, params, seen, normalizer.empty(), 7, "e", 1), folder / "policy")
+    store.save(generate(0, "box"), folder / "object")
+    (folder / "hand").write_text(hand_text(get_hand("human")))
+    save_motion(folder / "motion", motion_of_episode(episode()))
+    (folder / "config").write_text(to_json(RunConfig()))
+    (folder / "x.bvh").write_text(BVH)
+    (folder / "x.csv").write_text("x,y,z,w,x,y,z\n" + "0,0,0,1,0,0,0\n" * 3)
+    np.savez(folder / "x.npz", position=np.zeros((2, 3)), quaternion=np.tile([1.0, 0, 0, 0], (2, 1)))
+    (folder / "pickle").write_bytes(pickle.dumps({"a": [1, "x", np.zeros(3)], "b": (None, 2.5)}, 4))
+    journal = Journal(folder / "journal")
+    for i in range(5):
+        journal.write(actor="a", made=i)
+    journal.close()
+    _recording(folder).rename(folder / "x.mcap")
+    mesh = trimesh.creation.box((0.05, 0.05, 0.05))
+    for suffix in ("stl", "obj", "ply", "glb"):
+        mesh.export(folder / f"x.{suffix}")
+    everything = {
+        "policy": bundles.load,
+        "object": store.load,
+        "hand": read_hand,
+        "motion": load_motion,
+        "config": lambda path: run_config_from_json(path.read_bytes()),
+        "x.bvh": lambda path: read_bvh(path, "RightHand"),
+        "x.csv": read_wrist_path,
+        "x.npz": read_wrist_path,
+        "pickle": read_pickle,
+        "journal": read_journal,
+        "x.mcap": lambda path: (read_metrics(path), list(read_episodes(path))),
+        **dict.fromkeys(("x.stl", "x.obj", "x.ply", "x.glb"), read_mesh),
+    }
+    return {folder / name: load for name, load in everything.items()}
+
+
+def _recording(folder):
+    """A recording of metrics and an episode."""
+    writer, convert = LogWriter(folder, "log"), Converter()
+    for key, message in requests()[1][:4]:
+        writer.write(*convert(key.replace("NAME", "a"), message, 10**18))
+    writer.close()
+    return writer.files[0]
+
+
+def test_mutated_files_at_every_loader(tmp_path):
+    rng = random.Random(SEED)
+    loaders = _files(tmp_path)
+    valid = {path: path.read_bytes() for path in loaders}
+    for path, load in loaders.items():
+        load(path)
+    began, first, count, refused = time.monotonic(), 0, 0, 0
+    with no_tracebacks():
+        while (now := time.monotonic()) < began + SECONDS:
+            path = rng.choice(list(loaders))
+            data = valid[path]
+            if path.name in ("hand", "config") and rng.random() < 0.5:
+                data = json.dumps(odd_tree(rng, json.loads(data))).encode()
+            else:
+                data = odd_bytes(rng, data)
+            path.write_bytes(data)
+            try:
+                loaders[path](path)
+            except CongraspError as error:
+                refused += 1
+                assert "\n" not in str(error) and len(str(error)) < 3000
+            except Exception as error:
+                kept = tmp_path / "failed"
+                kept.write_bytes(data)
+                raise AssertionError(f"{path.name}, seed {SEED}, number {count}: {error!r}, see {kept}") from error
+            assert time.monotonic() - now < LONGEST, path.name
+            count += 1
+            if not first and time.monotonic() > began + SECONDS / 3:
+                first = memory()
+    assert memory() - first < GROWTH, f"grew by {(memory() - first) >> 20} MiB in {count} files"
+    assert refused > count / 10
+    print(f"{count} files, {refused} refused")

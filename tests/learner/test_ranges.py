@@ -1,0 +1,66 @@
+"""Ranges of a task: wide enough for whatever an engine produces, narrow enough to be worth a check."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from actors.bank import build_bank
+from actors.physics.native import NativePhysics
+from actors.rollout import RolloutWorker, finished_episodes
+from common.config import CurriculumConfig, RewardWeights, TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects import procedural
+from common.task.metrics import episode_fields
+from common.wire.codec import Message
+from learner.admission import Admission
+from learner.ranges import task_ranges
+
+TASK = TaskConfig(surface_points=32, trajectory_points=4, hold_steps_max=40)
+RANGES = task_ranges(TASK, CurriculumConfig())
+WORLDS, STEPS = 8, 90
+
+
+def _rollouts(*spreads):
+    """Rollouts of the native engine whose actions have these standard deviations."""
+    hand = get_hand("human")
+    objects = procedural.generate_many(1, 0, ("box",))
+
+    def noise(spread, observation, key):
+        action = spread * jax.random.normal(key, (observation.shape[0], len(hand.joints) + 6))
+        return action, -0.5 * jnp.sum((action / spread) ** 2 + 2 * jnp.log(spread) + np.log(2 * np.pi), -1)
+
+    physics = NativePhysics(hand, TASK, objects, 2)
+    bank = build_bank(hand, TASK, objects, 0)
+    worker = RolloutWorker(hand, TASK, physics, bank, noise, batch=WORLDS, seed=0, half_precision=True)
+    names = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
+    for spread in spreads:
+        rollout = worker.collect(jnp.float32(spread), STEPS)
+        yield Message({name: np.asarray(getattr(rollout, name)) for name in names} | finished_episodes(rollout, TASK))
+
+
+def test_whatever_an_engine_produces_is_within_the_ranges():
+    """Actions of three units make hands beat about, and of 30 throw objects away."""
+    admission = Admission(lambda: RANGES)
+    for rollout in _rollouts(0.3, 3.0, 30.0):
+        admission.check(rollout)
+        worst = Message({**rollout.arrays, "reward": rollout.arrays["reward"] * np.float32(1e15)})
+        with pytest.raises(CongraspError, match="'reward' holds"):
+            admission.check(worst)
+
+
+def test_names_and_bounds_follow_from_the_task():
+    assert set(RANGES.episodes) == set(episode_fields(TASK))
+    assert RANGES.episodes["episode/success"] == RANGES.episodes["episode/mask_trajectory"] == (0.0, 1.0)
+    assert RANGES.episodes["episode/length"] == (0.0, 90.0)
+    # An action's contact earns at most 1, everywhere, and is given twice the room: 90 steps of 2.
+    assert RANGES.episodes["term/contact"][1] == pytest.approx(180.0, rel=1e-3)
+    assert RANGES.episodes["term/drop"] == (-180.0, 180.0)
+    assert 30.0 < RANGES.reward < 300.0 and RANGES.observation.max() < 1500.0
+    assert np.isfinite(RANGES.observation).all()
+
+
+def test_a_curriculum_widens_the_reward_by_its_weights():
+    heavy = CurriculumConfig(ramp=(0, 10), reward=RewardWeights(contact=11.0))
+    assert task_ranges(TASK, heavy).reward == pytest.approx(RANGES.reward + 2.0 * 10.0, rel=1e-3)
