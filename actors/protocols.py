@@ -46,7 +46,7 @@ class Protocol(NamedTuple):
     """A lift, then six pushes with half of the object's weight and six with 1 N; times count from the table's removal.
 
     The pushes are DexGraspBench's (one along each axis of the world and one against it), but follow one another in the
-    same grasp, last 0.25 s instead of 2 s, and act beside gravity; its force of ten times the mass is the 1 N of its
+    same grasp, last 0.25 s instead of 2 s, and act beside gravity. Its force, 10 m/s^2 times the mass, is 1 N for its
     objects of 100 g.
     """
 
