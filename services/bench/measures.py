@@ -35,11 +35,10 @@ def bench_measures(physics: PhysicsName, environments: int, threads: int, repeat
     steps = task.approach_steps + two_seconds(task)
     began = time.perf_counter()
     field = jax.block_until_ready(distance_field(objects))
-    console.print(
-        f"Grids of {len(objects)} objects: {time.perf_counter() - began:.1f} s, {field.values.nbytes / 1e6:.0f} MB"
-    )
+    seconds, size = time.perf_counter() - began, field.values.nbytes / 1e6
+    console.print(f"Grids of {len(objects)} objects: {seconds:.1f} s, {size:.0f} MB")
 
-    def worker(probe: Probe | None) -> RolloutWorker:
+    def worker(probe: Probe) -> RolloutWorker:
         made = RolloutWorker(
             hand,
             task,
@@ -49,7 +48,7 @@ def bench_measures(physics: PhysicsName, environments: int, threads: int, repeat
             batch=environments,
             seed=0,
             half_precision=False,
-            **({"probe": probe} if probe else {}),
+            probe=probe,
         )
         made.adjust(probe_data=field)
         return made
@@ -61,7 +60,7 @@ def bench_measures(physics: PhysicsName, environments: int, threads: int, repeat
         if rollout.probed is not None:
             plausibility.measures(jax.tree.map(np.asarray, rollout.probed), task.control_dt)
 
-    workers = [worker(None), worker(plausibility.sample)]
+    workers = [worker(lambda scene, index, data: None), worker(plausibility.sample)]
     for one in workers:
         run(one)
     timed = np.array([[_timed(functools.partial(run, one)) for one in workers] for _ in range(repeats)])

@@ -164,9 +164,9 @@ def scaling(
 
 
 def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int = 0, repeats: int = 5) -> int:
-    """Seconds of an evaluation's episodes with measures of plausibility, beside the same without them.
+    """Seconds of an evaluation's episodes with measures of plausibility beside the same without them.
 
-    The pretrained human policy grasps held-out procedural objects. What grasps survive after their hold is not part of it.
+    The pretrained human policy grasps held-out procedural objects. Lifts and pushes after the hold are not part of it.
 
     Args:
       engine: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
