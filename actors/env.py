@@ -126,7 +126,7 @@ class GraspEnv:
             region=initial.region,
             hold=initial.hold,
             after=index,
-            frame=Frame(zero, zero),
+            frame=Frame(zero, zero, zero),
             time=index,
             q_target=reset_state.q,
             u_target=jnp.zeros((batch, 6)),
@@ -171,7 +171,7 @@ class GraspEnv:
         if settings.protocol is None:
             return target, (jnp.concatenate([target.u_target, target.q_target], -1), table)
         start, time = state.reset_state, state.time
-        frame = protocols.frame(settings.protocol, self.task, time + 1)
+        frame = protocols.frame(settings.protocol, self.task, time + 0.5)
         u_target = protocols.carried_targets(target.u_target, self.hand, start.base_quaternion, frame)
         force = protocols.push(settings.protocol, self.task, time, start.object_index, start.mass_scale)
         return target, (jnp.concatenate([u_target, target.q_target], -1), table, force)

@@ -46,7 +46,7 @@ class Protocol(NamedTuple):
     """A lift, then six pushes with half of the object's weight and six with 1 N; times count from the table's removal.
 
     The pushes are DexGraspBench's (one along each axis of the world and one against it), but follow one another in the
-    same grasp, last 0.25 s instead of 2 s, and act beside gravity; its force of ten times the mass is the 1 N of its
+    same grasp, last 0.25 s instead of 2 s, and act beside gravity. Its force, 10 m/s^2 times the mass, is 1 N for its
     objects of 100 g.
     """
 
@@ -61,12 +61,14 @@ class Protocol(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """How far and how fast the carried frame is above the world's, in B environments."""
+    """Where the carried frame is above the world's, and how it moves, in B environments."""
 
     height: Array
     """(B,) m."""
     speed: Array
     """(B,) m/s."""
+    acceleration: Array
+    """(B,) m/s^2."""
 
 
 def stress(task: TaskConfig, objects: Sequence[GraspObject], start: int, height: float = LIFT_HEIGHT) -> Protocol:
@@ -93,7 +95,7 @@ def stress_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
 
 
 def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
-    """The carried frame after `time` (B,) control steps of the episode.
+    """The carried frame `time` (B,) control steps into the episode.
 
     Its speed rises and falls with at most `LIFT_ACCELERATION` and is at most `LIFT_SPEED`: a ramp, less the same ramp
     by height / speed later.
@@ -101,14 +103,15 @@ def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
     since = (time - task.approach_steps - protocol.lift_start) * task.control_dt
     rise = LIFT_SPEED / LIFT_ACCELERATION
 
-    def ramp(seconds: Array) -> tuple[Array, Array]:
-        """Way and speed of one that speeds up to `LIFT_SPEED` and goes on."""
+    def ramp(seconds: Array) -> Frame:
+        """One that speeds up to `LIFT_SPEED` and goes on."""
         speeding = jnp.clip(seconds, 0.0, rise)
         way = 0.5 * LIFT_ACCELERATION * speeding**2 + LIFT_SPEED * jnp.maximum(seconds - rise, 0.0)
-        return way, LIFT_ACCELERATION * speeding
+        speeds_up = (seconds > 0.0) & (seconds < rise)
+        return Frame(way, LIFT_ACCELERATION * speeding, jnp.where(speeds_up, LIFT_ACCELERATION, 0.0))
 
-    (up, rising), (down, falling) = ramp(since), ramp(since - protocol.lift_height / LIFT_SPEED)
-    return Frame(up - down, rising - falling)
+    begun, ended = ramp(since), ramp(since - protocol.lift_height / LIFT_SPEED)
+    return Frame(*(first - second for first, second in zip(begun, ended, strict=True)))
 
 
 def push(protocol: Protocol, task: TaskConfig, time: Array, index: Array, mass_scale: Array) -> Array:
@@ -147,12 +150,14 @@ def carried(state: PhysicsState, base_quaternion: Array, frame: Frame) -> Physic
 
 
 def carried_targets(u_target: Array, hand: Hand, base_quaternion: Array, frame: Frame) -> Array:
-    """Wrist targets (B, 6) of the carried frame in the world.
+    """Wrist targets (B, 6) of the carried frame in the world, for a control step in whose middle it is at `frame`.
 
-    The servo's damping acts against the frame's speed; its targets lead by as much as makes up for that.
+    They lead by what makes up for the servo's damping of the frame's speed, and for the hand's inertia.
     """
-    lead = hand.wrist.slide_kv / hand.wrist.slide_kp
-    return u_target + slides(base_quaternion, frame.height + lead * frame.speed)
+    gains = hand.wrist
+    inertia = gains.slide_armature + sum(link.mass for link in hand.links)
+    lead = (gains.slide_kv * frame.speed + inertia * frame.acceleration) / gains.slide_kp
+    return u_target + slides(base_quaternion, frame.height + lead)
 
 
 def slides(base_quaternion: Array, height: Array) -> Array:

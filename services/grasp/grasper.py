@@ -85,7 +85,7 @@ class Grasp:
             "rest": self.rest,
             "constraints": list(self.motion.constraints),
             "links_at_removal": self.motion.metrics["links_at_removal"],
-            **{name: self.motion.metrics[name] for name in ASSESSED},
+            **{name: value for name, value in self.motion.metrics.items() if name in ASSESSED},
             **{name: self.motion.metrics[name] for name in _errors_of(self.motion.constraints)},
         }
 

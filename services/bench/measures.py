@@ -1,0 +1,81 @@
+"""What measuring plausibility costs an evaluation, beside the same episodes without it."""
+
+import functools
+import time
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from actors.bank import build_bank
+from actors.physics import make_physics, resolve_physics
+from actors.rollout import Probe, RolloutWorker
+from common.config import ObjectsConfig
+from common.engines import PhysicsName
+from common.hands import get_hand
+from common.objects.distance import distance_field
+from common.objects.pool import HELD_OUT_SEED, load_pool, scale_objects
+from common.policy import bundle as bundles
+from common.policy.bundle import sample_action
+from common.policy.pretrained import policy_file
+from common.task import plausibility
+from services.evaluate.protocol import protocol, two_seconds
+
+
+def bench_measures(physics: PhysicsName, environments: int, threads: int, repeats: int) -> None:
+    """Seconds of episodes of the evaluation, with and without measures, in turns."""
+    console = Console()
+    policy = bundles.load(policy_file(None, "human"))
+    task = protocol(policy.task, two_seconds(policy.task))
+    hand, engine = get_hand(policy.spec.hand), resolve_physics(physics)
+    objects = scale_objects(hand, task, load_pool(ObjectsConfig(count=16, seed=HELD_OUT_SEED)))
+    bank = build_bank(hand, task, objects, 0)
+    steps = task.approach_steps + two_seconds(task)
+    began = time.perf_counter()
+    field = jax.block_until_ready(distance_field(objects))
+    seconds, size = time.perf_counter() - began, field.values.nbytes / 1e6
+    console.print(f"Grids of {len(objects)} objects: {seconds:.1f} s, {size:.0f} MB")
+
+    def worker(probe: Probe) -> RolloutWorker:
+        made = RolloutWorker(
+            hand,
+            task,
+            make_physics(engine, hand, task, objects, threads=threads),
+            bank,
+            functools.partial(sample_action, policy.spec.layout),
+            batch=environments,
+            seed=0,
+            half_precision=False,
+            probe=probe,
+        )
+        made.adjust(probe_data=field)
+        return made
+
+    def run(worker: RolloutWorker) -> None:
+        worker.restart()
+        rollout = worker.collect(policy.inference_parameters, steps)
+        jax.block_until_ready(rollout.reward)
+        if rollout.probed is not None:
+            plausibility.measures(jax.tree.map(np.asarray, rollout.probed), task.control_dt)
+
+    workers = [worker(lambda scene, index, data: None), worker(plausibility.sample)]
+    for one in workers:
+        run(one)
+    timed = np.array([[_timed(functools.partial(run, one)) for one in workers] for _ in range(repeats)])
+    table = Table(title=f"{engine}: {environments} episodes of {steps} control steps, medians of {repeats}")
+    for column in ("", "without, s", "with, s", "ratio"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, (without, measured) in zip(("wall clock", "processor"), np.median(timed, 0).T, strict=True):
+        table.add_row(name, f"{without:.2f}", f"{measured:.2f}", f"{measured / without:.2f}")
+    console.print(table)
+    for one in workers:
+        one.physics.close()
+
+
+def _timed(run: Callable[[], object]) -> tuple[float, float]:
+    """Seconds of a call by the clock, and of the processor in all threads."""
+    began, busy = time.perf_counter(), time.process_time()
+    run()
+    return time.perf_counter() - began, time.process_time() - busy
