@@ -110,7 +110,7 @@ class Transport(Protocol):
         Args:
           key: the key.
           request: the question.
-          timeout: seconds to wait for the answer.
+          timeout: seconds to wait for the answer, and for each further piece of a long one.
 
         Raises:
           RefusedError: the peer answered with an error; a subclass where its code names one (`common.errors`).

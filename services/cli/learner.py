@@ -75,7 +75,10 @@ def learner(
     resume = resume or (or_resume and (run_dir / CONFIG_FILE).exists())
     try:
         config, url = with_hand(config, hand), rank_url(listen, rank)
-        with on_signal() as stop, urls.listen(url, "learner", certs=certs, insecure=insecure) as transport:
+        with (
+            on_signal() as stop,
+            urls.listen(url, "learner", certs=certs, insecure=insecure, run=config.name) as transport,
+        ):
             if rank == 0 and resume:
                 continue_run(run_dir, config)
             elif rank == 0:

@@ -18,7 +18,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 from actors.link import ActorLink
 from common.errors import CongraspError, TransportError
 from common.transport.certificates import read
-from common.transport.keys import Keys
+from common.transport.keys import Keys, below
 from common.transport.ports import free_port
 from common.transport.security import RIGHTS, Credentials
 from common.transport.zenoh_transport import ZenohTransport
@@ -39,7 +39,7 @@ ME, OTHER = "0.a", "1.b"
 def certs(tmp_path_factory):
     """An authority with a certificate of every role, a second actor's, and an expired one."""
     folder = tmp_path_factory.mktemp("certs")
-    create_authority(folder)
+    create_authority(folder, run="safe")
     for role in ("learner", "actor", "actor", "server", "client", "observer"):
         issue(folder, role)
     issue(folder, "actor", number=9, days=-1)
@@ -50,7 +50,7 @@ def certs(tmp_path_factory):
 def evil(tmp_path_factory):
     """Another authority, which certifies everything."""
     folder = tmp_path_factory.mktemp("evil")
-    create_authority(folder)
+    create_authority(folder, run="safe")
     for role in ("learner", "actor"):
         issue(folder, role)
     return folder
@@ -87,7 +87,7 @@ def run(certs):
         )  # fmt: skip
         hub.publish_weights(bundle(0, "e"), 0)
         serving = stack.enter_context(ZenohTransport(listen=[policy], credentials=server, flows=("policy",)))
-        for key in (KEYS.act, KEYS.health):
+        for key in (below(KEYS.act), KEYS.health):
             serving.serve(key, lambda key, request: Message(meta={"ready": True, "served": key}))
         yield Run(certs, endpoint, policy, hub, transport, stack)
 
@@ -140,10 +140,13 @@ def test_with_the_right_certificates_a_run_works_from_end_to_end(run):
         status = wait_for(lambda: (now := observer.query(KEYS.status, Message(), timeout=5).meta) and now)
         assert ("actor", ME) in {(role["role"], role["id"]) for role in status["roles"]}
         assert status["ledger"]["accepted"] == 2 and status["ledger"]["turned_away"] == 0
-    assert server.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5).meta["version"] == 1
+    assert (
+        server.query(KEYS.weights_for("server", "0.s"), Message(meta={"newer_than": -1}), timeout=5).meta["version"]
+        == 1
+    )
     with PolicyClient(run.policy, "safe", certs=run.certs / "client.0") as client:
         assert client.health()["ready"]
-    assert answers(run.connect("client.0", run.policy), KEYS.act).meta["served"] == KEYS.act
+    assert answers(run.connect("client.0", run.policy), KEYS.act_for("0.c")).meta["served"] == KEYS.act_for("0.c")
     assert answers(run.connect("observer.0", run.policy), KEYS.health)
 
 
@@ -173,13 +176,17 @@ def test_an_actor_finds_a_learner_that_comes_back_and_its_rules_hold(certs):
 
 EVERYTHING = {
     "config": KEYS.config,
-    "weights": KEYS.weights,
+    "nobody's weights": KEYS.weights,
+    "my weights": KEYS.weights_for("actor", ME),
+    "another's weights": KEYS.weights_for("actor", OTHER),
+    "a server's weights": KEYS.weights_for("server", "0.s"),
     "status": KEYS.status,
     "my ticket": KEYS.ticket(ME),
     "my rollout": KEYS.rollout(ME),
     "another's ticket": KEYS.ticket(OTHER),
     "another's rollout": KEYS.rollout(OTHER),
     "everyone's": "congrasp/safe/rollout/*",
+    "another run's status": Keys("other").status,
     "whatever there is": "congrasp/**",
     "the learner's innards": "@/{learner}/**",
 }
@@ -188,9 +195,9 @@ EVERYTHING = {
 @pytest.mark.parametrize(
     ("who", "may"),
     [
-        ("actor.0", {"config", "weights", "my ticket", "my rollout"}),
-        ("actor.1", {"config", "weights", "another's ticket", "another's rollout"}),
-        ("server.0", {"config", "weights"}),
+        ("actor.0", {"config", "my weights", "my ticket", "my rollout"}),
+        ("actor.1", {"config", "another's weights", "another's ticket", "another's rollout"}),
+        ("server.0", {"config", "a server's weights"}),
         ("observer.0", {"config", "status"}),
         ("client.0", set()),
         ("learner.0", set()),
@@ -207,11 +214,13 @@ def test_each_role_can_ask_the_learner_for_its_own_and_nothing_else(run, who, ma
 
 
 @pytest.mark.parametrize(
-    ("who", "may"), [("client.0", {KEYS.act, KEYS.health}), ("observer.0", {KEYS.health}), ("actor.0", set())]
+    ("who", "may"),
+    [("client.0", {KEYS.act_for("0.c"), KEYS.health}), ("observer.0", {KEYS.health}), ("actor.0", set())],
 )
 def test_only_clients_can_ask_the_policy(run, who, may):
     session = run.connect(who, run.policy)
-    assert {key for key in (KEYS.act, KEYS.health) if answers(session, key)} == may
+    asked = (KEYS.act_for("0.c"), KEYS.act_for("1.c"), KEYS.act, KEYS.health)
+    assert {key for key in asked if answers(session, key)} == may
 
 
 @pytest.mark.parametrize("who", ["actor.0", "client.0", "observer.0", "server.0"])
@@ -228,7 +237,9 @@ def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
         thief.publish(key, Message(meta={"forged": True}))
     assert heard(announcements) == heard(logs, 0.1) == heard(here[0], 0.1) == heard(here[1], 0.1) == []
     assert "forged" not in observer.query(KEYS.status, Message(), timeout=5).meta
-    assert "forged" not in victim.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5).meta
+    assert (
+        "forged" not in victim.query(KEYS.weights_for("actor", OTHER), Message(meta={"newer_than": -1}), timeout=5).meta
+    )
     assert answers(run.transport, KEYS.act) is None and asked == []
 
 
@@ -293,7 +304,8 @@ def test_another_mode_of_connecting_gives_no_more(run, mode):
 def test_every_right_is_a_key_of_a_run():
     """A right for a key that does not exist any more would be an open door without a room."""
     real = {
-        KEYS.config, KEYS.status, KEYS.weights, KEYS.announcement, KEYS.act, KEYS.health, KEYS.logs,
+        KEYS.config, KEYS.status, KEYS.announcement, KEYS.health, KEYS.logs, KEYS.act_for("name"),
+        KEYS.weights_for("actor", "name"), KEYS.weights_for("server", "name"),
         KEYS.ticket("{name}".strip("{}")), KEYS.rollout("name"), KEYS.alive("actor", "name", "x"),
         KEYS.alive("server", "x", "x"), KEYS.alive("recorder", "x", "x"), KEYS.log("x", "actor", "name"),
     }  # fmt: skip
