@@ -30,7 +30,7 @@ _INCARNATIONS = 1024  # whose sequences are kept
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
 _EVENT_SECONDS = 1.0  # between two events of one kind
-_PIECES = 64.0  # a second of the weights, of a mebibyte at most, for the owner of one certificate
+_PIECES = 40.0  # a second of the weights, of four mebibytes at most, for the owners of one certificate
 _RETURN_SECONDS = 1.0  # that actors have after a resume to send again what the last session had accepted
 
 
@@ -105,7 +105,7 @@ class LearnerHub:
         transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._turn_away)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
         transport.serve(
-            below(self.keys.weights), self._on_weights, workers=2, depth=16, admission=self._turn_away_puller
+            below(self.keys.weights), self._on_weights, workers=4, depth=16, admission=self._turn_away_puller
         )
         transport.serve(
             self.keys.rollouts,

@@ -9,6 +9,7 @@ import contextlib
 import json
 import logging
 import re
+import resource
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -29,10 +30,13 @@ _OVERHEAD = 64 << 10  # bytes that Zenoh may add to a message
 _ATTEMPT = 1.0  # seconds of one attempt to connect; signals are seen between two
 _CLOSE = 0.5  # seconds that closing may take
 _REOPEN = 10.0  # seconds that opening anew may take
-_WITHOUT_ROOM_US = 10_000  # that an answer waits for room in its reader's link
+_ROOM_US: dict[Flow, int] = {"control": 10_000, "bulk": 50_000, "log": 10_000, "policy": 5_000}
+"""Microseconds that an answer waits for room in its reader's link; then all are dropped until there is some."""
+_ROOM_LONG_US = 200_000  # that a piece of a long answer waits in all
 _QUEUE = 8  # batches of 64 KiB that wait for a link: an acknowledgement finds room beside a piece of a long reply
 _ACCEPT_MS = 2000  # that a connection has until it has shown who it is
-_PENDING = 1000  # connections that may be at that
+_PENDING = 4096  # connections that may be at that
+_FILES = 16384  # that the process may have open, if the system allows it: each connection is one
 _SESSIONS = 1000
 _log = logging.getLogger(__name__)
 
@@ -59,7 +63,8 @@ def configuration(
         "transport/link/tx/lease": _LEASE_MS[name],
         "transport/link/tx/queue/size/data": _QUEUE,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": _BLOCK_US[name],
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _WITHOUT_ROOM_US,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _ROOM_US[name],
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": _ROOM_LONG_US,
         "transport/link/rx/max_message_size": longest + _OVERHEAD,
         "qos/network": [{**answers, "overwrite": {"congestion_control": "drop"}}],
         **(limits(name, rates=credentials is not None) if listens else {}),
@@ -76,6 +81,10 @@ def configuration(
 
 def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
     """A session that listens; a CongraspError if its port is in use."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = _FILES if hard == resource.RLIM_INFINITY else min(hard, _FILES)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

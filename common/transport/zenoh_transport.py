@@ -26,8 +26,8 @@ from zenoh.handlers import FifoChannel
 from common.errors import CongraspError, TransportError, error_of
 from common.transport import pieces, zenoh_session
 from common.transport.base import Admission, Answerer, Damage, Subscription
-from common.transport.keys import FLOWS, Flow, flow
-from common.transport.pieces import Outbox
+from common.transport.keys import FLOWS, Flow, account, flow
+from common.transport.pieces import Outbox, Pace
 from common.transport.ports import shifted
 from common.transport.security import Credentials, secured
 from common.transport.zenoh_session import Sessions, first_line
@@ -86,7 +86,7 @@ class ZenohTransport:
         self._sender = secrets.token_bytes(8)
         self._counts: dict[str, int] = {}
         self._counts_lock = threading.Lock()
-        self._outbox = Outbox()
+        self._outbox, self._pace = Outbox(), Pace()
         self._sessions = Sessions()
         self._finalizer = weakref.finalize(self, self._sessions.close)
         deadline = time.monotonic() + wait
@@ -137,7 +137,7 @@ class ZenohTransport:
         reply = self._ask(key, self._encode(request), None, timeout)
         whole = reply.payload
         if reply.head:
-            whole = pieces.fetch(reply.head, whole, ask, most=self._max_message, timeout=timeout)
+            whole = pieces.fetch(reply.head, whole, ask, self._pace, most=self._max_message, timeout=timeout)
         return decode(whole, max_bytes=self._max_message)
 
     def _ask(self, key: str, payload: bytes | None, attachment: bytes | None, timeout: float) -> _Reply:
@@ -273,11 +273,10 @@ def _serve(queries: Any, server: _Server) -> None:
         wanted = query.attachment.to_bytes() if query.attachment else b""
         if not pieces.is_request(wanted):
             _reply(query, key, functools.partial(_answer, query, key, server), server.outbox)
-        elif server.admission(key) is None:
-            with contextlib.suppress(zenoh.ZError), query:
-                query.reply(key, server.outbox.piece(wanted), attachment=wanted)
         else:
-            query.drop()
+            with contextlib.suppress(zenoh.ZError), query, server.outbox.turn(account(key)) as mine:
+                if mine and server.admission(key) is None:
+                    query.reply(key, server.outbox.piece(wanted), attachment=wanted)
 
 
 def _answer(query: Any, key: str, server: _Server) -> Message | Future[Message]:
@@ -313,10 +312,9 @@ def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]
         if message:
             encoding = zenoh.Encoding.TEXT_PLAIN.with_schema(code)
             query.reply_err(message.encode(errors="replace"), encoding=encoding)
-        elif len(payload) > pieces.FIRST:
-            query.reply(key, payload[: pieces.FIRST], attachment=outbox.put(payload))
         else:
-            query.reply(key, payload)
+            piece, head = outbox.first(payload)
+            query.reply(key, piece, attachment=head)
 
 
 def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:
