@@ -274,7 +274,7 @@ def _serve(queries: Any, server: _Server) -> None:
         if not pieces.is_request(wanted):
             _reply(query, key, functools.partial(_answer, query, key, server), server.outbox)
         else:
-            with contextlib.suppress(zenoh.ZError), query, server.outbox.turn(account(key)) as mine:
+            with contextlib.suppress(zenoh.ZError, CongraspError), query, server.outbox.turn(account(key)) as mine:
                 if mine and server.admission(key) is None:
                     query.reply(key, server.outbox.piece(wanted), attachment=wanted)
 

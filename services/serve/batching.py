@@ -68,9 +68,18 @@ class Batcher(Generic[T, R]):
         self._thread = threading.Thread(target=self._work, daemon=True, name="batcher")
         self._thread.start()
 
+    def check_room(self, peer: str) -> None:
+        """Raises `OverloadedError` if nothing more of a peer may wait."""
+        with self._changed:
+            if len(self) >= self._depth:
+                raise OverloadedError(f"Overloaded: {self._depth} queries wait already.", "Ask again later.")
+            if len(self._queues.get(peer, ())) >= self._share:
+                raise OverloadedError(f"Overloaded: {self._share} of your queries wait already.", "Ask again later.")
+
     def __len__(self) -> int:
         """Items that wait."""
-        return sum(len(queue) for queue in self._queues.values())
+        with self._changed:
+            return sum(len(queue) for queue in self._queues.values())
 
     def submit(self, item: T, timeout: float, peer: str = "") -> "Future[R]":
         """Queues an item of a peer that is worth answering for `timeout` seconds.
@@ -86,11 +95,8 @@ class Batcher(Generic[T, R]):
             alone = not self._running and not self._queues and self._expected == 1
             if alone:
                 self._running = True
-            elif len(self) >= self._depth:
-                raise OverloadedError(f"Overloaded: {self._depth} queries wait already.", "Ask again later.")
-            elif len(self._queues.get(peer, ())) >= self._share:
-                raise OverloadedError(f"Overloaded: {self._share} of your queries wait already.", "Ask again later.")
             else:
+                self.check_room(peer)
                 self._queues.setdefault(peer, collections.deque()).append(waiting)
                 self._changed.notify()
         if alone:

@@ -91,7 +91,9 @@ class PolicyServer:
         )
         keys = Keys(run)
         transport.serve(keys.health, lambda key, request: Message({}, self.health()))
-        transport.serve(below(keys.act), self._act, workers=2, depth=DEPTH)  # one may infer while the other receives
+        transport.serve(
+            below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._turn_away
+        )  # one may infer while the other receives
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
 
@@ -115,6 +117,15 @@ class PolicyServer:
         self._closed.set()
         self._batcher.close()
         self._follower.join(2 * _FOLLOW_SECONDS)
+
+    def _turn_away(self, key: str) -> None:
+        """Refuses a query that could not wait for its turn, before it costs anything more."""
+        began = time.monotonic()
+        try:
+            self._batcher.check_room(account(key))
+        except CongraspError as error:
+            self._count(error, began)
+            raise
 
     def _act(self, key: str, request: Message) -> "Future[Message]":
         """Queues a query; the answer comes later."""

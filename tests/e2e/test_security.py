@@ -26,7 +26,7 @@ from common.wire.codec import Message, encode
 from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
-from services.ops.certificates import create_authority, issue
+from services.ops.certificates import create_authority, issue, revoke
 from services.serve.client import PolicyClient
 from tests.cluster import A, B, D, T, bundle, rollout
 
@@ -80,7 +80,7 @@ def run(certs):
     endpoint, policy = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     with contextlib.ExitStack() as stack:
         learner, server = (Credentials(certs / f"{role}.0", role) for role in ("learner", "server"))
-        transport = stack.enter_context(ZenohTransport(listen=[endpoint], credentials=learner))
+        transport = stack.enter_context(ZenohTransport(listen=[endpoint], credentials=learner, revocation_seconds=0.1))
         hub = LearnerHub(
             transport, run="safe", config_json="{}", run_id="e", schema="s",
             form=RolloutForm(T, B, D, A, half=True), staleness=StalenessManager(1, 2),
@@ -278,17 +278,21 @@ def test_a_client_hears_no_logs(run):
     assert heard(logs) == heard(also, 0.1) == []
 
 
-@pytest.mark.parametrize("mode", ["peer", "router"])
-def test_another_mode_of_connecting_gives_no_more(run, mode):
-    """Zenoh's peers and routers exchange more than its clients; the same rules hold for them."""
-    folder = run.certs / "actor.0"
+def _raw_session(endpoint, folder, mode):
+    """A session of somebody who does not use our code."""
     config = zenoh.Config.from_json5(
         f"""{{mode: "{mode}", listen: {{endpoints: []}}, scouting: {{multicast: {{enabled: false}}}},
-             connect: {{endpoints: ["{run.endpoint.replace("tcp/", "tls/")}"], timeout_ms: 5000}},
+             connect: {{endpoints: ["{endpoint.replace("tcp/", "tls/")}"], timeout_ms: 5000}},
              transport: {{link: {{tls: {{root_ca_certificate: "{folder}/ca.crt", enable_mtls: true,
              connect_certificate: "{folder}/tls.crt", connect_private_key: "{folder}/tls.key"}}}}}}}}"""
     )
-    with zenoh.open(config) as session:
+    return zenoh.open(config)
+
+
+@pytest.mark.parametrize("mode", ["peer", "router"])
+def test_another_mode_of_connecting_gives_no_more(run, mode):
+    """Zenoh's peers and routers exchange more than its clients; the same rules hold for them."""
+    with _raw_session(run.endpoint, run.certs / "actor.0", mode) as session:
         stolen = [session.declare_queryable(key, FifoChannel(8)) for key in (KEYS.status, KEYS.act)]
         logs = session.declare_subscriber("congrasp/**", RingChannel(64))
         time.sleep(0.5)
@@ -350,6 +354,81 @@ def test_nobody_is_taken_for_the_learner(folder, who, request, certs):
     mine = Credentials(request.getfixturevalue(folder) / who, "learner")
     with ZenohTransport(listen=[endpoint], credentials=mine):
         _refused(endpoint, Credentials(certs / "actor.1", "actor"), "not to be trusted")
+
+
+def test_a_certificate_serves_the_run_that_it_names(run, certs):
+    """Another run's certificates of the same authority open the connection, and nothing behind it."""
+    mine = {
+        "actor": (KEYS.config, KEYS.ticket("20.a"), KEYS.rollout("20.a"), Keys("other").config),
+        "observer": (KEYS.config, KEYS.status, Keys("other").status),
+    }
+    for role, keys in mine.items():
+        folder = issue(certs, role, run="other", number=20, force=True)
+        with pytest.raises(CongraspError, match=r"safe.learner.0', which may not listen to other"):
+            run.connect(folder.name)
+        with _raw_session(run.endpoint, folder, "client") as session:
+            for key in keys:
+                time.sleep(0.02)
+                assert not list(session.get(key, FifoChannel(8), payload=encode(Message()), timeout=3.0)), key
+    assert answers(run.connect("observer.0"), KEYS.status)
+
+
+def test_a_policy_server_is_not_taken_for_the_learner(certs):
+    """Its certificate is one for listening, and of the same authority: those who want the learner see whose it is."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "server.0", "server")):
+        for role in ("actor", "observer", "server"):
+            _refused(endpoint, Credentials(certs / f"{role}.0", role), "server.0', which may not listen to safe")
+    issue(certs, "learner", run="other", number=20, force=True)
+    with ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "learner.20", "learner")):
+        _refused(endpoint, Credentials(certs / "actor.0", "actor"), "other.learner.20', which may not listen to safe")
+
+
+def test_a_learner_that_is_replaced_by_another_role_gets_nothing(certs):
+    """Zenoh connects again by itself, without asking us: the rules of who connects hold for whom it finds then."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    learner = ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "learner.0", "learner"))
+    learner.serve(KEYS.config, lambda key, request: Message())
+    with ZenohTransport(connect=[endpoint], credentials=Credentials(certs / "actor.0", "actor")) as actor:
+        assert answers(actor, KEYS.config)
+        learner.close()
+        asked = []
+        with ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "server.0", "server")) as thief:
+            for key in (KEYS.config, KEYS.ticket(ME)):
+                thief.serve(key, lambda key, request: asked.append(key) or Message())
+            wait_for(lambda: list(thief._sessions.get("control").info.links()))
+            time.sleep(0.3)
+            assert answers(actor, KEYS.config) is None and answers(actor, KEYS.ticket(ME)) is None and asked == []
+
+
+def test_who_is_revoked_is_out_and_the_others_stay(run):
+    thief, actor, observer = run.connect("actor.1"), run.connect("actor.0"), run.connect("observer.0")
+    logs = observer.subscribe(KEYS.logs, depth=64)
+    thief.declare_alive(KEYS.alive("actor", OTHER, "66"))
+    actor.declare_alive(KEYS.alive("actor", ME, "01"))
+
+    def out():
+        """Never answered in a while: one request alone could be one too soon after another."""
+        return not any(time.sleep(0.05) or answers(thief, KEYS.config) for _ in range(10))
+
+    assert not out()
+    wait_for(lambda: len(run.hub.status()["roles"]) == 3)
+    with ActorLink(actor, "safe", ME, request_timeout=5.0) as link:
+        link.config(10)
+        revoke(run.certs, "actor", 1)
+        try:
+            wait_for(out, 30.0)
+            wait_for(lambda: OTHER not in {role["id"] for role in run.hub.status()["roles"]})
+            wait_for(lambda: ME in {role["id"] for role in run.hub.status()["roles"]})
+            ticket = wait_for(lambda: link.acquire_ticket(5))
+            assert link.upload(rollout(T, 0, 0), ticket).result(20) == "accepted"
+            thief.publish(KEYS.log("event", "actor", OTHER), Message())
+            wait_for(lambda: actor.publish(KEYS.log("event", "actor", ME), Message()) or logs.receive(0.3))
+            assert answers(thief, KEYS.ticket(OTHER)) is None and out()
+        finally:
+            for path in run.certs.rglob("revoked"):
+                path.unlink()
+    wait_for(lambda: answers(thief, KEYS.config))  # and let in again once the list is empty
 
 
 def test_a_certificate_for_another_host_is_not_trusted(certs):
