@@ -48,6 +48,8 @@ class Endpoint(NamedTuple):
     """Seconds to wait for somebody to listen."""
     run: str | None = None
     """The run that certificates must be for; None for any."""
+    longest_rollout: int | None = None
+    """Bytes of the longest rollout that a learner takes; None for that of any message."""
 
     @property
     def address(self) -> str:
@@ -74,7 +76,13 @@ def connect(url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0, ru
 
 
 def listen(
-    url: str, role: Listener, *, certs: Certs = None, insecure: bool = False, run: str | None = None
+    url: str,
+    role: Listener,
+    *,
+    certs: Certs = None,
+    insecure: bool = False,
+    run: str | None = None,
+    longest_rollout: int | None = None,
 ) -> Transport:
     """Listens at a URL.
 
@@ -84,12 +92,13 @@ def listen(
       certs: folder of the role's certificate: mutual TLS, and each role may do only what is its own.
       insecure: listen beyond loopback without certificates.
       run: name of the run that the certificate must be for.
+      longest_rollout: bytes of the longest rollout that a learner takes; longer ones are refused unseen.
 
     Raises:
       CongraspError: the URL is malformed or in use, other machines could connect and nothing would protect it, or the
         certificates are missing, expired, or another role's or run's.
     """
-    return _open(Endpoint(url, role, listens=True, certs=certs, insecure=insecure, run=run))
+    return _open(Endpoint(url, role, True, certs, insecure, run=run, longest_rollout=longest_rollout))
 
 
 def find_credentials(certs: Certs, role: str, run: str | None = None) -> Credentials | None:
@@ -145,7 +154,9 @@ def _open_zenoh(endpoint: Endpoint) -> Transport:
     if endpoint.listens:
         check_exposure(endpoint.url, credentials, insecure=endpoint.insecure)
         flows = LISTENER_FLOWS[endpoint.role]  # type: ignore[index]
-        return ZenohTransport(listen=[endpoint.url], flows=flows, credentials=credentials)
+        return ZenohTransport(
+            listen=[endpoint.url], flows=flows, credentials=credentials, longest_rollout=endpoint.longest_rollout
+        )
     flows = PEER_FLOWS[endpoint.role]  # type: ignore[index]
     return ZenohTransport(connect=[endpoint.url], flows=flows, wait=endpoint.wait, credentials=credentials)
 

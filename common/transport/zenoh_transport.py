@@ -59,6 +59,7 @@ class ZenohTransport:
         max_message: int = MAX_MESSAGE,
         wait: float = 10.0,
         credentials: Credentials | None = None,
+        longest_rollout: int | None = None,
         revocation_seconds: float = _REVOCATION_SECONDS,
     ):
         """Opens the sessions.
@@ -72,6 +73,7 @@ class ZenohTransport:
           wait: seconds to wait for somebody to listen at `connect`.
           credentials: everything goes over mutual TLS with these; one that listens allows each role what
             `common.transport.security` gives it, and nothing else.
+          longest_rollout: bytes of the longest rollout that one that listens takes; by default `max_message`.
           revocation_seconds: how often one that listens looks whether certificates have been revoked.
 
         Raises:
@@ -93,7 +95,8 @@ class ZenohTransport:
         known = credentials.revoked() if credentials else frozenset()
 
         def opened(name: Flow, where: list[str]) -> zenoh.Session:
-            config = zenoh_session.configuration(name, where, bool(listen), max_message, credentials)
+            longest = longest_rollout if name == "bulk" and longest_rollout else max_message
+            config = zenoh_session.configuration(name, where, bool(listen), longest, credentials)
             if listen:
                 return zenoh_session.listen(config, where)
             return zenoh_session.connect(config, where, deadline, name, credentials)

@@ -78,14 +78,14 @@ def silent(endpoint: str, run: str, query: bytes) -> None:
 
 
 def huge(endpoint: str, run: str, query: bytes) -> None:
-    """Sends 60 MB to a policy server, four at a time."""
-    payload = bytes(_HUGE)
+    """Sends 60 MB to a policy server, or to the key that the file holds, four at a time."""
+    payload, key = bytes(_HUGE), query.decode() or Keys(run).act_for("huge")
     sessions = [_session(endpoint, 0) for _ in range(4)]
     print("began", flush=True)
 
     def send(session: zenoh.Session) -> None:
         while True:
-            for _ in session.get(Keys(run).act_for("huge"), FifoChannel(4), payload=payload, timeout=1.0):
+            for _ in session.get(key, FifoChannel(4), payload=payload, timeout=1.0):
                 pass
 
     for session in sessions:
