@@ -6,6 +6,7 @@ weights of 3.5 MB after every second one. Attackers (`services.bench.attackers`)
 """
 
 import contextlib
+import itertools
 import multiprocessing
 import pathlib
 import socket
@@ -57,9 +58,8 @@ class Row(NamedTuple):
 
 def bench_attacks(seconds: float) -> None:
     """Prints a table of all attacks, each measured for `seconds` and compared with as long without it."""
-    rows = [*_on_the_server(seconds), *_on_the_learner(seconds)]
-    print(f"{'beside':34} {'honest':26} {'alone':>8} {'beside':>8} {'ratio':>6}")
-    for row in rows:
+    print(f"{'beside':34} {'honest':26} {'alone':>8} {'beside':>8} {'ratio':>6}", flush=True)
+    for row in itertools.chain(_on_the_server(seconds), _on_the_learner(seconds)):
         ratio = row.attacked / row.alone
         print(
             f"{row.attack:34} {row.unit:26} {row.alone:8.2f} {row.attacked:8.2f} {ratio:6.2f}  {row.note}", flush=True
@@ -86,9 +86,8 @@ def attacked(kind: str, endpoint: str, run: str, query: pathlib.Path | None = No
 # --- a policy server and its clients ---
 
 
-def _on_the_server(seconds: float) -> list[Row]:
+def _on_the_server(seconds: float) -> Iterator[Row]:
     """What a client's queries, and a new client's connection, take beside each attack on the policy server."""
-    rows = []
     with tempfile.TemporaryDirectory() as folder:
         policy, query = pathlib.Path(folder, "policy.safetensors"), pathlib.Path(folder, "query")
         bundles.save(untrained(get_preset("quickstart")), policy)
@@ -107,9 +106,8 @@ def _on_the_server(seconds: float) -> list[Row]:
                     memory = psutil.Process(process).memory_info().rss / 1e6
                     name = f"{count} x {kind}"
                     note = f"{len(times)} of {len(alone)} answers, server {memory:.0f} MB"
-                    rows.append(Row(name, "p99 of a query, ms", _p99(alone), _p99(times), note))
-                    rows.append(Row(name, "a new connection, ms", 1e3 * before, 1e3 * after, ""))
-    return rows
+                    yield Row(name, "p99 of a query, ms", _p99(alone), _p99(times), note)
+                    yield Row(name, "a new connection, ms", 1e3 * before, 1e3 * after, "")
 
 
 def _p99(times: list[float]) -> float:
@@ -156,7 +154,7 @@ def _long_query(client: PolicyClient, episode: Example) -> bytes:
 # --- a learner and its actors ---
 
 
-def _on_the_learner(seconds: float) -> list[Row]:
+def _on_the_learner(seconds: float) -> Iterator[Row]:
     """What an honest actor's rollouts and the run's updates come to beside each attack on the learner."""
     attacks: dict[str, Callable[[str], contextlib.AbstractContextManager[Any]]] = {
         "1 x greedy": lambda endpoint: attacked("greedy", endpoint, _RUN),
@@ -164,7 +162,6 @@ def _on_the_learner(seconds: float) -> list[Row]:
         "1 x silent": lambda endpoint: attacked("silent", endpoint, _RUN),
         "an actor of 400 kB/s": _slow_actor,
     }
-    rows = []
     spawn = multiprocessing.get_context("spawn")
     endpoint, updates, rollouts, pause = local_url(), spawn.Value("i", 0), spawn.Value("i", 0), spawn.Value("d", 0.0)
     roles = (_learn, (endpoint, updates)), (_act, (endpoint, "honest", rollouts, pause))
@@ -193,12 +190,11 @@ def _on_the_learner(seconds: float) -> list[Row]:
             note = (
                 f"updates {beside[1]:.1f} of {alone[1]:.1f} a second, longest pause {beside[2]:.2f} ({alone[2]:.2f}) s"
             )
-            rows.append(Row(name, "rollouts a second", alone[0], beside[0], note))
+            yield Row(name, "rollouts a second", alone[0], beside[0], note)
     finally:
         for process in processes:
             process.kill()
             process.join()
-    return rows
 
 
 def _learn(endpoint: str, updates: Any) -> None:
