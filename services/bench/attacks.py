@@ -43,7 +43,7 @@ _WEIGHTS = 875_000  # float32
 _PACE = 0.05  # seconds in which an actor makes a rollout
 _PERIOD = 0.01  # seconds between two queries of a client
 _SLOW = 400e3  # bytes a second of a slow actor's link
-_START = 60.0  # seconds that processes may take to start
+_START = 180.0  # seconds that processes may take to start
 
 
 class Row(NamedTuple):
