@@ -34,7 +34,7 @@ _ROOM_US: dict[Flow, int] = {"control": 10_000, "bulk": 50_000, "log": 10_000, "
 """Microseconds that an answer waits for room in its reader's link; then all are dropped until there is some."""
 _ROOM_LONG_US = 200_000  # that a piece of a long answer waits in all
 _QUEUE = 8  # batches of 64 KiB that wait for a link: an acknowledgement finds room beside a piece of a long reply
-_ACCEPT_MS = 2000  # that a connection has until it has shown who it is
+_ACCEPT_MS = 5000  # that a connection has until it has shown who it is
 _PENDING = 4096  # connections that may be at that
 _FILES = 16384  # that the process may have open, if the system allows it: each connection is one
 _SESSIONS = 1000
