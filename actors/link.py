@@ -81,7 +81,7 @@ class ActorLink:
         """
         self.keys = Keys(run)
         self.actor = actor
-        self._ticket_key = self.keys.ticket(actor)
+        self._ticket_key, self._weights_key = self.keys.ticket(actor), self.keys.weights_for("actor", actor)
         self.incarnation = secrets.token_hex(4)
         self._transport = transport
         self._timeout = request_timeout
@@ -177,7 +177,7 @@ class ActorLink:
         session = self._learner[1]
         request = Message(meta={"newer_than": newer_than, "life": self._held_session})
         try:
-            reply = self._transport.query(self.keys.weights, request, timeout=self._timeout)
+            reply = self._transport.query(self._weights_key, request, timeout=self._timeout)
         except TransportError:
             return None
         if not reply.arrays:

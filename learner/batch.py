@@ -7,9 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
+from common.config import RunConfig
+from common.policy.bundle import PolicySpec
 from common.task.types import Array
-from common.wire.schema import WORLDS, Schema
+from common.wire.schema import WORLDS, RolloutForm, Schema
 from learner.collectives import AXIS
+
+
+def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> RolloutForm:
+    """The arrays and sizes of a run's rollouts, of which its algorithm learns from those of `schema`."""
+    return RolloutForm(
+        config.rollout_steps,
+        config.environments,
+        sum(size for _, size in spec.layout),
+        spec.action_size,
+        config.half_observations,
+        schema,
+    )
 
 
 def collate(rollouts: Sequence[Mapping[str, Array]], schema: Schema) -> dict[str, Array]:

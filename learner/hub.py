@@ -18,7 +18,7 @@ from typing import Any
 
 from common.errors import CongraspError
 from common.transport.base import Transport
-from common.transport.keys import Keys, check_name, parse_alive
+from common.transport.keys import Keys, below, check_name, parse_alive
 from common.wire.codec import Message, SharedMessage
 from common.wire.messages import TICKET, RolloutForm, RolloutHeader, validate, validate_bundle, validate_rollout
 from learner.admission import Admission
@@ -33,6 +33,7 @@ _INCARNATIONS = 1024  # whose sequences are kept
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
 _EVENT_SECONDS = 1.0  # between two events of one kind
+_PIECES = 40.0  # a second of the weights, of four mebibytes at most, for the owners of one certificate
 
 
 class LearnerHub:
@@ -100,6 +101,7 @@ class LearnerHub:
         self._finished = self._closed = False
         self._audit, self._log = audit, log
         self._rate_limit = RateLimit()
+        self._pull_limit = RateLimit(per_second=_PIECES, most=4 * _PIECES)
         if durable is not None:
             self._restore(durable)
         self._recovered: Recovered | None = self._begin()
@@ -107,7 +109,9 @@ class LearnerHub:
         charging = self._rate_limit.charging
         transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._turn_away)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
-        transport.serve(self.keys.weights, self._on_weights, workers=2, depth=16)
+        transport.serve(
+            below(self.keys.weights), self._on_weights, workers=4, depth=16, admission=self._turn_away_puller
+        )
         transport.serve(
             self.keys.rollouts,
             charging(self._on_rollout),
@@ -429,6 +433,13 @@ class LearnerHub:
         self._event("warning", f"Too many useless requests of {_sender(key)}: turned away.", kind="turned away")
         retry = self._answer("retry", why="Too many of your requests were of no use.")
         return Message(meta={**retry.meta, "granted": False})
+
+    def _turn_away_puller(self, key: str) -> Message | None:
+        """The answer to a peer that pulls weights beyond its rate limit; None for all others, who pay for a piece."""
+        if not self._pull_limit.admits(key):
+            return Message(meta=self._state())
+        self._pull_limit.charge(key, 0)
+        return None
 
     def _on_damage(self, key: str, error: CongraspError) -> None:
         self._rate_limit.charge(key, DAMAGED)

@@ -25,12 +25,11 @@ from common.policy.bundle import PolicyBundle
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode, finite
-from common.wire.schema import RolloutForm
 from learner.admission import Admission
 from learner.algorithms import make_algorithm
 from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
 from learner.audit import AuditLog
-from learner.batch import collate
+from learner.batch import collate, rollout_form
 from learner.checkpoint import Checkpoints, checksum, flatten, restore
 from learner.collapse import CollapseWatch
 from learner.hub import LearnerHub
@@ -157,14 +156,7 @@ class _Learner:
         self._on_event = notify
         self._spec = bundles.policy_spec(config.task, config.network)
         self._algorithm = make_algorithm(self._spec, config)
-        self._form = RolloutForm(
-            config.rollout_steps,
-            config.environments,
-            sum(size for _, size in self._spec.layout),
-            self._spec.action_size,
-            config.half_observations,
-            self._algorithm.batch_schema,
-        )
+        self._form = rollout_form(config, self._spec, self._algorithm.batch_schema)
         self._checkpoints = Checkpoints(run_dir / CHECKPOINTS)
         self._state, meta = self._first_state(resume)
         self._dropped = self._dropped_in_a_row = 0

@@ -17,7 +17,7 @@ Answerer = Callable[[str, Message], "Message | Future[Message]"]
 Damage = Callable[[str, CongraspError], None]
 """(key, what is wrong): a request arrived that could not be decoded."""
 Admission = Callable[[str], Message | None]
-"""key -> the reply with which a request is turned away before anyone looks at it, or None to let it pass."""
+"""key -> the reply, or raised error, with which a request is turned away unseen; None lets it pass."""
 
 
 def join(threads: Iterable[threading.Thread], deadline: float) -> None:
@@ -110,7 +110,7 @@ class Transport(Protocol):
         Args:
           key: the key.
           request: the question.
-          timeout: seconds to wait for the answer.
+          timeout: seconds to wait for the answer, and for each further piece of a long one.
 
         Raises:
           RefusedError: the peer answered with an error; a subclass where its code names one (`common.errors`).

@@ -10,16 +10,16 @@ from cryptography import x509
 from cryptography.x509.oid import NameOID
 
 from common.errors import CongraspError
-from common.transport.security import CERTIFICATE_FILE, NUMBERS, ROLES, Credentials
+from common.transport.security import CERTIFICATE_FILE, ROLES, Credentials, Identity, not_ours, parse_identity
 
 
 class Certificate(NamedTuple):
     """Content of a certificate."""
 
-    role: str
-    """One of `ROLES`; `ca` for the authority."""
-    number: int
-    """Tells the certificates of a role apart."""
+    identity: Identity | None
+    """Whose it is; None for the authority."""
+    run: str
+    """The run that it is for; of the authority, that for which it issues where no other is named."""
     hosts: tuple[str, ...]
     """Names and addresses under which its owner may listen."""
     expires: datetime.datetime
@@ -28,7 +28,7 @@ class Certificate(NamedTuple):
     @property
     def name(self) -> str:
         """The common name."""
-        return f"{self.role}.{self.number}" if self.role != "ca" else "ca"
+        return str(self.identity) if self.identity else "ca"
 
     @property
     def days(self) -> float:
@@ -55,22 +55,20 @@ def read(path: pathlib.Path) -> Certificate:
     made = load(path)
     names = made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     if not names:
-        return Certificate("ca", 0, (), made.not_valid_after_utc)
-    role, _, number = str(names[0].value).partition(".")
-    if role not in ROLES or not number.isascii() or not number.isdigit() or int(number) >= NUMBERS:
-        raise CongraspError(
-            f"{path} is a certificate for {ascii(names[0].value)[:60]}, which is no role and number.",
-            "Issue one with 'congrasp certs issue'.",
-        )
+        units = made.subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
+        return Certificate(None, str(units[0].value) if units else "", (), made.not_valid_after_utc)
+    identity = parse_identity(str(names[0].value))
+    if identity is None:
+        raise not_ours(path, str(names[0].value))
     hosts: list[str] = []
     for extension in made.extensions:
         if isinstance(extension.value, x509.SubjectAlternativeName):
             hosts = [str(name.value) for name in extension.value]
-    return Certificate(role, int(number), tuple(hosts), made.not_valid_after_utc)
+    return Certificate(identity, identity.run, tuple(hosts), made.not_valid_after_utc)
 
 
-def find(folder: pathlib.Path, role: str) -> tuple[Credentials, Certificate]:
-    """The credentials of a role, and its certificate.
+def find(folder: pathlib.Path, role: str) -> Credentials:
+    """The credentials of a role.
 
     Args:
       folder: one that was issued for the role, or the authority's, whose number 0 is then taken.
@@ -86,9 +84,10 @@ def find(folder: pathlib.Path, role: str) -> tuple[Credentials, Certificate]:
         if not os.access(path, os.R_OK):
             raise CongraspError(f"{path} is missing or cannot be read.", f"Run: {_hint(folder, role)}")
     certificate = read(credentials.certificate)
-    if certificate.role != role:
+    actual = certificate.identity.role if certificate.identity else "ca"
+    if actual != role:
         raise CongraspError(
-            f"{credentials.certificate} is for the role {certificate.role}, not {role}.", f"Run: {_hint(folder, role)}"
+            f"{credentials.certificate} is for the role {actual}, not {role}.", f"Run: {_hint(folder, role)}"
         )
     for expires, path in (
         (certificate.expires, credentials.certificate),
@@ -102,7 +101,7 @@ def find(folder: pathlib.Path, role: str) -> tuple[Credentials, Certificate]:
         raise CongraspError(
             f"{credentials.key} is not the key of {credentials.certificate}.", f"Run: {_hint(folder, role)}"
         ) from None
-    return credentials, certificate
+    return credentials
 
 
 def _hint(folder: pathlib.Path, role: str) -> str:

@@ -67,6 +67,17 @@ def matches(expression: str, key: str) -> bool:
     return re.fullmatch(pattern, "/" + key) is not None
 
 
+def below(key: str) -> str:
+    """Expression of a key and of all below it."""
+    return f"{key}/**"
+
+
+def account(key: str) -> str:
+    """What the keys of all peers with one certificate have in common: the number that their names begin with."""
+    before, slash, name = key.rpartition("/")
+    return before + slash + name.partition(".")[0]
+
+
 @dataclasses.dataclass(frozen=True)
 class Keys:
     """The keys of one run."""
@@ -105,8 +116,12 @@ class Keys:
 
     @property
     def weights(self) -> str:
-        """Query: the latest policy bundle."""
+        """Query: the latest policy bundle, for a peer without a name."""
         return self._key("weights", "latest")
+
+    def weights_for(self, role: str, name: str) -> str:
+        """Query: the latest policy bundle, for an actor or a policy server of this name."""
+        return self._key("weights", "latest", check_name("role", role), check_name(role, name))
 
     @property
     def announcement(self) -> str:
@@ -120,8 +135,12 @@ class Keys:
 
     @property
     def act(self) -> str:
-        """Query: an action of the live policy."""
+        """Query: an action of the live policy, for a client without a name."""
         return self._key("policy", "act")
+
+    def act_for(self, client: str) -> str:
+        """Query: an action of the live policy, for a client of this name."""
+        return self._key("policy", "act", check_name("client", client))
 
     @property
     def health(self) -> str:

@@ -1,11 +1,13 @@
 """Who may do what on the wire: mutual TLS, and what each role is allowed by the process that listens.
 
-Everyone shows a certificate of the run's authority whose common name is `<role>.<number>`. The listening process (the
+Everyone shows a certificate of the authority whose common name is `<run>.<role>.<number>`. The listening process (the
 learner, or a policy server) denies everything but what `RIGHTS` gives that name, for its own end and for what it would
-forward. An actor's names on the wire begin with its certificate's number, so it cannot speak for another certificate's.
+forward. A peer's names on the wire begin with its certificate's number, so it cannot speak for another certificate's.
+The connecting process denies everything to a listener that is not its run's learner or policy server.
 
 Zenoh reads its rules once and compares common names as a whole; so all numbers are written into the rules, whether
-their certificates exist yet or not.
+their certificates exist yet or not, except those that the file `revoked` names. When that file changes, the sessions
+are opened anew.
 """
 
 import contextlib
@@ -15,8 +17,8 @@ import pathlib
 import re
 import socket
 import ssl
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator, Set
+from typing import Any, NamedTuple
 
 from common.errors import CongraspError
 from common.transport.keys import ROOT, Flow, flow
@@ -27,9 +29,38 @@ LISTENERS = ("learner", "server")
 """Roles whose certificates others connect to."""
 NUMBERS = 256
 """Certificates of one role."""
-CA_FILE, CERTIFICATE_FILE, KEY_FILE = "ca.crt", "tls.crt", "tls.key"
+CA_FILE, CERTIFICATE_FILE, KEY_FILE, REVOKED_FILE = "ca.crt", "tls.crt", "tls.key", "revoked"
 _PROBE_SECONDS = 1.0
 _ENDPOINT = re.compile(r"(?P<protocol>[a-z-]+)/(?P<host>\[[^]]*\]|[^/:]*)(:(?P<port>\d+))?.*")
+
+
+class Identity(NamedTuple):
+    """What a certificate's common name says."""
+
+    run: str
+    """Name of the run that it is for."""
+    role: str
+    """One of `ROLES`."""
+    number: int
+    """Tells the certificates of a role apart; below `NUMBERS`."""
+
+    def __str__(self) -> str:
+        return f"{self.run}.{self.role}.{self.number}"
+
+
+def parse_identity(common_name: str) -> Identity | None:
+    """The identity that a common name spells; None if it spells none."""
+    run, role, number = ("", "", *common_name.rsplit(".", 2))[-3:]
+    fits = run and role in ROLES and number.isascii() and number.isdigit() and int(number) < NUMBERS
+    return Identity(run, role, int(number)) if fits else None
+
+
+def not_ours(path: pathlib.Path, common_name: str) -> CongraspError:
+    """The error of a certificate whose common name spells no identity."""
+    return CongraspError(
+        f"{path} is a certificate for {ascii(common_name)[:90]}, which is no run, role and number.",
+        "Issue one with 'congrasp certs issue'.",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +86,43 @@ class Credentials:
         """Its private key."""
         return self.folder / KEY_FILE
 
+    @property
+    def identity(self) -> Identity:
+        """Whose certificate it is; a CongraspError if it cannot be read, or names no run and role."""
+        try:
+            decoded: Any = ssl._ssl._test_decode_cert(str(self.certificate))  # type: ignore[attr-defined]
+        except (OSError, ValueError):
+            raise CongraspError(f"The credentials in {self.folder} cannot be used.", "Issue them anew.") from None
+        names = [value for entry in decoded["subject"] for key, value in entry if key == "commonName"]
+        found = parse_identity(names[0]) if names else None
+        if found is None:
+            raise not_ours(self.certificate, "".join(names))
+        return found
+
+    def revoked(self) -> frozenset[str]:
+        """Common names in the list of revoked certificates beside these; none without a list.
+
+        Raises:
+          CongraspError: there is a list that cannot be read: without it nobody is to be let in.
+        """
+        try:
+            return frozenset((self.folder / REVOKED_FILE).read_text().split())
+        except FileNotFoundError:
+            return frozenset()
+        except (OSError, UnicodeDecodeError):
+            raise CongraspError(f"{self.folder / REVOKED_FILE} cannot be read.", "Copy it again.") from None
+
+    def expects(self, name: Flow, common_name: str | None) -> bool:
+        """Whether a certificate of this common name may listen to these in a flow."""
+        return common_name in self._listeners(name)
+
+    def _listeners(self, name: Flow) -> list[str]:
+        """Common names that may listen to these in a flow: the learner's, and for queries of a policy the server's."""
+        run, revoked = self.identity.run, self.revoked()
+        roles = LISTENERS if name == "policy" else LISTENERS[:1]
+        names = [str(Identity(run, role, number)) for role in roles for number in range(NUMBERS)]
+        return [one for one in names if one not in revoked]
+
     def settings(self, name: Flow, *, listens: bool) -> dict[str, Any]:
         """Zenoh's configuration for the session of one flow that listens or connects with these."""
         side = "listen" if listens else "connect"
@@ -67,11 +135,8 @@ class Credentials:
             "close_link_on_expiration": True,
         }
         settings: dict[str, Any] = {"transport/link/protocols": ["tls"], "transport/link/tls": tls}
-        if not listens:
-            return settings
-        if name in LONGEST:
-            settings["transport/link/rx/max_message_size"] = LONGEST[name]
-        return {**settings, "access_control": _access_control(self.role, name), **_limits(self.role, name)}
+        rules = _access_control(self.identity, name, self.revoked()) if listens else _only(self._listeners(name))
+        return {**settings, "access_control": rules}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,16 +156,18 @@ class Rights:
 RIGHTS: dict[str, dict[str, Rights]] = {
     "learner": {
         "actor": Rights(
-            ask=("config", "weights/latest", "ticket/{name}", "rollout/{name}"),
+            ask=("config", "weights/latest/actor/{name}", "ticket/{name}", "rollout/{name}"),
             publish=("log/*/actor/{name}",),
             hear=("weights/announce",),
             show=("alive/actor/{name}/*",),
         ),
-        "server": Rights(ask=("config", "weights/latest"), hear=("weights/announce",), show=("alive/server/*/*",)),
+        "server": Rights(
+            ask=("config", "weights/latest/server/{name}"), hear=("weights/announce",), show=("alive/server/*/*",)
+        ),
         "observer": Rights(ask=("config", "status"), hear=("log/**",), show=("alive/recorder/*/*",)),
     },
     "server": {
-        "client": Rights(ask=("policy/act", "policy/health")),
+        "client": Rights(ask=("policy/act/{name}", "policy/health")),
         "observer": Rights(ask=("policy/health",)),
     },
 }
@@ -116,28 +183,26 @@ class Limit:
     size: int
     """Bytes of a message."""
     rate: float
-    """Messages a second, evenly spaced; those that come sooner after the one before are dropped. 0 for no limit."""
+    """With certificates: messages a second, evenly spaced; those that come sooner after the one before are dropped. 0
+    for no limit."""
 
 
-LONGEST: dict[Flow, int] = {"control": 2 << 20, "log": 32 << 20, "policy": 2 << 20}
-"""Bytes of a message that is put together at all; every connection may have several in the making."""
 _SMALL, _LOG = 64 << 10, 16 << 20
-LIMITS: dict[str, tuple[Limit, ...]] = {
-    "learner": (
-        Limit("config", _SMALL, 100.0),
-        Limit("status", _SMALL, 100.0),
-        Limit("weights/latest", _SMALL, 100.0),
-        Limit("ticket/*", _SMALL, 0.0),  # the hub counts these by actor
-        *(Limit(f"log/{channel}/**", _LOG, 100.0) for channel in ("metrics", "event", "version", "episode", "rollout")),
-    ),
+LIMITS: tuple[Limit, ...] = (
+    Limit("config", _SMALL, 100.0),
+    Limit("status", _SMALL, 100.0),
+    Limit("weights/latest/**", _SMALL, 0.0),  # the hub counts these by peer
+    Limit("ticket/*", _SMALL, 0.0),  # and these by actor
+    *(Limit(f"log/{channel}/**", _LOG, 100.0) for channel in ("metrics", "event", "version", "episode", "rollout")),
     # The policy server's own queue refuses what is too much, with a message.
-    "server": (Limit("policy/act", 1 << 20, 0.0), Limit("policy/health", _SMALL, 100.0)),
-}
-"""By the role that listens. Rollouts are limited by the longest message and by the learner's hub."""
+    Limit("policy/act/**", 1 << 20, 0.0),
+    Limit("policy/health", _SMALL, 100.0),
+)
+"""Rollouts are limited by the longest message and by the learner's hub."""
 
 
-def actor_name(number: int, name: str) -> str:
-    """The name on the wire of an actor that has the actors' certificate of this number."""
+def numbered(number: int, name: str) -> str:
+    """The name on the wire of who has the certificate of this number."""
     return f"{number}.{name}"
 
 
@@ -233,33 +298,50 @@ def _is_loopback(endpoint: str) -> bool:
         return False
 
 
-def _access_control(role: str, name_of_flow: Flow) -> dict[str, Any]:
+def _only(names: list[str]) -> dict[str, Any]:
+    """Who connects takes everything from these, and nothing from anybody else."""
+    messages = ["put", "delete", "query", "reply", "declare_subscriber", "declare_queryable"]
+    liveliness = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
+    rule = {
+        "id": "all", "permission": "allow", "flows": ["ingress", "egress"], "messages": messages + liveliness,
+        "key_exprs": ["**"],
+    }  # fmt: skip
+    subjects = [{"id": "listener", "cert_common_names": names}]
+    policies = [{"rules": ["all"], "subjects": ["listener"]}]
+    return {
+        "enabled": True, "default_permission": "deny", "rules": [rule], "subjects": subjects, "policies": policies,
+    }  # fmt: skip
+
+
+def _access_control(mine: Identity, name_of_flow: Flow, revoked: Set[str]) -> dict[str, Any]:
     """What a listener allows each certificate to do in one flow; nothing else passes."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
 
     def allow(who: str, names: list[str], rights: Rights) -> None:
-        mine = list(_rules(who, rights, name_of_flow))
-        if not mine:
+        allowed = list(_rules(who, rights, name_of_flow, run))
+        if not allowed or not names:
             return
-        rules.extend(mine)
+        rules.extend(allowed)
         subjects.append({"id": who, "cert_common_names": names})
-        policies.append({"rules": [rule["id"] for rule in mine], "subjects": [who]})
+        policies.append({"rules": [rule["id"] for rule in allowed], "subjects": [who]})
 
-    for other, rights in RIGHTS[role].items():
+    run = mine.run if mine.role == "learner" else "*"  # a server's clients know the policy by a name of its own
+    for other, rights in RIGHTS.get(mine.role, {}).items():
         shared, own = _split(rights)
-        names = [f"{other}.{number}" for number in range(NUMBERS)]
-        allow(other, names, shared)
+        peers = [Identity(mine.run, other, number) for number in range(NUMBERS)]
+        peers = [peer for peer in peers if str(peer) not in revoked]
+        allow(other, [str(peer) for peer in peers], shared)
         if own != Rights():
-            for number, name in enumerate(names):
-                allow(name, [name], _filled(own, actor_name(number, "$*")))
+            for peer in peers:
+                allow(str(peer), [str(peer)], _filled(own, numbered(peer.number, "$*")))
     return {
         "enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies,
     }  # fmt: skip
 
 
-def _rules(who: str, rights: Rights, name: Flow) -> Iterator[dict[str, Any]]:
+def _rules(who: str, rights: Rights, name: Flow, run: str) -> Iterator[dict[str, Any]]:
     """Zenoh's rules for one flow: what comes in, and what goes out in answer to it."""
     kinds = (
         (rights.ask, "query", "reply"),
@@ -268,7 +350,7 @@ def _rules(who: str, rights: Rights, name: Flow) -> Iterator[dict[str, Any]]:
         (rights.show, "liveliness_token", None),
     )
     for parts, comes, goes in kinds:
-        keys = _of_flow(parts, name)
+        keys = _of_flow(parts, name, run)
         for direction, message in (("ingress", comes), ("egress", goes)):
             if keys and message:
                 yield {
@@ -280,9 +362,9 @@ def _rules(who: str, rights: Rights, name: Flow) -> Iterator[dict[str, Any]]:
                 }
 
 
-def _of_flow(parts: Iterable[str], name: Flow) -> list[str]:
-    """The keys of any run among these that belong to a flow."""
-    keys = [f"{ROOT}/*/{part}" for part in parts]
+def _of_flow(parts: Iterable[str], name: Flow, run: str = "*") -> list[str]:
+    """The keys of a run, or of any, among these that belong to a flow."""
+    keys = [f"{ROOT}/{run}/{part}" for part in parts]
     return [key for key in keys if flow(key) == name]
 
 
@@ -301,10 +383,10 @@ def _filled(rights: Rights, name: str) -> Rights:
     return Rights(**{kind: tuple(key.replace("{name}", name) for key in keys) for kind, keys in parts.items()})
 
 
-def _limits(role: str, name: Flow) -> dict[str, Any]:
-    """Size and rate of the messages that a listener takes in one flow."""
+def limits(name: Flow, *, rates: bool) -> dict[str, Any]:
+    """Zenoh's configuration of the size of the messages that a listener takes in one flow, and of their rate."""
     both = {"flows": ["ingress"], "messages": ["query", "put"]}
-    limits = [(key, limit) for limit in LIMITS[role] for key in _of_flow([limit.keys], name)]
-    sizes = [{"id": key, **both, "key_exprs": [key], "size_limit": limit.size} for key, limit in limits]
-    rates = [{"key_expr": key, "freq": limit.rate} for key, limit in limits if limit.rate]
-    return {"low_pass_filter": sizes, "downsampling": [{"id": "rates", **both, "rules": rates}] if rates else []}
+    found = [(key, limit) for limit in LIMITS for key in _of_flow([limit.keys], name)]
+    sizes = [{"id": key, **both, "key_exprs": [key], "size_limit": limit.size} for key, limit in found]
+    often = [{"key_expr": key, "freq": limit.rate} for key, limit in found if limit.rate and rates]
+    return {"low_pass_filter": sizes, "downsampling": [{"id": "rates", **both, "rules": often}] if often else []}

@@ -15,7 +15,7 @@ from common.transport.base import Transport
 from common.transport.keys import FLOWS, Flow
 from common.transport.memory import connect_in_memory, listen_in_memory
 from common.transport.ports import LEARNER_URL
-from common.transport.security import Credentials, check_exposure
+from common.transport.security import Credentials, check_exposure, numbered
 
 Listener = Literal["learner", "server"]
 Peer = Literal["actor", "server", "client", "observer"]
@@ -46,6 +46,10 @@ class Endpoint(NamedTuple):
     """May listen where other machines reach it although nothing protects it."""
     wait: float = 0.0
     """Seconds to wait for somebody to listen."""
+    run: str | None = None
+    """The run that certificates must be for; None for any."""
+    longest_rollout: int | None = None
+    """Bytes of the longest rollout that a learner takes; None for that of any message."""
 
     @property
     def address(self) -> str:
@@ -53,7 +57,7 @@ class Endpoint(NamedTuple):
         return self.url.partition("/")[2]
 
 
-def connect(url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0) -> Transport:
+def connect(url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0, run: str | None = None) -> Transport:
     """Connects to who listens at a URL.
 
     Args:
@@ -61,15 +65,25 @@ def connect(url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0) ->
       role: what this process is to its peer.
       certs: folder of the role's certificate, for mutual TLS.
       wait: seconds to wait for somebody to listen.
+      run: name of the run that the certificate must be for.
 
     Raises:
-      CongraspError: the URL is malformed, or the certificates are missing, expired, another role's or not accepted.
+      CongraspError: the URL is malformed, or the certificates are missing, expired, another role's or run's, or not
+        accepted, or those of who listens are not for that.
       TransportError: nobody listens there.
     """
-    return _open(Endpoint(url, role, listens=False, certs=certs, wait=wait))
+    return _open(Endpoint(url, role, listens=False, certs=certs, wait=wait, run=run))
 
 
-def listen(url: str, role: Listener, *, certs: Certs = None, insecure: bool = False) -> Transport:
+def listen(
+    url: str,
+    role: Listener,
+    *,
+    certs: Certs = None,
+    insecure: bool = False,
+    run: str | None = None,
+    longest_rollout: int | None = None,
+) -> Transport:
     """Listens at a URL.
 
     Args:
@@ -77,22 +91,24 @@ def listen(url: str, role: Listener, *, certs: Certs = None, insecure: bool = Fa
       role: a learner, or a policy server.
       certs: folder of the role's certificate: mutual TLS, and each role may do only what is its own.
       insecure: listen beyond loopback without certificates.
+      run: name of the run that the certificate must be for.
+      longest_rollout: bytes of the longest rollout that a learner takes; longer ones are refused unseen.
 
     Raises:
       CongraspError: the URL is malformed or in use, other machines could connect and nothing would protect it, or the
-        certificates are missing, expired or another role's.
+        certificates are missing, expired, or another role's or run's.
     """
-    return _open(Endpoint(url, role, listens=True, certs=certs, insecure=insecure))
+    return _open(Endpoint(url, role, True, certs, insecure, run=run, longest_rollout=longest_rollout))
 
 
-def find_credentials(certs: Certs, role: str) -> Credentials | None:
-    """The credentials of a role; None without a folder of certificates.
+def find_credentials(certs: Certs, role: str, run: str | None = None) -> Credentials | None:
+    """The credentials of a role, for a run if it is named; None without a folder of certificates.
 
     Where the package cryptography is absent, as beside a client that needs numpy and Zenoh alone, it is only the peer
     who judges them.
 
     Raises:
-      CongraspError: they are missing, damaged, expired, or another role's.
+      CongraspError: they are missing, damaged, expired, or another role's or run's.
     """
     if certs is None:
         return None
@@ -100,17 +116,19 @@ def find_credentials(certs: Certs, role: str) -> Credentials | None:
         return Credentials(pathlib.Path(certs), role)
     from common.transport.certificates import find
 
-    return find(pathlib.Path(certs), role)[0]
+    credentials = find(pathlib.Path(certs), role)
+    if run is not None and credentials.identity.run != run:
+        raise CongraspError(
+            f"{credentials.certificate} is for the run '{credentials.identity.run}', not '{run}'.",
+            f"Name that run, or issue one for this: congrasp certs issue --run {run} --role {role}",
+        )
+    return credentials
 
 
-def name_on_wire(name: str, certs: Certs) -> str:
-    """The name under which an actor works: with certificates it begins with its certificate's number."""
-    if certs is None:
-        return name
-    from common.transport.certificates import find
-    from common.transport.security import actor_name
-
-    return actor_name(find(pathlib.Path(certs), "actor")[1].number, name)
+def name_on_wire(name: str, certs: Certs, role: str = "actor") -> str:
+    """The name of an actor, server or client on the wire: it begins with its certificate's number, if it has one."""
+    credentials = find_credentials(certs, role)
+    return name if credentials is None else numbered(credentials.identity.number, name)
 
 
 def _open(endpoint: Endpoint) -> Transport:
@@ -132,11 +150,13 @@ def _open_memory(endpoint: Endpoint) -> Transport:
 def _open_zenoh(endpoint: Endpoint) -> Transport:
     from common.transport.zenoh_transport import ZenohTransport
 
-    credentials = find_credentials(endpoint.certs, endpoint.role)
+    credentials = find_credentials(endpoint.certs, endpoint.role, endpoint.run)
     if endpoint.listens:
         check_exposure(endpoint.url, credentials, insecure=endpoint.insecure)
         flows = LISTENER_FLOWS[endpoint.role]  # type: ignore[index]
-        return ZenohTransport(listen=[endpoint.url], flows=flows, credentials=credentials)
+        return ZenohTransport(
+            listen=[endpoint.url], flows=flows, credentials=credentials, longest_rollout=endpoint.longest_rollout
+        )
     flows = PEER_FLOWS[endpoint.role]  # type: ignore[index]
     return ZenohTransport(connect=[endpoint.url], flows=flows, wait=endpoint.wait, credentials=credentials)
 

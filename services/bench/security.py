@@ -42,7 +42,7 @@ def bench_security(repeats: int) -> None:
 def _measure(repeats: int) -> dict[str, float]:
     """Medians of `repeats` alternating measurements: times in ms, and rates in MB/s, one of them beside a flood."""
     with tempfile.TemporaryDirectory() as folder:
-        create_authority(pathlib.Path(folder))
+        create_authority(pathlib.Path(folder), run=_KEYS.run)
         for role in ("learner", "actor", "actor"):
             issue(pathlib.Path(folder), role)
         found: dict[str, list[float]] = {}

@@ -54,7 +54,7 @@ def actor(
     with (
         watch.watched("actor", name, run, metrics),
         on_signal() as stop,
-        urls.connect(connect, "actor", certs=certs, wait=patience) as transport,
+        urls.connect(connect, "actor", certs=certs, wait=patience, run=run) as transport,
     ):
         log("info", f"Connected to the learner at {connect}.")
         run_actor(

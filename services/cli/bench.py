@@ -77,18 +77,22 @@ def shutdown(tries: int = 100, within: float = 45.0, seed: int = 0) -> int:
     return 0 if bench_shutdown(tries, within, seed) else 1
 
 
-def security(repeats: int = 5) -> int:
-    """What mutual TLS with access control costs beside plain TCP, and what another actor's flood costs an honest one.
+def security(repeats: int = 5, seconds: float = 10.0) -> int:
+    """What mutual TLS with access control costs beside plain TCP, and what hostile and slow peers cost honest ones.
 
-    Both ends are in one process, over the loopback interface. The flood is 1 MB of rubbish at a time, as fast as it is
-    answered, from another process.
+    Over the loopback interface. The flood is 1 MB of rubbish at a time, as fast as it is answered. The attacks are in
+    services/bench/attackers.py; each is measured beside the same honest work alone.
 
     Args:
-      repeats: Measurements of each, alternating; medians are printed.
+      repeats: Measurements of each cost, alternating; medians are printed.
+      seconds: Length of each measurement beside an attack; 0 for none.
     """
+    from services.bench.attacks import bench_attacks
     from services.bench.security import bench_security
 
     bench_security(repeats)
+    if seconds:
+        bench_attacks(seconds)
     return 0
 
 

@@ -9,20 +9,27 @@ Folder = Annotated[pathlib.Path, tyro.conf.Positional]
 Role = Literal["learner", "actor", "server", "client", "observer"]
 
 
-def init(folder: Folder = pathlib.Path("certs"), host: tuple[str, ...] = (), force: bool = False) -> int:
+def init(
+    folder: Folder = pathlib.Path("certs"),
+    run: str = "quickstart",
+    host: tuple[str, ...] = (),
+    force: bool = False,
+) -> int:
     """Make a private authority, and number 0 of every role: all that a run on one machine needs.
 
-    Its ca.key signs certificates: keep it where nobody else can read it. Commands on this machine take --certs FOLDER.
+    A certificate serves the one run that it names. The authority's ca.key signs certificates: keep it where nobody else
+    can read it. Commands on this machine take --certs FOLDER.
 
     Args:
       folder: Folder for the authority and the certificates.
+      run: Name of the run that they are for.
       host: Names and addresses of this machine, under which others will connect to its learner or policy server.
       force: Replace an authority that is there; certificates that it issued are useless then.
     """
     from common.transport.security import LISTENERS, ROLES
     from services.ops.certificates import create_authority, issue
 
-    create_authority(folder, force=force)
+    create_authority(folder, run=run, force=force)
     for role in ROLES:
         issue(folder, role, number=0, hosts=host if role in LISTENERS else (), force=force)
     return show(folder)
@@ -32,6 +39,7 @@ def issue(
     folder: Folder = pathlib.Path("certs"),
     *,
     role: Role,
+    run: str | None = None,
     number: int | None = None,
     host: tuple[str, ...] = (),
     days: float = 365.0,
@@ -45,21 +53,40 @@ def issue(
       folder: Folder of the authority.
       role: Certificate role: learner, actor, server (of a policy), client (of a policy server) or observer (status,
         recorder).
+      run: Name of the run that it is for; by default the one that the authority was made for.
       number: Tells the certificates of a role apart; the lowest that is free by default.
       host: Names and addresses under which others will connect to it (learner and server).
       days: Days until it expires.
-      force: Replace the certificate of this number; the old one works until it expires.
+      force: Replace the certificate of this number; the old one works until it expires, too.
     """
     from common.transport.security import CERTIFICATE_FILE
     from services.ops.certificates import issue, read
 
-    made = issue(folder, role, number=number, hosts=host, days=days, force=force)
+    made = issue(folder, role, run=run, number=number, hosts=host, days=days, force=force)
     print(f"{made}: good until {read(made / CERTIFICATE_FILE).expires:%Y-%m-%d}")
     return 0
 
 
+def revoke(folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, run: str | None = None) -> int:
+    """Revoke a certificate whose key is lost or stolen: learners and servers let its owner in no more.
+
+    Those on this machine notice within seconds, and all their peers connect anew. Elsewhere, copy the file 'revoked'
+    into the folder of the learner's or server's certificate.
+
+    Args:
+      folder: Folder of the authority.
+      role: The certificate's role.
+      number: The certificate's number.
+      run: Name of the run that it was for; by default the one that the authority was made for.
+    """
+    from services.ops.certificates import revoke
+
+    print(f"{revoke(folder, role, number, run=run)} is revoked.")
+    return 0
+
+
 def show(folder: Folder = pathlib.Path("certs")) -> int:
-    """Show the certificates of a folder and when they expire; the exit code is 1 if one has.
+    """Show the certificates of a folder, when they expire and which are revoked; the exit code is 1 if one has expired.
 
     Args:
       folder: Folder of an authority or of one certificate.
@@ -67,16 +94,18 @@ def show(folder: Folder = pathlib.Path("certs")) -> int:
     from rich.console import Console
     from rich.table import Table
 
+    from common.transport.security import Credentials
     from services.ops.certificates import certificates
 
+    revoked = Credentials(folder, "").revoked()
     table = Table("certificate", "expires (UTC)", "days left", "listens as")
     found = certificates(folder)
     for one in found:
         style = "red" if one.days <= 0 else "yellow" if one.days < 30 else ""
-        left = f"{one.days:.0f}" if one.days > 0 else "expired"
+        left = "revoked" if one.name in revoked else f"{one.days:.0f}" if one.days > 0 else "expired"
         table.add_row(one.name, f"{one.expires:%Y-%m-%d %H:%M}", left, ", ".join(one.hosts), style=style)
     Console().print(table)
     return int(any(one.days <= 0 for one in found))
 
 
-COMMANDS = {"init": init, "issue": issue, "show": show}
+COMMANDS = {"init": init, "issue": issue, "revoke": revoke, "show": show}

@@ -74,7 +74,17 @@ def learner(
     resume = resume or (or_resume and (run_dir / CONFIG_FILE).exists())
     try:
         config, url = with_hand(config, hand), rank_url(listen, rank)
-        with on_signal() as stop, urls.listen(url, "learner", certs=certs, insecure=insecure) as transport:
+        with (
+            on_signal() as stop,
+            urls.listen(
+                url,
+                "learner",
+                certs=certs,
+                insecure=insecure,
+                run=config.name,
+                longest_rollout=_longest_rollout(config) if ranks == 1 else None,  # others have rank 0's configuration
+            ) as transport,
+        ):
             if rank == 0 and resume:
                 continue_run(run_dir, config)
             elif rank == 0:
@@ -87,6 +97,17 @@ def learner(
         if ranks > 1:
             end_process(str(error), error.exit_code)
         raise
+
+
+def _longest_rollout(config: RunConfig) -> int:
+    """Twice the bytes of a run's rollouts: what is longer is none."""
+    from common.policy.bundle import policy_spec
+    from learner.algorithms import make_algorithm
+    from learner.batch import rollout_form
+
+    spec = policy_spec(config.task, config.network)
+    form = rollout_form(config, spec, make_algorithm(spec, config).batch_schema)
+    return 2 * sum(array.nbytes for array in form.zeros().values())
 
 
 def _learn(

@@ -60,9 +60,9 @@ def serve(
         contextlib.ExitStack() as stack,
     ):
         if connect:
-            upstream = stack.enter_context(urls.connect(connect, "server", certs=certs))
+            upstream = stack.enter_context(urls.connect(connect, "server", certs=certs, run=run))
             upstream.declare_alive(Keys(run).alive("server", name, secrets.token_hex(4)))
-            source = follow_run(upstream, run)
+            source = follow_run(upstream, run, urls.name_on_wire(name, certs, "server"))
         else:
             source = follow_file(policy_file(policy, hand))
         transport = stack.enter_context(urls.listen(listen, "server", certs=certs, insecure=insecure))

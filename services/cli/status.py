@@ -36,7 +36,7 @@ def status(
     from common.transport import urls
     from services.ops.status import ask, follow, tables
 
-    with urls.connect(connect, "observer", certs=certs) as transport:
+    with urls.connect(connect, "observer", certs=certs, run=run) as transport:
         found = ask(transport, run)
         if not watch:
             if json:

@@ -1,8 +1,9 @@
-"""A private authority and the certificates that it issues: one for each role and number, such as `actor.3`.
+"""A private authority and the certificates that it issues, one for each run, role and number: `human.actor.3`.
 
-The common name of a certificate is `<role>.<number>`. Zenoh compares common names as a whole and reads its rules once,
-so those who listen allow all numbers below `NUMBERS` from the start, and a certificate that is issued later works at
-once. Keys are elliptic (P-256), in files that their owner alone can read.
+The common name of a certificate is `<run>.<role>.<number>`. Zenoh compares common names as a whole and reads its rules
+once, so those who listen allow all numbers below `NUMBERS` from the start, and a certificate that is issued later works
+at once. One that is lost is revoked: its common name goes into the file `revoked`, which listeners look at. Keys are
+elliptic (P-256), in files that their owner alone can read.
 """
 
 import datetime
@@ -20,20 +21,35 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from common.errors import CongraspError
 from common.transport.certificates import Certificate, load, read
-from common.transport.security import CA_FILE, CERTIFICATE_FILE, KEY_FILE, LISTENERS, NUMBERS, ROLES
+from common.transport.keys import check_name
+from common.transport.security import (
+    CA_FILE,
+    CERTIFICATE_FILE,
+    KEY_FILE,
+    LISTENERS,
+    NUMBERS,
+    REVOKED_FILE,
+    ROLES,
+    Credentials,
+    Identity,
+)
 
 CA_KEY_FILE = "ca.key"
 CA_DAYS, DAYS = 3650, 365
+RUN = "quickstart"
+"""Name of the run for which an authority issues certificates unless told otherwise."""
+_LONGEST_NAME = 64  # characters of a common name (RFC 5280)
 _ORGANIZATION = "congrasp"
 _LOOPBACK = ("localhost", "127.0.0.1")
 _CLOCKS = datetime.timedelta(minutes=5)  # by which the clocks of two machines may differ
 
 
-def create_authority(folder: pathlib.Path, *, force: bool = False) -> Certificate:
+def create_authority(folder: pathlib.Path, *, run: str = RUN, force: bool = False) -> Certificate:
     """Makes an authority: `ca.crt`, which everyone gets, and `ca.key`, which stays where it is.
 
     Args:
       folder: made if it is not there.
+      run: name of the run for which it issues certificates where no other is named.
       force: replace an authority that is there, which makes all certificates that it issued useless.
 
     Raises:
@@ -47,6 +63,7 @@ def create_authority(folder: pathlib.Path, *, force: bool = False) -> Certificat
     name = x509.Name(
         [
             x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION),
+            x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, check_name("run", run)),
             x509.NameAttribute(NameOID.SERIAL_NUMBER, secrets.token_hex(8)),  # tells authorities apart
         ]
     )
@@ -63,13 +80,15 @@ def create_authority(folder: pathlib.Path, *, force: bool = False) -> Certificat
     folder.mkdir(parents=True, exist_ok=True)
     _write_secret(folder / CA_KEY_FILE, key)
     (folder / CA_FILE).write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    return Certificate("ca", 0, (), made.not_valid_after_utc)
+    (folder / REVOKED_FILE).unlink(missing_ok=True)
+    return Certificate(None, run, (), made.not_valid_after_utc)
 
 
 def issue(
     folder: pathlib.Path,
     role: str,
     *,
+    run: str | None = None,
     number: int | None = None,
     hosts: Sequence[str] = (),
     days: float = DAYS,
@@ -80,7 +99,8 @@ def issue(
     Args:
       folder: holds the authority, and takes the new folder `<role>.<number>` with `ca.crt`, `tls.crt` and `tls.key`.
       role: one of `ROLES`.
-      number: by default the lowest that has no folder yet.
+      run: name of the run that it is for; by default the authority's.
+      number: by default the lowest that has no folder yet and is not revoked.
       hosts: names and addresses under which its owner may listen besides loopback.
       days: until it expires; never later than the authority.
       force: replace the one that is there.
@@ -95,19 +115,26 @@ def issue(
         raise CongraspError(f"There is no certificate role {ascii(role)[:40]}.", f"Choose one of: {', '.join(ROLES)}.")
     if hosts and role not in LISTENERS:
         raise CongraspError(f"A certificate of the role {role} names no hosts.", f"Only {' and '.join(LISTENERS)} do.")
+    ca, ca_key = _authority(folder)
+    run = check_name("run", run or read(folder / CA_FILE).run)
+    revoked = Credentials(folder, role).revoked()
+    taken = lambda i: (folder / f"{role}.{i}").exists() or str(Identity(run, role, i)) in revoked  # noqa: E731
     if number is None:
-        number = next((i for i in range(NUMBERS) if not (folder / f"{role}.{i}").exists()), NUMBERS)
+        number = next((i for i in range(NUMBERS) if not taken(i)), NUMBERS)
     if not 0 <= number < NUMBERS:
         raise CongraspError(f"{role}.{number} cannot be issued.", f"Numbers go from 0 to {NUMBERS - 1}.")
-    target = folder / f"{role}.{number}"
+    target, identity = folder / f"{role}.{number}", Identity(run, role, number)
     if target.exists() and not force:
         raise CongraspError(f"{target} is there already.", "Choose another --number, or replace it with --force.")
-    ca, ca_key = _authority(folder)
+    if str(identity) in revoked:
+        raise CongraspError(f"{identity} is revoked.", "Choose another --number.")
+    if len(str(identity)) > _LONGEST_NAME:
+        raise CongraspError(f"{identity} is longer than {_LONGEST_NAME} characters.", "Give the run a shorter name.")
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name(
         [
             x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION),
-            x509.NameAttribute(NameOID.COMMON_NAME, target.name),
+            x509.NameAttribute(NameOID.COMMON_NAME, str(identity)),
         ]
     )
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -128,7 +155,34 @@ def issue(
     _write_secret(target / KEY_FILE, key)
     (target / CERTIFICATE_FILE).write_bytes(made.public_bytes(serialization.Encoding.PEM))
     shutil.copyfile(folder / CA_FILE, target / CA_FILE)
+    if (folder / REVOKED_FILE).exists():
+        shutil.copyfile(folder / REVOKED_FILE, target / REVOKED_FILE)
     return target
+
+
+def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = None) -> str:
+    """Revokes a certificate: its common name goes into the list of the authority and of all listeners in its folder.
+
+    Args:
+      folder: of the authority.
+      role: one of `ROLES`.
+      number: the certificate's.
+      run: name of the run that it was for; by default the authority's.
+
+    Returns:
+      The common name.
+
+    Raises:
+      CongraspError: there is no authority.
+    """
+    _authority(folder)
+    name = str(Identity(run or read(folder / CA_FILE).run, role, number))
+    listed = "".join(f"{one}\n" for one in sorted(Credentials(folder, role).revoked() | {name}))
+    for place in (folder, *(path for listener in LISTENERS for path in folder.glob(f"{listener}.*"))):
+        part = place / f"{REVOKED_FILE}.part"
+        part.write_text(listed)
+        part.replace(place / REVOKED_FILE)
+    return name
 
 
 def certificates(folder: pathlib.Path) -> list[Certificate]:
@@ -141,7 +195,7 @@ def certificates(folder: pathlib.Path) -> list[Certificate]:
     found = [read(path) for path in files if path.exists()]
     if not found:
         raise CongraspError(f"{folder} holds no certificates.", f"Make them: congrasp certs init {folder}")
-    return sorted(found, key=lambda one: (one.role != "ca", one.role, one.number))
+    return sorted(found, key=lambda one: one.identity or Identity("", "", 0))
 
 
 def _builder(

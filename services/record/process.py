@@ -49,7 +49,7 @@ def record_run(
     warn = functools.partial(log, "warning") if structured else lambda text: console.print(f"congrasp: {text}")
     end = time.monotonic() + duration if duration is not None else None
     with contextlib.ExitStack() as stack:
-        transport = stack.enter_context(urls.connect(connect, "observer", certs=certs))
+        transport = stack.enter_context(urls.connect(connect, "observer", certs=certs, run=run))
         server = stack.enter_context(LiveServer(live)) if live is not None else None
         if server is not None:
             console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")

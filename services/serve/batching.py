@@ -1,4 +1,8 @@
-"""Queries that arrive together are answered together: a bounded queue, a worker thread, and none for a lone query."""
+"""Queries that arrive together are answered together: a bounded queue, a worker thread, and none for a lone query.
+
+Peers take turns in the queue, and none may fill more than its part of it: one that asks without end delays the others
+by one query of its own, and is refused when nobody else would be.
+"""
 
 import collections
 import threading
@@ -17,6 +21,7 @@ class _Waiting(NamedTuple):
     """An item in the queue; times in seconds of the monotonic clock."""
 
     item: object
+    peer: str
     future: Future
     arrival: float
     deadline: float
@@ -35,6 +40,7 @@ class Batcher(Generic[T, R]):
       size: most that the items of one batch may weigh together.
       window: seconds.
       depth: most items that wait; one more is refused with `OverloadedError`.
+      share: most items of one peer that wait; by default `depth`.
       weigh: an item's weight, which is at most `size`.
     """
 
@@ -45,6 +51,7 @@ class Batcher(Generic[T, R]):
         size: int,
         window: float,
         depth: int,
+        share: int | None = None,
         weigh: Callable[[T], int] = lambda item: 1,
     ):
         self._run = run
@@ -52,7 +59,8 @@ class Batcher(Generic[T, R]):
         self._size = size
         self._window = window
         self._depth = depth
-        self._queue: collections.deque[_Waiting] = collections.deque()
+        self._share = depth if share is None else share
+        self._queues: collections.OrderedDict[str, collections.deque[_Waiting]] = collections.OrderedDict()
         self._changed = threading.Condition()
         self._running = False
         self._expected = 1
@@ -60,28 +68,36 @@ class Batcher(Generic[T, R]):
         self._thread = threading.Thread(target=self._work, daemon=True, name="batcher")
         self._thread.start()
 
+    def check_room(self, peer: str) -> None:
+        """Raises `OverloadedError` if nothing more of a peer may wait."""
+        with self._changed:
+            if len(self) >= self._depth:
+                raise OverloadedError(f"Overloaded: {self._depth} queries wait already.", "Ask again later.")
+            if len(self._queues.get(peer, ())) >= self._share:
+                raise OverloadedError(f"Overloaded: {self._share} of your queries wait already.", "Ask again later.")
+
     def __len__(self) -> int:
         """Items that wait."""
-        return len(self._queue)
+        with self._changed:
+            return sum(len(queue) for queue in self._queues.values())
 
-    def submit(self, item: T, timeout: float) -> "Future[R]":
-        """Queues an item that is worth answering for `timeout` seconds.
+    def submit(self, item: T, timeout: float, peer: str = "") -> "Future[R]":
+        """Queues an item of a peer that is worth answering for `timeout` seconds.
 
         Raises:
-          OverloadedError: `depth` items wait already.
+          OverloadedError: `depth` items wait already, or `share` of this peer.
         """
         now = time.monotonic()
-        waiting = _Waiting(item, Future(), now, now + timeout)
+        waiting = _Waiting(item, peer, Future(), now, now + timeout)
         with self._changed:
             if self._closed:
                 raise CongraspError("The server is shutting down.")
-            alone = not self._running and not self._queue and self._expected == 1
+            alone = not self._running and not self._queues and self._expected == 1
             if alone:
                 self._running = True
-            elif len(self._queue) >= self._depth:
-                raise OverloadedError(f"Overloaded: {self._depth} queries wait already.", "Ask again later.")
             else:
-                self._queue.append(waiting)
+                self.check_room(peer)
+                self._queues.setdefault(peer, collections.deque()).append(waiting)
                 self._changed.notify()
         if alone:
             self._answer([waiting])
@@ -98,7 +114,7 @@ class Batcher(Generic[T, R]):
         """Answers batches until the batcher is closed, in the worker."""
         while batch := self._collect():
             self._answer(batch)
-        for waiting in self._queue:
+        for waiting in (one for queue in self._queues.values() for one in queue):
             waiting.future.set_exception(CongraspError("The server is shutting down."))
 
     def _answer(self, batch: list[_Waiting]) -> None:
@@ -126,17 +142,24 @@ class Batcher(Generic[T, R]):
     def _collect(self) -> list[_Waiting]:
         """The next batch; empty once closed."""
         with self._changed:
-            while (self._running or not self._queue) and not self._closed:
+            while (self._running or not self._queues) and not self._closed:
                 if not self._changed.wait(self._window if self._expected > 1 else None):
                     self._expected = 1
             if self._closed:
                 return []
-            until = self._queue[0].arrival + self._window
-            while len(self._queue) < self._expected and (rest := until - time.monotonic()) > 0 and not self._closed:
+            until = min(queue[0].arrival for queue in self._queues.values()) + self._window
+            while len(self) < self._expected and (rest := until - time.monotonic()) > 0 and not self._closed:
                 self._changed.wait(rest)
             batch, room = [], self._size
-            while self._queue and (weight := self._weigh(cast(T, self._queue[0].item))) <= room:
-                batch.append(self._queue.popleft())
+            while self._queues:
+                peer, queue = next(iter(self._queues.items()))  # whose turn it is
+                weight = self._weigh(cast(T, queue[0].item))
+                if weight > room:
+                    break
+                batch.append(queue.popleft())
                 room -= weight
+                self._queues.move_to_end(peer)
+                if not queue:
+                    del self._queues[peer]
             self._running, self._expected = True, len(batch)
             return batch

@@ -1,6 +1,7 @@
 """The client of a policy server, for a robot's control loop: needs nothing but numpy and zenoh."""
 
 import os
+import secrets
 
 from common.transport import urls
 from common.transport.keys import Keys
@@ -37,6 +38,7 @@ class PolicyClient(EpisodePolicy):
         super().__init__()
         self._transport = urls.connect(connect, "client", certs=certs, wait=wait)
         self._keys, self._hand, self._timeout = Keys(run), hand, timeout
+        self._act_key = self._keys.act_for(urls.name_on_wire(secrets.token_hex(4), certs, "client"))
 
     def health(self) -> dict[str, object]:
         """Readiness, version, hand and queue of the server."""
@@ -49,4 +51,4 @@ class PolicyClient(EpisodePolicy):
     def _query(self, query: Message) -> Message:
         """The server's reply."""
         meta = {"hand": self._hand, "timeout": self._timeout, **query.meta}
-        return self._transport.query(self._keys.act, Message(query.arrays, meta), timeout=self._timeout)
+        return self._transport.query(self._act_key, Message(query.arrays, meta), timeout=self._timeout)

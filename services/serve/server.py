@@ -13,7 +13,7 @@ from common.hands import get_hand
 from common.policy import bundle as bundles
 from common.policy.bundle import InferenceParameters, PolicyBundle, content_hash
 from common.transport.base import Transport
-from common.transport.keys import Keys
+from common.transport.keys import Keys, account, below
 from common.wire.codec import Message, encode
 from services.ops.logs import log
 from services.serve.batching import Batcher
@@ -26,6 +26,8 @@ WINDOW = 0.001
 """Seconds that a query may wait for others to join its batch."""
 DEPTH = 64
 """Queries that wait for the next batch; one more is refused at once."""
+SHARE = 16
+"""Queries of one peer among them."""
 _MAX_TIMEOUT = 60.0
 _FOLLOW_SECONDS = 0.5
 
@@ -80,11 +82,18 @@ class PolicyServer:
         self._trouble = ""
         self._closed = threading.Event()
         self._batcher: Batcher[Query, _Answered] = Batcher(
-            self._infer, weigh=lambda query: len(query.vectors), size=BATCH_SIZES[-1], window=WINDOW, depth=DEPTH
+            self._infer,
+            weigh=lambda query: len(query.vectors),
+            size=BATCH_SIZES[-1],
+            window=WINDOW,
+            depth=DEPTH,
+            share=SHARE,
         )
         keys = Keys(run)
         transport.serve(keys.health, lambda key, request: Message({}, self.health()))
-        transport.serve(keys.act, self._act, workers=2, depth=DEPTH)  # one may infer while the other receives
+        transport.serve(
+            below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._turn_away
+        )  # one may infer while the other receives
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
 
@@ -109,12 +118,22 @@ class PolicyServer:
         self._batcher.close()
         self._follower.join(2 * _FOLLOW_SECONDS)
 
+    def _turn_away(self, key: str) -> None:
+        """Refuses a query that could not wait for its turn, before it costs anything more."""
+        began = time.monotonic()
+        try:
+            self._batcher.check_room(account(key))
+        except CongraspError as error:
+            self._count(error, began)
+            raise
+
     def _act(self, key: str, request: Message) -> "Future[Message]":
         """Queues a query; the answer comes later."""
         began = time.monotonic()
         try:
             query = self._function.layout.parse(request)
-            future = self._batcher.submit(query, self._deadline(request.meta.get("timeout", self._timeout)))
+            timeout = self._deadline(request.meta.get("timeout", self._timeout))
+            future = self._batcher.submit(query, timeout, peer=account(key))
         except CongraspError as error:
             self._count(error, began)
             raise
@@ -211,11 +230,12 @@ def follow_file(path: pathlib.Path) -> Source:
     return read
 
 
-def follow_run(transport: Transport, run: str) -> Source:
-    """A source that pulls the newest policy from a learner."""
+def follow_run(transport: Transport, run: str, name: str) -> Source:
+    """A source that pulls the newest policy from a learner, under the server's name on the wire."""
+    key = Keys(run).weights_for("server", name)
 
     def pull(version: int) -> PolicyBundle | None:
-        reply = transport.query(Keys(run).weights, Message({}, {"newer_than": version}), timeout=5.0)
+        reply = transport.query(key, Message({}, {"newer_than": version}), timeout=5.0)
         return PolicyBundle.from_message(reply, "of the learner") if reply.arrays else None
 
     return pull

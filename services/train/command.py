@@ -85,7 +85,7 @@ def run_training(
     Raises:
       CongraspError: the arguments contradict each other, the configuration cannot run, or a process failed for good.
     """
-    _check_connections(actors, listen, certs, insecure=insecure)
+    _check_connections(actors, listen, certs, config.name, insecure=insecure)
     plan = _plan(config, actors, ranks, listens=listen is not None or certs is not None)
     _prepare(run_dir, config, initial, resume=resume)
     easier_task = _announce(config, run_dir, plan)
@@ -133,15 +133,17 @@ def run_training(
     return 0
 
 
-def _check_connections(actors: int | None, listen: str | None, certs: pathlib.Path | None, *, insecure: bool) -> None:
+def _check_connections(
+    actors: int | None, listen: str | None, certs: pathlib.Path | None, run: str, *, insecure: bool
+) -> None:
     """Raises `CongraspError` unless the learner may listen as asked, and all roles have certificates if any has."""
     if listen is None and certs is None:
         return
     if certs is not None and (certs / CERTIFICATE_FILE).exists():
         raise CongraspError(f"{certs} belongs to one role.", "Name the authority's folder, which holds all of them.")
-    check_exposure(listen or LEARNER_URL, urls.find_credentials(certs, "learner"), insecure=insecure)
+    check_exposure(listen or LEARNER_URL, urls.find_credentials(certs, "learner", run), insecure=insecure)
     for role in ("actor", "observer"):
-        urls.find_credentials(certs, role)
+        urls.find_credentials(certs, role, run)
     if actors == 0:
         raise CongraspError("With --actors 0 nothing listens.", "Leave out --listen and --certs, or --actors.")
 

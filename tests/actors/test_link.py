@@ -8,7 +8,7 @@ import pytest
 
 from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from common.errors import CongraspError, TransportError
-from common.transport.keys import Keys
+from common.transport.keys import Keys, below
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
 
@@ -30,7 +30,7 @@ class Learner:
         self.pulls = 0
         self.transport.serve(KEYS.config, lambda key, m: self.reply(config="{}", schema="s", arrays=["reward"]))
         self.transport.serve(KEYS.tickets, self.on_ticket)
-        self.transport.serve(KEYS.weights, self.on_weights)
+        self.transport.serve(below(KEYS.weights), self.on_weights)
         self.transport.serve(KEYS.rollouts, self.on_rollout, workers=4)
 
     def reply(self, **meta):

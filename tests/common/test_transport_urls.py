@@ -26,7 +26,7 @@ KEYS = Keys("test")
 
 @pytest.fixture
 def certs(tmp_path):
-    create_authority(tmp_path)
+    create_authority(tmp_path, run="test")
     for role in ("learner", "actor", "actor", "observer"):
         issue(tmp_path, role)
     return tmp_path

@@ -18,7 +18,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 from actors.link import ActorLink
 from common.errors import CongraspError, TransportError
 from common.transport.certificates import read
-from common.transport.keys import Keys
+from common.transport.keys import Keys, below
 from common.transport.ports import free_port
 from common.transport.security import RIGHTS, Credentials
 from common.transport.zenoh_transport import ZenohTransport
@@ -26,7 +26,7 @@ from common.wire.codec import Message, encode
 from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
-from services.ops.certificates import create_authority, issue
+from services.ops.certificates import create_authority, issue, revoke
 from services.serve.client import PolicyClient
 from tests.cluster import A, B, D, T, bundle, rollout
 
@@ -39,7 +39,7 @@ ME, OTHER = "0.a", "1.b"
 def certs(tmp_path_factory):
     """An authority with a certificate of every role, a second actor's, and an expired one."""
     folder = tmp_path_factory.mktemp("certs")
-    create_authority(folder)
+    create_authority(folder, run="safe")
     for role in ("learner", "actor", "actor", "server", "client", "observer"):
         issue(folder, role)
     issue(folder, "actor", number=9, days=-1)
@@ -50,7 +50,7 @@ def certs(tmp_path_factory):
 def evil(tmp_path_factory):
     """Another authority, which certifies everything."""
     folder = tmp_path_factory.mktemp("evil")
-    create_authority(folder)
+    create_authority(folder, run="safe")
     for role in ("learner", "actor"):
         issue(folder, role)
     return folder
@@ -80,14 +80,14 @@ def run(certs):
     endpoint, policy = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     with contextlib.ExitStack() as stack:
         learner, server = (Credentials(certs / f"{role}.0", role) for role in ("learner", "server"))
-        transport = stack.enter_context(ZenohTransport(listen=[endpoint], credentials=learner))
+        transport = stack.enter_context(ZenohTransport(listen=[endpoint], credentials=learner, revocation_seconds=0.1))
         hub = LearnerHub(
             transport, run="safe", config_json="{}", run_id="e", schema="s",
             form=RolloutForm(T, B, D, A, half=True), staleness=StalenessManager(1, 2),
         )  # fmt: skip
         hub.publish_weights(bundle(0, "e"), 0)
         serving = stack.enter_context(ZenohTransport(listen=[policy], credentials=server, flows=("policy",)))
-        for key in (KEYS.act, KEYS.health):
+        for key in (below(KEYS.act), KEYS.health):
             serving.serve(key, lambda key, request: Message(meta={"ready": True, "served": key}))
         yield Run(certs, endpoint, policy, hub, transport, stack)
 
@@ -140,10 +140,13 @@ def test_with_the_right_certificates_a_run_works_from_end_to_end(run):
         status = wait_for(lambda: (now := observer.query(KEYS.status, Message(), timeout=5).meta) and now)
         assert ("actor", ME) in {(role["role"], role["id"]) for role in status["roles"]}
         assert status["ledger"]["accepted"] == 2 and status["ledger"]["turned_away"] == 0
-    assert server.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5).meta["version"] == 1
+    assert (
+        server.query(KEYS.weights_for("server", "0.s"), Message(meta={"newer_than": -1}), timeout=5).meta["version"]
+        == 1
+    )
     with PolicyClient(run.policy, "safe", certs=run.certs / "client.0") as client:
         assert client.health()["ready"]
-    assert answers(run.connect("client.0", run.policy), KEYS.act).meta["served"] == KEYS.act
+    assert answers(run.connect("client.0", run.policy), KEYS.act_for("0.c")).meta["served"] == KEYS.act_for("0.c")
     assert answers(run.connect("observer.0", run.policy), KEYS.health)
 
 
@@ -173,13 +176,17 @@ def test_an_actor_finds_a_learner_that_comes_back_and_its_rules_hold(certs):
 
 EVERYTHING = {
     "config": KEYS.config,
-    "weights": KEYS.weights,
+    "nobody's weights": KEYS.weights,
+    "my weights": KEYS.weights_for("actor", ME),
+    "another's weights": KEYS.weights_for("actor", OTHER),
+    "a server's weights": KEYS.weights_for("server", "0.s"),
     "status": KEYS.status,
     "my ticket": KEYS.ticket(ME),
     "my rollout": KEYS.rollout(ME),
     "another's ticket": KEYS.ticket(OTHER),
     "another's rollout": KEYS.rollout(OTHER),
     "everyone's": "congrasp/safe/rollout/*",
+    "another run's status": Keys("other").status,
     "whatever there is": "congrasp/**",
     "the learner's innards": "@/{learner}/**",
 }
@@ -188,9 +195,9 @@ EVERYTHING = {
 @pytest.mark.parametrize(
     ("who", "may"),
     [
-        ("actor.0", {"config", "weights", "my ticket", "my rollout"}),
-        ("actor.1", {"config", "weights", "another's ticket", "another's rollout"}),
-        ("server.0", {"config", "weights"}),
+        ("actor.0", {"config", "my weights", "my ticket", "my rollout"}),
+        ("actor.1", {"config", "another's weights", "another's ticket", "another's rollout"}),
+        ("server.0", {"config", "a server's weights"}),
         ("observer.0", {"config", "status"}),
         ("client.0", set()),
         ("learner.0", set()),
@@ -207,11 +214,13 @@ def test_each_role_can_ask_the_learner_for_its_own_and_nothing_else(run, who, ma
 
 
 @pytest.mark.parametrize(
-    ("who", "may"), [("client.0", {KEYS.act, KEYS.health}), ("observer.0", {KEYS.health}), ("actor.0", set())]
+    ("who", "may"),
+    [("client.0", {KEYS.act_for("0.c"), KEYS.health}), ("observer.0", {KEYS.health}), ("actor.0", set())],
 )
 def test_only_clients_can_ask_the_policy(run, who, may):
     session = run.connect(who, run.policy)
-    assert {key for key in (KEYS.act, KEYS.health) if answers(session, key)} == may
+    asked = (KEYS.act_for("0.c"), KEYS.act_for("1.c"), KEYS.act, KEYS.health)
+    assert {key for key in asked if answers(session, key)} == may
 
 
 @pytest.mark.parametrize("who", ["actor.0", "client.0", "observer.0", "server.0"])
@@ -228,7 +237,9 @@ def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
         thief.publish(key, Message(meta={"forged": True}))
     assert heard(announcements) == heard(logs, 0.1) == heard(here[0], 0.1) == heard(here[1], 0.1) == []
     assert "forged" not in observer.query(KEYS.status, Message(), timeout=5).meta
-    assert "forged" not in victim.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5).meta
+    assert (
+        "forged" not in victim.query(KEYS.weights_for("actor", OTHER), Message(meta={"newer_than": -1}), timeout=5).meta
+    )
     assert answers(run.transport, KEYS.act) is None and asked == []
 
 
@@ -267,17 +278,21 @@ def test_a_client_hears_no_logs(run):
     assert heard(logs) == heard(also, 0.1) == []
 
 
-@pytest.mark.parametrize("mode", ["peer", "router"])
-def test_another_mode_of_connecting_gives_no_more(run, mode):
-    """Zenoh's peers and routers exchange more than its clients; the same rules hold for them."""
-    folder = run.certs / "actor.0"
+def _raw_session(endpoint, folder, mode):
+    """A session of somebody who does not use our code."""
     config = zenoh.Config.from_json5(
         f"""{{mode: "{mode}", listen: {{endpoints: []}}, scouting: {{multicast: {{enabled: false}}}},
-             connect: {{endpoints: ["{run.endpoint.replace("tcp/", "tls/")}"], timeout_ms: 5000}},
+             connect: {{endpoints: ["{endpoint.replace("tcp/", "tls/")}"], timeout_ms: 5000}},
              transport: {{link: {{tls: {{root_ca_certificate: "{folder}/ca.crt", enable_mtls: true,
              connect_certificate: "{folder}/tls.crt", connect_private_key: "{folder}/tls.key"}}}}}}}}"""
     )
-    with zenoh.open(config) as session:
+    return zenoh.open(config)
+
+
+@pytest.mark.parametrize("mode", ["peer", "router"])
+def test_another_mode_of_connecting_gives_no_more(run, mode):
+    """Zenoh's peers and routers exchange more than its clients; the same rules hold for them."""
+    with _raw_session(run.endpoint, run.certs / "actor.0", mode) as session:
         stolen = [session.declare_queryable(key, FifoChannel(8)) for key in (KEYS.status, KEYS.act)]
         logs = session.declare_subscriber("congrasp/**", RingChannel(64))
         time.sleep(0.5)
@@ -293,7 +308,8 @@ def test_another_mode_of_connecting_gives_no_more(run, mode):
 def test_every_right_is_a_key_of_a_run():
     """A right for a key that does not exist any more would be an open door without a room."""
     real = {
-        KEYS.config, KEYS.status, KEYS.weights, KEYS.announcement, KEYS.act, KEYS.health, KEYS.logs,
+        KEYS.config, KEYS.status, KEYS.announcement, KEYS.health, KEYS.logs, KEYS.act_for("name"),
+        KEYS.weights_for("actor", "name"), KEYS.weights_for("server", "name"),
         KEYS.ticket("{name}".strip("{}")), KEYS.rollout("name"), KEYS.alive("actor", "name", "x"),
         KEYS.alive("server", "x", "x"), KEYS.alive("recorder", "x", "x"), KEYS.log("x", "actor", "name"),
     }  # fmt: skip
@@ -338,6 +354,81 @@ def test_nobody_is_taken_for_the_learner(folder, who, request, certs):
     mine = Credentials(request.getfixturevalue(folder) / who, "learner")
     with ZenohTransport(listen=[endpoint], credentials=mine):
         _refused(endpoint, Credentials(certs / "actor.1", "actor"), "not to be trusted")
+
+
+def test_a_certificate_serves_the_run_that_it_names(run, certs):
+    """Another run's certificates of the same authority open the connection, and nothing behind it."""
+    mine = {
+        "actor": (KEYS.config, KEYS.ticket("20.a"), KEYS.rollout("20.a"), Keys("other").config),
+        "observer": (KEYS.config, KEYS.status, Keys("other").status),
+    }
+    for role, keys in mine.items():
+        folder = issue(certs, role, run="other", number=20, force=True)
+        with pytest.raises(CongraspError, match=r"safe.learner.0', which may not listen to other"):
+            run.connect(folder.name)
+        with _raw_session(run.endpoint, folder, "client") as session:
+            for key in keys:
+                time.sleep(0.02)
+                assert not list(session.get(key, FifoChannel(8), payload=encode(Message()), timeout=3.0)), key
+    assert answers(run.connect("observer.0"), KEYS.status)
+
+
+def test_a_policy_server_is_not_taken_for_the_learner(certs):
+    """Its certificate is one for listening, and of the same authority: those who want the learner see whose it is."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "server.0", "server")):
+        for role in ("actor", "observer", "server"):
+            _refused(endpoint, Credentials(certs / f"{role}.0", role), "server.0', which may not listen to safe")
+    issue(certs, "learner", run="other", number=20, force=True)
+    with ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "learner.20", "learner")):
+        _refused(endpoint, Credentials(certs / "actor.0", "actor"), "other.learner.20', which may not listen to safe")
+
+
+def test_a_learner_that_is_replaced_by_another_role_gets_nothing(certs):
+    """Zenoh connects again by itself, without asking us: the rules of who connects hold for whom it finds then."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    learner = ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "learner.0", "learner"))
+    learner.serve(KEYS.config, lambda key, request: Message())
+    with ZenohTransport(connect=[endpoint], credentials=Credentials(certs / "actor.0", "actor")) as actor:
+        assert answers(actor, KEYS.config)
+        learner.close()
+        asked = []
+        with ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "server.0", "server")) as thief:
+            for key in (KEYS.config, KEYS.ticket(ME)):
+                thief.serve(key, lambda key, request: asked.append(key) or Message())
+            wait_for(lambda: list(thief._sessions.get("control").info.links()))
+            time.sleep(0.3)
+            assert answers(actor, KEYS.config) is None and answers(actor, KEYS.ticket(ME)) is None and asked == []
+
+
+def test_who_is_revoked_is_out_and_the_others_stay(run):
+    thief, actor, observer = run.connect("actor.1"), run.connect("actor.0"), run.connect("observer.0")
+    logs = observer.subscribe(KEYS.logs, depth=64)
+    thief.declare_alive(KEYS.alive("actor", OTHER, "66"))
+    actor.declare_alive(KEYS.alive("actor", ME, "01"))
+
+    def out():
+        """Never answered in a while: one request alone could be one too soon after another."""
+        return not any(time.sleep(0.05) or answers(thief, KEYS.config) for _ in range(10))
+
+    assert not out()
+    wait_for(lambda: len(run.hub.status()["roles"]) == 3)
+    with ActorLink(actor, "safe", ME, request_timeout=5.0) as link:
+        link.config(10)
+        revoke(run.certs, "actor", 1)
+        try:
+            wait_for(out, 30.0)
+            wait_for(lambda: OTHER not in {role["id"] for role in run.hub.status()["roles"]})
+            wait_for(lambda: ME in {role["id"] for role in run.hub.status()["roles"]})
+            ticket = wait_for(lambda: link.acquire_ticket(5))
+            assert link.upload(rollout(T, 0, 0), ticket).result(20) == "accepted"
+            thief.publish(KEYS.log("event", "actor", OTHER), Message())
+            wait_for(lambda: actor.publish(KEYS.log("event", "actor", ME), Message()) or logs.receive(0.3))
+            assert answers(thief, KEYS.ticket(OTHER)) is None and out()
+        finally:
+            for path in run.certs.rglob("revoked"):
+                path.unlink()
+    wait_for(lambda: answers(thief, KEYS.config))  # and let in again once the list is empty
 
 
 def test_a_certificate_for_another_host_is_not_trusted(certs):

@@ -377,6 +377,16 @@ def test_weights_are_pulled_by_version(bench):
     assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 1, "life": "before"}), timeout=5).arrays
 
 
+def test_who_asks_for_weights_without_end_is_put_off_alone(bench):
+    b, request = bench(), Message(meta={"newer_than": -1})
+    b.hub.publish_weights(bundle(0), 0)
+    ask = lambda name: b.peer.query(KEYS.weights_for("actor", name), request, timeout=5)  # noqa: E731
+    replies = [ask("1.a") for _ in range(400)]
+    assert all(reply.arrays for reply in replies[:100])
+    assert not all(reply.arrays for reply in replies) and replies[-1].meta["version"] == 0
+    assert ask("2.a").arrays and ask("3.a").arrays
+
+
 def test_only_weights_of_this_run_are_published(bench):
     b = bench()
     with pytest.raises(CongraspError, match="not version 1 of run id e"):

@@ -78,11 +78,12 @@ def _of_run(
     pulling = watching
     if certs is not None:
         try:
-            pulling = stack.enter_context(urls.connect(connect, "server", certs=certs))
+            pulling = stack.enter_context(urls.connect(connect, "server", certs=certs, run=run))
         except CongraspError as error:
             log("warning", f"{error} The studio grasps with the pretrained policies.")
             return _pretrained()
-    return {"of the run": functools.partial(PolicyGrasping, follow_run(pulling, run), f"the run '{run}'")}
+    source = follow_run(pulling, run, urls.name_on_wire("studio", certs, "server"))
+    return {"of the run": functools.partial(PolicyGrasping, source, f"the run '{run}'")}
 
 
 def _pretrained() -> dict[str, Callable[[], PolicyGrasping]]:

@@ -9,24 +9,28 @@ import pytest
 
 from common.errors import CongraspError
 from common.transport.certificates import find, read
-from common.transport.security import NUMBERS, Credentials, check_exposure, secured
-from services.ops.certificates import certificates, create_authority, issue
+from common.transport.security import NUMBERS, Credentials, check_exposure, parse_identity, secured
+from services.ops.certificates import certificates, create_authority, issue, revoke
 
 
 @pytest.fixture
 def folder(tmp_path):
-    create_authority(tmp_path / "certs")
+    create_authority(tmp_path / "certs", run="human")
     return tmp_path / "certs"
 
 
-def test_a_certificate_says_role_number_hosts_and_end(folder):
+def test_a_certificate_says_run_role_number_hosts_and_end(folder):
     made = read(issue(folder, "learner", hosts=["10.0.0.5", "gpu.example", "10.0.0.5"], days=30) / "tls.crt")
-    assert (made.name, made.role, made.number) == ("learner.0", "learner", 0)
+    assert (made.name, made.identity) == ("human.learner.0", ("human", "learner", 0))
     assert made.hosts == ("localhost", "127.0.0.1", "10.0.0.5", "gpu.example")
     assert made.expires.utcoffset() == datetime.timedelta(0) and 29.99 < made.days <= 30
-    assert read(issue(folder, "learner") / "tls.crt").name == "learner.1"
+    assert read(issue(folder, "learner") / "tls.crt").name == "human.learner.1"
+    other = issue(folder, "learner", run="a.b-c")
+    assert read(other / "tls.crt").identity == Credentials(other, "learner").identity == ("a.b-c", "learner", 2)
     assert read(issue(folder, "actor", days=7000) / "tls.crt").expires <= read(folder / "ca.crt").expires
-    assert [one.name for one in certificates(folder)] == ["ca", "actor.0", "learner.0", "learner.1"]
+    assert [one.name for one in certificates(folder)] == [
+        "ca", "a.b-c.learner.2", "human.actor.0", "human.learner.0", "human.learner.1",
+    ]  # fmt: skip
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="the command openssl is not here")
@@ -70,6 +74,8 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
         ("server", {"hosts": ["../x"]}, "neither a host name nor an address"),
         ("actor", {"number": NUMBERS}, "0 to 255"),
         ("actor", {"number": -1}, "0 to 255"),
+        ("actor", {"run": "a/b"}, "cannot be the name of a run"),
+        ("actor", {"run": "x" * 60}, "longer than 64"),
         ("actor", {"days": 1e9}, "days"),
         ("actor", {"days": float("nan")}, "days"),
     ],
@@ -83,8 +89,8 @@ def test_what_makes_no_sense_is_not_issued(folder, role, options, words):
 def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
     issue(folder, "actor")
     other = issue(folder, "actor")
-    assert find(folder, "actor")[0] == Credentials(folder / "actor.0", "actor")
-    assert find(other, "actor")[1].number == 1
+    assert find(folder, "actor") == Credentials(folder / "actor.0", "actor")
+    assert find(other, "actor").identity.number == 1
     with pytest.raises(CongraspError, match=r"for the role actor, not learner.*--role learner"):
         find(other, "learner")
     with pytest.raises(CongraspError, match="missing"):
@@ -100,6 +106,30 @@ def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
     (other / "tls.crt").write_bytes((folder / "ca.crt").read_bytes())
     with pytest.raises(CongraspError, match="for the role ca"):
         find(other, "actor")
+
+
+@pytest.mark.parametrize("name", ["", "actor.0", ".actor.0", "r.boss.0", "r.actor.256", "r.actor.-1", "r.actor.x"])
+def test_a_common_name_that_is_none_of_ours_is_nobodys(name):
+    assert parse_identity(name) is None
+    assert parse_identity("r.s.actor.255") == ("r.s", "actor", 255)
+
+
+def test_what_is_revoked_is_listed_where_others_connect_and_never_issued_again(folder):
+    learner, actor = issue(folder, "learner"), issue(folder, "actor")
+    assert revoke(folder, "actor", 0) == "human.actor.0"
+    assert revoke(folder, "actor", 3) == "human.actor.3"
+    assert Credentials(learner, "learner").revoked() == {"human.actor.0", "human.actor.3"}
+    assert Credentials(actor, "actor").revoked() == set()
+    assert Credentials(issue(folder, "server"), "server").revoked() == {"human.actor.0", "human.actor.3"}
+    with pytest.raises(CongraspError, match="is revoked"):
+        issue(folder, "actor", number=0, force=True)
+    assert [issue(folder, "actor").name for _ in range(3)] == ["actor.1", "actor.2", "actor.4"]
+    assert issue(folder, "actor", number=3, run="other").name == "actor.3"
+    (learner / "revoked").write_bytes(b"\xff\xfe")
+    with pytest.raises(CongraspError, match="cannot be read"):
+        Credentials(learner, "learner").revoked()
+    create_authority(folder, force=True)
+    assert Credentials(folder, "learner").revoked() == set()
 
 
 def test_with_credentials_every_endpoint_is_tls(tmp_path):

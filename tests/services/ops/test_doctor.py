@@ -127,7 +127,8 @@ def test_certificates_are_looked_at(tmp_path):
     issue(tmp_path, "actor", days=100.0)
     issue(tmp_path, "observer", days=3.0)
     found = {finding.text.split(":")[0]: finding for finding in doctor._certificates(tmp_path)}
-    assert found["actor.0"].fine and not found["observer.0"].fine and "issue --force" in found["observer.0"].text
+    actor, observer = found["quickstart.actor.0"], found["quickstart.observer.0"]
+    assert actor.fine and not observer.fine and "issue --force" in observer.text
 
 
 @pytest.mark.timeout(60)

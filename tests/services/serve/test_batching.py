@@ -72,6 +72,21 @@ def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
     batcher.close()
 
 
+def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
+    batcher = Batcher(gate, size=2, window=0.0, depth=10, share=3)
+    futures = [running(batcher, gate)]
+    futures += [batcher.submit(i, 10.0, peer="greedy") for i in (1, 2, 3)]
+    for refuse in (lambda: batcher.submit(4, 10.0, peer="greedy"), lambda: batcher.check_room("greedy")):
+        with pytest.raises(OverloadedError, match="Overloaded: 3 of your queries wait"):
+            refuse()
+    batcher.check_room("modest")
+    futures += [batcher.submit(i, 10.0, peer="modest") for i in (7, 8)]
+    gate.go.set()
+    assert [future.result(10) for future in futures] == [0, 10, 20, 30, 70, 80]
+    assert gate.batches == [[0], [1, 7], [2, 8], [3]]
+    batcher.close()
+
+
 def test_a_query_whose_deadline_passed_is_not_computed(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=4)
     running(batcher, gate)

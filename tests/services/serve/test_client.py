@@ -9,7 +9,7 @@ from common.config import TaskConfig
 from common.errors import RefusedError, TransportError
 from common.hands import get_hand
 from common.request import GraspRequest
-from common.transport.keys import Keys
+from common.transport.keys import Keys, below
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
@@ -44,7 +44,7 @@ class CannedServer:
         self.fields: list[dict[str, np.ndarray]] = []
         self.forms: list[str] = []
         self.transport = ZenohTransport(listen=[endpoint], flows=("policy",))
-        self.transport.serve(Keys("policy").act, self._act)
+        self.transport.serve(below(Keys("policy").act), self._act)
         self.transport.serve(Keys("policy").health, lambda key, request: Message({}, {"ready": True}))
 
     def _act(self, key: str, request: Message) -> Message:

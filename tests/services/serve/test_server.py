@@ -21,7 +21,7 @@ from common.errors import (
 )
 from common.policy import bundle as bundles
 from common.request import GraspRequest
-from common.transport.keys import Keys
+from common.transport.keys import Keys, below
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
@@ -266,7 +266,7 @@ def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(serve
 def test_following_a_run_pulls_only_what_is_newer():
     keys, policy = Keys("r"), untrained(CONFIG)
     with MemoryTransport(MemoryHub()) as transport:
-        pull = follow_run(transport, "r")
+        pull = follow_run(transport, "r", "s")
         with pytest.raises(TransportError):
             pull(-1)
 
@@ -274,7 +274,7 @@ def test_following_a_run_pulls_only_what_is_newer():
             current = request.meta["newer_than"] == policy.version
             return Message({}, {"version": policy.version}) if current else policy.to_message()
 
-        transport.serve(keys.weights, weights)
+        transport.serve(below(keys.weights), weights)
         assert pull(-1).version == policy.version
         assert pull(policy.version) is None
 

@@ -1,0 +1,190 @@
+"""One who does not read, asks without end, says nothing, sends too much or is slow holds nobody else up.
+
+The attackers are programs in processes of their own (`services.bench.attackers`).
+"""
+
+import contextlib
+import threading
+import time
+
+import numpy as np
+import psutil
+import pytest
+
+from actors.link import ActorLink
+from common.errors import TransportError
+from common.transport import urls
+from common.transport.keys import Keys, below
+from common.transport.ports import local_url, shifted
+from common.wire.codec import Message, encode
+from common.wire.schema import RolloutForm
+from learner.hub import LearnerHub
+from learner.staleness import StalenessManager
+from services.bench.attacks import attacked, throttled
+from tests.cluster import A, B, D, T, bundle, rollout
+
+pytestmark = pytest.mark.timeout(120)
+KEYS = Keys("r")
+ANSWER = Message({"q_target": np.zeros(5_000, np.float32)})
+
+
+@contextlib.contextmanager
+def policy_server():
+    """Answers of 20 kB, as those to 64 states are."""
+    endpoint = local_url()
+    with urls.listen(endpoint, "server") as transport:
+        transport.serve(below(KEYS.act), lambda key, request: ANSWER, workers=2, depth=64)
+        yield endpoint
+
+
+@contextlib.contextmanager
+def learner(parameters):
+    """A hub with weights of so many float32."""
+    endpoint = local_url()
+    with urls.listen(endpoint, "learner") as transport:
+        hub = LearnerHub(
+            transport, run="r", config_json="{}", run_id="e", schema="s",
+            form=RolloutForm(T, B, D, A, half=True), staleness=StalenessManager(1, 2),
+        )  # fmt: skip
+        hub.publish = lambda version: hub.publish_weights(_weights(version, parameters), version)
+        hub.publish(0)
+        yield endpoint, hub
+
+
+def _weights(version, parameters):
+    made = bundle(version, "e")
+    return Message({**made.arrays, "actor/w": np.full(parameters, version, np.float32)}, made.meta)
+
+
+def _updates(link, hub, count):
+    """So many updates of two rollouts each, with the weights of each pulled in full."""
+    version = hub._staleness.version
+    for _ in range(count):
+        for _ in range(2):
+            ticket = link.acquire_ticket(20)
+            assert link.upload(rollout(T, 0, version), ticket).result(20) == "accepted"
+        assert hub.next_batch(2, 5)
+        version += 1
+        hub.publish(version)
+        deadline = time.monotonic() + 20
+        while (pulled := link.weights(version - 1)) is None or pulled.meta["version"] != version:
+            assert time.monotonic() < deadline, "the weights did not come"
+            time.sleep(0.01)
+        assert (pulled.arrays["actor/w"] == version).all()
+
+
+def test_two_who_leave_their_answers_unread_hold_nobody_up(tmp_path):
+    """With answers that wait for their readers, both workers of the server would stand still for seconds."""
+    query = tmp_path / "query"
+    query.write_bytes(encode(Message()))
+    with (
+        policy_server() as endpoint,
+        urls.connect(endpoint, "client") as client,
+        attacked("unread", endpoint, "r", query, count=2),
+    ):
+        deadline = time.monotonic() + 6.0
+        while time.monotonic() < deadline:
+            client.query(KEYS.act_for("c"), Message(), timeout=1.5)
+            time.sleep(0.01)
+
+
+def test_peers_that_ask_for_weights_without_end_are_put_off():
+    with (
+        learner(900_000) as (endpoint, hub),
+        urls.connect(endpoint, "actor") as transport,
+        ActorLink(transport, "r", "a", request_timeout=20.0) as link,
+        attacked("greedy", endpoint, "r", count=3),
+    ):
+        link.config(10)
+        _updates(link, hub, 20)
+        assert hub._pull_limit.turned_away > 0
+
+
+def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
+    """300 kB/s: the weights take three seconds, in which the other's updates go on."""
+    pulled = []
+
+    def pull(slow):
+        with urls.connect(slow, "actor") as transport, ActorLink(transport, "r", "slow", request_timeout=5.0) as link:
+            link.config(10)
+            pulled.append(link.weights(-1))
+
+    with (
+        learner(225_000) as (endpoint, hub),
+        throttled(endpoint, 300e3) as slow,
+        urls.connect(endpoint, "actor") as transport,
+        ActorLink(transport, "r", "a", request_timeout=20.0) as link,
+    ):
+        link.config(10)
+        thread = threading.Thread(target=pull, args=(slow,))
+        thread.start()
+        for _ in range(20):
+            _updates(link, hub, 1)
+            time.sleep(0.05)
+        thread.join(60)
+    (weights,) = pulled
+    assert (weights.arrays["actor/w"] == weights.meta["version"]).all()
+
+
+def test_three_slow_links_leave_the_weights_to_others():
+    """8 MB at 200 kB/s: forty seconds each, in which answers that wait for their readers would hold up all pulls."""
+
+    def pull(slow, name):
+        with contextlib.suppress(TransportError), urls.connect(slow, "actor") as transport:
+            transport.query(KEYS.weights_for("actor", name), Message(meta={"newer_than": -1}), timeout=60)
+
+    with (
+        learner(2_000_000) as (endpoint, _),
+        throttled(endpoint, 200e3) as slow,
+        urls.connect(endpoint, "actor") as transport,
+    ):
+        for name in "abc":
+            threading.Thread(target=pull, args=(slow, name), daemon=True).start()
+        deadline = time.monotonic() + 6.0
+        while time.monotonic() < deadline:
+            reply = transport.query(KEYS.weights_for("actor", "d"), Message(meta={"newer_than": -1}), timeout=3)
+            assert reply.meta["version"] == 0
+            time.sleep(0.3)
+
+
+@pytest.mark.parametrize("flow", [0, 1])
+def test_silent_connections_keep_nobody_out(flow):
+    """Connections that show nothing for seconds are closed, and hundreds of them are not too many."""
+    with learner(1000) as (endpoint, _), attacked("silent", shifted(endpoint, flow), "r"):
+        time.sleep(1.0)
+        for _ in range(5):
+            with urls.connect(endpoint, "observer", wait=20.0) as transport:
+                assert transport.query(KEYS.status, Message(), timeout=10).meta["run"] == "r"
+
+
+def _grown(honest):
+    """Bytes by which this process grows while it does something 200 times."""
+    process, most = psutil.Process(), 0
+    before = process.memory_info().rss
+    for _ in range(200):
+        honest()
+        most = max(most, process.memory_info().rss - before)
+        time.sleep(0.01)
+    return most
+
+
+def test_what_is_too_long_is_refused_before_it_is_in_memory():
+    """Four times 60 MB at a time: a policy server is sent no more than two."""
+    with policy_server() as endpoint, urls.connect(endpoint, "client") as client:
+        ask = lambda: client.query(KEYS.act_for("c"), Message(), timeout=5)  # noqa: E731
+        ask()
+        with attacked("huge", endpoint, "r"):
+            assert _grown(ask) < 100e6
+
+
+def test_rollouts_that_no_actor_makes_are_refused_before_they_are_in_memory(tmp_path):
+    """A learner knows how long its run's rollouts are."""
+    endpoint, key = local_url(), tmp_path / "key"
+    key.write_text(KEYS.rollout("huge"))
+    with urls.listen(endpoint, "learner", longest_rollout=1 << 20) as transport:
+        taken = []
+        transport.serve(KEYS.rollouts, lambda key, message: taken.append(key) or Message())
+        with urls.connect(endpoint, "actor") as actor, attacked("huge", shifted(endpoint, 1), "r", key):
+            send = lambda: actor.query(KEYS.rollout("a"), rollout(T, 0, 0), timeout=5)  # noqa: E731
+            assert _grown(send) < 100e6
+    assert set(taken) == {KEYS.rollout("a")}
