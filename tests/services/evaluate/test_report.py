@@ -11,8 +11,9 @@ import pytest
 from PIL import Image
 
 from services.cli.report import curves_of
+from services.evaluate.paper import paper_row
 from services.evaluate.report import Commands, Picture, count_causes, write_report
-from services.evaluate.scores import PAPER, Row
+from services.evaluate.scores import Row
 from services.record.channels import JsonChannels
 from services.record.writer import LogWriter
 from services.train.command import untrained
@@ -50,8 +51,8 @@ class Reader(html.parser.HTMLParser):
 def row(constraint, success, low, high):
     errors = {"heading_rad": 0.07, "heading_m": 0.013}
     forces = {f"{name}_{of}": 1.0 for name in ("link_force", "force_sum", "torque_share") for of in ("mean", "p95")}
-    paper = PAPER["human"][constraint]
-    return Row(constraint, "human", "ours", "", 100, 8, success, low, high, None, None, None, errors, forces,
+    paper = paper_row("hands" if constraint == "pose" else "captured", "human", "ours", constraint)
+    return Row(constraint, "human", "ours", "", 100, 8, 8, success, low, high, None, None, None, errors, forces,
                0.0, 5.0, 0.0, paper)  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from common.errors import CongraspError
 from common.task.constraints import CONSTRAINTS
 from services.cli.plot import plot
 from services.evaluate.plots import cells, plot_evaluation
-from services.evaluate.scores import Sample, active_mask, summarise, write_json
+from services.evaluate.scores import Sample, summarise, write_json
 
 TASK = TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))
 METRICS = metric_names(TASK)
@@ -27,10 +27,8 @@ def evaluation(path: pathlib.Path) -> list[dict]:
         for name in METRICS:
             if name.endswith(("_rad", "_m", "_ratio")):
                 values[name] = np.concatenate([np.linspace(0.1, 0.4, 30), np.full(10, 9.0)])
-        for name, bit in active_mask(constraint, TASK).items():
-            values[f"mask_{name}"][:] = bit
         sample = Sample(values, np.zeros((0, 1, 1)), np.zeros((0, 1, 1)))
-        rows.append(summarise(constraint, "human", sample, held_2s=True))
+        rows.append(summarise(constraint, "human", sample, held_2s=True, objects=["box"], paper="captured"))
     write_json(rows, path, {})
     return json.loads(path.read_text())["rows"]
 
