@@ -23,13 +23,12 @@ from common.wire.codec import Message, SharedMessage
 from common.wire.messages import TICKET, RolloutForm, RolloutHeader, validate, validate_bundle, validate_rollout
 from learner.admission import Admission
 from learner.audit import AuditLog
-from learner.deduplication import Sequences
+from learner.deduplication import SequenceTable
 from learner.members import Members
-from learner.rate_limit import DAMAGED, RateLimit, certificate
+from learner.rate_limit import DAMAGED, RateLimit
 from learner.staleness import Owner, StalenessManager
 from learner.write_ahead import Identity, Recovered, WriteAheadLog
 
-_INCARNATIONS = 1024  # whose sequences are kept
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
 _EVENT_SECONDS = 1.0  # between two events of one kind
@@ -90,8 +89,7 @@ class LearnerHub:
         self._name, self._on_event = check_name("learner", name), on_event
         self._changed = threading.Condition()
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
-        self._sequences: collections.OrderedDict[Owner, Sequences] = collections.OrderedDict()
-        self._forgotten_missing = 0
+        self._sequences = SequenceTable()
         self._being_written: set[tuple[Owner, int]] = set()  # accepted, and not acknowledged yet
         self._bundle: SharedMessage | None = None
         self._members = Members()
@@ -105,23 +103,7 @@ class LearnerHub:
         if durable is not None:
             self._restore(durable)
         self._recovered: Recovered | None = self._begin()
-        transport.serve(self.keys.config, self._on_config)
-        charging = self._rate_limit.charging
-        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._turn_away)
-        transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
-        transport.serve(
-            below(self.keys.weights), self._on_weights, workers=4, depth=16, admission=self._turn_away_puller
-        )
-        transport.serve(
-            self.keys.rollouts,
-            charging(self._on_rollout),
-            workers=2,
-            depth=8,
-            on_damage=self._on_damage,
-            admission=self._turn_away,
-        )
-        transport.watch_alive(self.keys.everyone, self._on_alive)
-        transport.declare_alive(self.keys.alive("learner", name, self.session_id))
+        self._serve()
 
     def has_batch(self, count: int, timeout: float) -> bool:
         """Whether `next_batch` would find a batch; waits for it for at most `timeout` seconds, and takes nothing."""
@@ -193,7 +175,6 @@ class LearnerHub:
             now = time.monotonic()
             self._forget_arrivals(now)
             span = min(_RATE_SECONDS, max(1.0, now - self._arrivals[0][0])) if self._arrivals else _RATE_SECONDS
-            missing = self._forgotten_missing + sum(each.missing for each in self._sequences.values())
             roles: list[dict[str, Any]] = []
             arrived = collections.defaultdict[Owner, list[int]](list)
             for _, owner, steps in self._arrivals:
@@ -215,7 +196,10 @@ class LearnerHub:
                 "rates": _rates([steps for *_, steps in self._arrivals], span),
                 "queue": {"length": len(self._queue), "limit": self._limit},
                 "ledger": self._staleness.counters()
-                | {"missing": missing, "turned_away": self._rate_limit.turned_away + self._admission.turned_away},
+                | {
+                    "missing": self._sequences.missing,
+                    "turned_away": self._rate_limit.turned_away + self._admission.turned_away,
+                },
             }
 
     def durable(self) -> dict[str, Any]:
@@ -227,18 +211,11 @@ class LearnerHub:
                     self._write_ahead(header, message)
                 self._log.cover((*header.owner, header.sequence) for header, _ in self._queue)
             waiting = {(header.owner, header.sequence) for header, _ in self._queue}
-            sequences = []
-            for owner, known in self._sequences.items():
-                queued = {sequence for of, sequence in waiting if of == owner}
-                start = min(queued | {known.next})
-                decided = set(range(start, known.next)) | known.ahead
-                sequences.append([*owner, start, sorted(decided - queued), sorted(known.refused), known.skipped])
             return {
                 "run_id": self.run_id,
                 "version": self._staleness.version,
                 "counters": self._staleness.durable(),
-                "forgotten_missing": self._forgotten_missing,
-                "sequences": sequences,
+                **self._sequences.durable(waiting),
             }
 
     def note_saved(self) -> None:
@@ -256,6 +233,27 @@ class LearnerHub:
         if self._log is not None:
             self._log.discard(identities)
 
+    def _serve(self) -> None:
+        """Answers at the run's keys from now on, and shows that the learner is there."""
+        transport = self._transport
+        transport.serve(self.keys.config, self._on_config)
+        charging = self._rate_limit.charging
+        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._turn_away)
+        transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
+        transport.serve(
+            below(self.keys.weights), self._on_weights, workers=4, depth=16, admission=self._turn_away_puller
+        )
+        transport.serve(
+            self.keys.rollouts,
+            charging(self._on_rollout),
+            workers=2,
+            depth=8,
+            on_damage=self._on_damage,
+            admission=self._turn_away,
+        )
+        transport.watch_alive(self.keys.everyone, self._on_alive)
+        transport.declare_alive(self.keys.alive("learner", self._name, self.session_id))
+
     def _begin(self) -> Recovered:
         """Reads what earlier sessions left on disk, and notes that this one begins."""
         staleness, log = self._staleness, self._log
@@ -271,9 +269,7 @@ class LearnerHub:
         if durable["run_id"] != self.run_id:
             raise CongraspError(f"The checkpoint is of run id {durable['run_id']}, not {self.run_id}.")
         self._staleness.restore(durable["counters"], durable["version"])
-        self._forgotten_missing = durable["forgotten_missing"]
-        for actor, incarnation, start, ahead, refused, skipped in durable["sequences"]:
-            self._sequences[actor, incarnation] = Sequences(start, set(ahead), set(refused), skipped)
+        self._sequences.restore(durable)
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1
@@ -342,7 +338,7 @@ class LearnerHub:
         taken: list[Identity] = []
         stale: list[Identity] = []
         for header, message in recovered.rollouts:
-            sequences, identity = self._sequences_of(header.owner), (*header.owner, header.sequence)
+            sequences, identity = self._sequences.of(header.owner), (*header.owner, header.sequence)
             if header.sequence in sequences:  # the checkpoint holds its outcome
                 continue
             verdict = self._staleness.arrive(header.owner, "", header.version, beyond_capacity=True)
@@ -364,7 +360,7 @@ class LearnerHub:
             return self._answer("retry", why="The learner is stopping.")
         if (header.owner, header.sequence) in self._being_written:
             return self._answer("retry", why="It is being written.")
-        sequences = self._sequences_of(header.owner)
+        sequences = self._sequences.of(header.owner)
         if header.sequence in sequences.refused:
             self._staleness.redeem(header.owner, ticket)
             return self._answer("stale", why="It was refused before.")
@@ -395,15 +391,6 @@ class LearnerHub:
 
     def _answer(self, outcome: str, *, why: str = "") -> Message:
         return Message(meta={**self._state(), "outcome": outcome, "why": why, "retry_after": _RETRY_SECONDS})
-
-    def _sequences_of(self, owner: Owner) -> Sequences:
-        sequences = self._sequences.setdefault(owner, Sequences())
-        self._sequences.move_to_end(owner)
-        if len(self._sequences) > _INCARNATIONS:
-            # Whoever has many incarnations displaces his own, so that nobody makes the learner forget another's.
-            mine = (of for of in self._sequences if of != owner and certificate(of[0]) == certificate(owner[0]))
-            self._forgotten_missing += self._sequences.pop(next(mine, next(iter(self._sequences)))).missing
-        return sequences
 
     def _forget_arrivals(self, now: float) -> None:
         while self._arrivals and self._arrivals[0][0] < now - _RATE_SECONDS:
