@@ -114,9 +114,10 @@ class Evaluator:
         """
         with self._worker(sampling_config(self.task, constraints), episodes, traced=keep) as worker:
             self._harvest_references(worker, constraints)
+            stressed = min(episodes, STRESSED) if self._hold == two_seconds(self.task) else 0
             if keep:
                 self._kept |= {constraint: {False: [], True: []} for constraint in constraints}
-            return self._gather(worker, constraints, episodes, progress, keep, min(episodes, STRESSED))
+            return self._gather(worker, constraints, episodes, progress, keep, stressed)
 
     def samples_of_pools(
         self,

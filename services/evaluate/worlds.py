@@ -124,5 +124,6 @@ def evaluation_worker(
 
 def measure(worker: RolloutWorker, task: TaskConfig, objects: Sequence[GraspObject]) -> None:
     """Measures against these objects from now on; episodes that go on after their hold are under `protocols.stress`."""
-    protocol = protocols.stress(task, objects, task.hold_steps_max)
+    hold = task.hold_steps_max
+    protocol = protocols.stress(task, objects, hold) if hold == two_seconds(task) else None
     worker.adjust(protocol=protocol, probe_data=distance_field(objects))
