@@ -88,6 +88,7 @@ def test_other_pools_take_the_place_of_the_first(monkeypatch):
         return len(built)
 
     monkeypatch.setattr("services.evaluate.evaluator.build_bank", build_bank)
+    monkeypatch.setattr("services.evaluate.evaluator.measure", lambda worker, task, objects: worker.measure(objects))
     evaluator = Evaluator(untrained(CONFIG), OBJECTS[:1], seed=5)
     monkeypatch.setattr(evaluator, "_worker", lambda task, episodes: contextlib.nullcontext(worker))
     monkeypatch.setattr(evaluator, "_gather", lambda worker, names, episodes, progress: {"heading": evaluator.objects})
@@ -95,8 +96,11 @@ def test_other_pools_take_the_place_of_the_first(monkeypatch):
     assert list(evaluator.samples_of_pools("heading", pools, 2)) == [OBJECTS[:1], *pools]
     assert built == [(OBJECTS[:1], 5), (OBJECTS[1:2], 6), (OBJECTS[2:3], 7)]
     # The worlds begin anew each time: what was under way belongs to objects that are gone.
-    replace, restart = mock.call.replace_objects, mock.call.restart
-    assert worker.mock_calls == [replace(pools[0], 2), restart(), replace(pools[1], 3), restart()]
+    calls = [
+        (mock.call.replace_objects(pool, bank), mock.call.measure(pool), mock.call.restart())
+        for pool, bank in zip(pools, (2, 3), strict=True)
+    ]
+    assert worker.mock_calls == [*calls[0], *calls[1]]
 
 
 def test_procedural_pools_hold_different_objects_in_equal_numbers():
