@@ -295,10 +295,11 @@ class Evaluator:
         """The episodes of a plan, of which some are kept under a name; the first ones go on after the hold."""
         found: list[Sample] = []
         done = 0
+        most = min(plan.total, STRESSED) if running.measured and self._hold == two_seconds(self.task) else 0
         if keep:
             self._kept[name] = {False: [], True: []}
         for conditions, count in batches(self._hand, self.task, bank, plan, self._seed, running.batch):
-            batch = running.run(conditions, stressed=done < min(plan.total, STRESSED) and running.measured)
+            batch = running.run(conditions, stressed=done < most)
             for i in range(count) if keep else ():
                 kept = self._kept[name][bool(batch.sample.values["held"][i] > 0)]
                 if len(kept) < _KEPT:
