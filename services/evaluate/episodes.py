@@ -24,6 +24,7 @@ from common.policy.bundle import PolicyBundle, mean_action
 from common.task import plausibility
 from common.task.types import Array, Surface
 from common.wire.codec import Message
+from services.evaluate.protocol import two_seconds
 from services.evaluate.scores import Sample
 
 
@@ -150,7 +151,8 @@ class Episodes:
         """Measures against these objects; episodes that go on after their hold are under `protocols.stress`."""
         self._objects = objects
         if self.measured:
-            stress = protocols.stress(self._task, objects, self._hold)
+            lasts = self._hold == two_seconds(self._task)
+            stress = protocols.stress(self._task, objects, self._hold) if lasts else None
             self._worker.adjust(protocol=stress, probe_data=distance_field(objects))
 
     def _message(self, begun: EnvState, trace: Trace, metrics: dict[str, float], episode: int) -> Message:
