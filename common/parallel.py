@@ -16,6 +16,11 @@ _PRELOADED = ["common.objects.procedural", "common.task.constraints"]
 """Imported once by the process that workers are forked from; what else a function needs, its worker imports."""
 
 
+def cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> list[Result]:
     """`map` over processes, in order; in this one if there are few calls or few cores.
 
@@ -41,7 +46,7 @@ def prepare_workers(calls: int) -> None:
 
 def _workers(calls: int) -> int:
     """Processes for so many calls; 0 where they would cost more than they save."""
-    workers = min(len(os.sched_getaffinity(0)), _MOST_WORKERS, calls // (_WORTH_IT // 4))
+    workers = min(cores(), _MOST_WORKERS, calls // (_WORTH_IT // 4))
     return workers if calls >= _WORTH_IT and workers > 1 else 0
 
 

@@ -3,7 +3,6 @@
 import concurrent.futures
 import functools
 import itertools
-import os
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -161,8 +160,3 @@ def _compiled_loop(worker: RolloutWorker) -> Callable[[], object]:
 
     run()
     return run
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import pathlib
 import platform
 import shutil
@@ -18,6 +17,7 @@ from rich.table import Table
 
 from common.config import RunConfig
 from common.errors import CongraspError, TransportError
+from common.parallel import cores
 from learner.run_directory import create_run
 from services.train.processes import engine_of, leave_gpus_to, train
 
@@ -130,7 +130,7 @@ def bench_scaling(
         console.print(f"{count} rank(s): at most {deadline:.0f} s …")
         stages.append(_measure(config, count, actors, gpus, seconds, deadline, stages[0] if stages else None, console))
         result = {
-            "machine": {"host": platform.node(), "cores": os.cpu_count(), "jax": jax.__version__, "gpus": gpus},
+            "machine": {"host": platform.node(), "cores": cores(), "jax": jax.__version__, "gpus": gpus},
             "config": dataclasses.asdict(config),
             "actors": actors,
             "stages": [dataclasses.asdict(stage) for stage in stages],

@@ -34,10 +34,9 @@ def actor(
       watch: How it is watched.
       certs: Folder of an actor's certificate (congrasp certs), whose number its name on the wire begins with.
     """
-    import os
-
     from actors.process import run_actor
     from common.journal import Journal
+    from common.parallel import cores
     from common.transport import urls
     from common.transport.keys import process_name
     from services.ops.logs import log
@@ -63,7 +62,7 @@ def actor(
             actor=name,
             stop=stop,
             physics=physics,
-            threads=threads or os.cpu_count() or 1,
+            threads=threads or cores(),
             patience=patience,
             on_rollout=report,
             journal=Journal(audit, lambda text: log("error", text)) if audit else None,

@@ -16,9 +16,10 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
       repeats: Measurements of each, alternating; medians and their ratio are printed, and the ratio of the best.
       engines: Engines to measure; those that the machine is made for if none is named.
     """
+    from common.parallel import cores
     from services.bench import physics as bench
 
-    bench.bench_physics(environments, threads or bench.cores(), repeats, list(engines) or bench.engines())  # type: ignore[arg-type]
+    bench.bench_physics(environments, threads or cores(), repeats, list(engines) or bench.engines())  # type: ignore[arg-type]
     return 0
 
 
@@ -220,8 +221,8 @@ def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int 
       threads: Threads of the native engine; 0 takes all cores.
       repeats: Measurements of each, alternating; medians and their ratio are printed.
     """
+    from common.parallel import cores
     from services.bench.measures import bench_measures
-    from services.bench.physics import cores
 
     bench_measures(engine, environments, threads or cores(), repeats)
     return 0

@@ -84,8 +84,7 @@ def _references(
     hand: "Hand", policy: pathlib.Path | None, objects: "list[GraspObject]", seed: int, track: "Track"
 ) -> Any:
     """Constraints with references from a policy's grasps; prints how many there are."""
-    import os
-
+    from common.parallel import cores
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file, reference_file
     from services.evaluate.evaluator import Evaluator
@@ -96,7 +95,7 @@ def _references(
             f"The policy is for the hand '{bundle.spec.hand_name}', not '{hand.name}'.",
             f"Set --hand {bundle.spec.hand_name}.",
         )
-    evaluator = Evaluator(bundle, objects, threads=os.cpu_count() or 1, seed=seed)
+    evaluator = Evaluator(bundle, objects, threads=cores(), seed=seed)
     advance = track("Grasping: reference poses", None)
     made = evaluator.references_of(bundle, lambda done, of: advance(done))
     whole = made.grasps[:, 0]

@@ -46,17 +46,15 @@ def evaluate(
 
     An episode has 50 control steps with the table and 2 s without it. Success is counted after the paper's 25 steps
     without the table, and again after the 2 s (held). Rates come with 95 % Wilson intervals; errors and forces are
-    those of successful episodes in the paper's window of 25 steps. The policy acts by its mean. Every object has
-    the same number of episodes in a row, which is the same whatever other rows are asked for. Reference poses and
-    trajectories are grasps of a reference policy, which never had any, as the paper makes them for its hands: 20 an
-    object, of which the last fifth is evaluated. They are kept in ~/.cache/congrasp for the next evaluation.
+    those of successful episodes in the paper's window of 25 steps. The policy acts by its mean. Every object has the
+    same number of episodes in a row, which is the same whatever other rows are asked for. Reference poses and
+    trajectories are grasps of a reference policy, which never had any; the last fifth of each object's 20 is evaluated.
 
     Args:
       policy: A policy file (policy.safetensors of a run); by default a pretrained one.
-      table: single: one constraint a row; composed: two, pose and trajectory each for itself, then aligned pairs;
-        cross: the rows of the paper's cross-dataset table; objects: the heading alone on many objects, by size, mass
-        and family; noise: poses and trajectories with errors, as captured ones have; all: everything. Several may be
-        named.
+      table: single: one constraint a row; composed: two; cross: the rows of the paper's cross-dataset table; objects:
+        the heading alone on many objects, by size, mass and family; noise: poses and trajectories with errors, as
+        captured ones have; all: everything. Several may be named.
       objects: Objects to grasp: a folder as 'congrasp objects import' takes it, or one that it made. By default
         procedural objects of seeds that training never uses.
       constraints: Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import'; its
@@ -70,9 +68,8 @@ def evaluate(
       json: Also write the rows to this file.
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
       hand: Whose pretrained policy.
-      method: Which method this is: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp,
-        no-dynamic-center, no-feedforward, two-phase or single-stage. A policy of another is refused; by default the
-        policy says.
+      method: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center,
+        no-feedforward, two-phase or single-stage. A policy of another is refused; by default the policy says.
       by: object: also print the rates of each object; --json always has them.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.
@@ -80,7 +77,7 @@ def evaluate(
     from actors.physics import resolve_physics
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
-    from common.task.methods import evaluated_as, get_method
+    from common.task.methods import evaluated_as
     from services.assets.objects.named import objects_of
     from services.cli.console import at_least, tracked
     from services.evaluate.protocol import objects_label
@@ -88,8 +85,7 @@ def evaluate(
 
     at_least(1, episodes=episodes)
     at_least(0, pool=pool, batch=batch, seed=seed)
-    if not 0.05 <= friction <= 10.0:
-        raise CongraspError(f"--friction is {friction:g}.", "It must lie between 0.05 and 10.")
+    _check_friction(friction)
     policy = policy_file(policy, hand)
     loaded = bundles.load(policy)
     if method is not None:
@@ -97,20 +93,33 @@ def evaluate(
     engine = resolve_physics(physics)
     settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
     with tracked() as track:
-        given, bank = objects_of(objects, track=track) if objects else None, None
+        given, bank, paper = objects_of(objects, track=track) if objects else None, None, "hands"
         if constraints is not None:
-            given, bank, settings["paper"] = _captured(constraints, split, given, objects)
-        found = _evaluate(loaded, given, bank, table, episodes, pool, settings, track, keep=pictures is not None)
+            given, bank, paper = _captured(constraints, split, given, objects)
+        found = _evaluate(loaded, given, bank, paper, table, episodes, pool, settings, track, keep=pictures is not None)
     source = objects_label(loaded, objects)
-    what = f"{policy.name}, version {loaded.version}"
-    if loaded.task.method != "ours":
-        what = f"method {loaded.task.method}" + (f", {what}" if get_method(loaded.task.method).learns else "")
-    _show(found, f"{what}, on {source}, {engine}, friction {friction:g}", by == "object")
+    _show(found, f"{_title(loaded, policy)}, on {source}, {engine}, friction {friction:g}", by == "object")
     if json is not None:
         write_json(found.rows, json, _about(policy, loaded, objects, source, constraints, split) | settings)
     if pictures is not None:
         _draw(found, loaded, episodes, pictures)
     return 0
+
+
+def _check_friction(friction: float) -> None:
+    """Raises a CongraspError for a friction that nothing has."""
+    if not 0.05 <= friction <= 10.0:
+        raise CongraspError(f"--friction is {friction:g}.", "It must lie between 0.05 and 10.")
+
+
+def _title(loaded: Any, policy: pathlib.Path) -> str:
+    """What was evaluated: a policy, or a method that has none."""
+    from common.task.methods import get_method
+
+    method, what = loaded.task.method, f"{policy.name}, version {loaded.version}"
+    if method == "ours":
+        return what
+    return f"method {method}, {what}" if get_method(method).learns else f"method {method}"
 
 
 class _Found(NamedTuple):
@@ -134,6 +143,7 @@ def _evaluate(
     loaded: Any,
     given: "list[GraspObject] | None",
     bank: "ConstraintBank | None",
+    paper: str,
     table: tuple[Table, ...],
     episodes: int,
     pool: int,
@@ -161,7 +171,7 @@ def _evaluate(
     left_out: list[CongraspError] = []
     evaluator: Any = None
     if names or "noise" in wanted:
-        evaluator = _evaluator(loaded, given, bank, pool or _POOL, settings, track)
+        evaluator = _evaluator(loaded, given, bank, paper, pool or _POOL, settings, track)
     source = ""
     if "noise" in wanted or any(from_references(name) for name in names):
         source = _references(evaluator, track)
@@ -272,15 +282,15 @@ def _evaluator(
     bundle: Any,
     given: "list[GraspObject] | None",
     bank: "ConstraintBank | None",
+    paper: str,
     pool: int,
     settings: dict[str, Any],
     track: "Track",
 ) -> Any:
     """An evaluator of given objects, or of held-out procedural ones."""
-    import os
-
     from common.config import ObjectsConfig
     from common.objects.pool import HELD_OUT_SEED, load_pool
+    from common.parallel import cores
     from services.evaluate.evaluator import Evaluator
     from services.evaluate.protocol import two_seconds
 
@@ -288,9 +298,10 @@ def _evaluator(
     return Evaluator(
         bundle,
         given or load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED)),
-        threads=os.cpu_count() or 1,
+        threads=cores(),
         hold_steps=two_seconds(bundle.task),
         bank=bank,
+        paper=paper,
         **settings,
     )
 
@@ -304,16 +315,15 @@ def _object_rows(
     track: "Track",
 ) -> list[Any]:
     """Rows of the heading on many objects."""
-    import os
-
     from common.objects.pool import HELD_OUT_SEED
+    from common.parallel import cores
     from services.evaluate.unseen import POOL, evaluate_objects, procedural_pools
 
     pools = iter([given]) if given else procedural_pools(pool, HELD_OUT_SEED)
     number = 1 if given else -(-pool // POOL)
     each = -(-episodes // number)
     advance = track("Episodes on many objects", number * each)
-    return evaluate_objects(bundle, pools, each, threads=os.cpu_count() or 1, progress=advance, **settings)
+    return evaluate_objects(bundle, pools, each, threads=cores(), progress=advance, **settings)
 
 
 COMMAND = evaluate

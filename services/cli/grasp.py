@@ -54,7 +54,7 @@ def grasp(
     then small errors, a quiet object and gentle forces. Interrupted runs resume where they stopped.
 
     Args:
-      objects: Meshes (STL, OBJ, PLY, GLB), object files, or folders of them.
+      objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, or FAMILY:SEED of the generator (mug:7).
       out: Folder for the results.
       constraints: What the grasp must keep to.
       video: Also write grasp.mp4, at half speed, with the constraints drawn.

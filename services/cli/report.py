@@ -43,11 +43,10 @@ def report(
       seed: Seed of constraints and episodes.
       hand: Whose pretrained policy.
     """
-    import os
-
     from actors.physics import resolve_physics
     from common.config import ObjectsConfig
     from common.objects.pool import HELD_OUT_SEED, load_pool
+    from common.parallel import cores
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
     from services.assets.objects.named import objects_of
@@ -73,7 +72,7 @@ def report(
             objects_of(objects, track=track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
         )
         track("Making constraints", None)
-        held, threads = two_seconds(policy.task), os.cpu_count() or 1
+        held, threads = two_seconds(policy.task), cores()
         evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)
         names, left_out = evaluator.allowed(names)
         rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)

@@ -1,6 +1,5 @@
 """One picture of what a policy can do: a grasp under each constraint that it knows."""
 
-import os
 import pathlib
 from collections.abc import Callable
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from common.config import ObjectsConfig
 from common.objects.pool import HELD_OUT_SEED, load_pool
+from common.parallel import cores
 from common.policy.bundle import PolicyBundle
 from services.evaluate.evaluator import Evaluator
 from services.viz.render import episode_strip
@@ -31,7 +31,7 @@ def showcase(
       Whether the grasp succeeded, by the name of the constraint.
     """
     objects = load_pool(ObjectsConfig(count=_OBJECTS, seed=HELD_OUT_SEED))
-    evaluator = Evaluator(policy, objects, threads=os.cpu_count() or 1)
+    evaluator = Evaluator(policy, objects, threads=cores())
     images: list[np.ndarray] = []
     labels: list[str] = []
     successes: dict[str, bool] = {}

@@ -18,6 +18,7 @@ from common.errors import ContradictionError
 from common.hands import get_hand
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
+from common.parallel import cores
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
 from common.policy.pretrained import policy_file
@@ -118,7 +119,7 @@ class Grasper:
         self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
         self._compiled = False
         hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
-        self._attempts = Attempts(self.hand, self.task, policy, hold=hold, threads=threads or os.cpu_count() or 1)
+        self._attempts = Attempts(self.hand, self.task, policy, hold=hold, threads=threads or cores())
 
     def grasp(
         self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None

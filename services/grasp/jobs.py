@@ -132,7 +132,9 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
 
 
 def _content(at: ObjectAt) -> str:
-    """A hash of an object's files."""
+    """A hash of an object's files, or what the generator makes it of."""
+    if not at.source and not at.path.exists():
+        return str(at.path)
     files = [file.path for file in at.source.files()] if at.source else [at.path]
     return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
 

@@ -17,6 +17,7 @@ from common.config import MetricWriter, ObjectsConfig, RunConfig
 from common.engines import ENGINES, PhysicsName
 from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
+from common.parallel import cores
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.pretrained import pretrained_file
@@ -312,9 +313,7 @@ def _evaluator(policy: PolicyBundle, config: RunConfig, seed: int, batch: int) -
         if not config.objects.folder
         else config.objects
     )
-    return Evaluator(
-        policy, objects, physics="native", batch=batch, threads=os.cpu_count() or 1, seed=seed, task=config.task
-    )
+    return Evaluator(policy, objects, physics="native", batch=batch, threads=cores(), seed=seed, task=config.task)
 
 
 def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, when: str) -> list[Row]:

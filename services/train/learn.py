@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import os
 import pathlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from actors.process import run_actor
 from common.config import MetricWriter, RunConfig
 from common.engines import PhysicsName
-from common.parallel import prepare_workers
+from common.parallel import cores, prepare_workers
 from common.transport import urls
 from common.transport.base import Transport
 from common.transport.pair import PairTransport
@@ -105,7 +104,7 @@ def _actor_thread(
                     actor=name,
                     stop=ended,
                     physics=physics,
-                    threads=os.cpu_count() or 1,
+                    threads=cores(),
                     patience=ROUND_SECONDS,
                 )
         except BaseException as error:

@@ -18,6 +18,7 @@ from common.config import MetricWriter, RunConfig
 from common.engines import PhysicsName
 from common.errors import CongraspError, TransportError
 from common.journal import AUDIT
+from common.parallel import cores
 from common.transport import urls
 from common.transport.base import Transport
 from common.transport.keys import Keys
@@ -151,7 +152,7 @@ def _actors(
     run_dir: pathlib.Path, run: str, connect: Sequence[str], *, ranks: int, actors: int, physics: PhysicsName
 ) -> list[Child]:
     """The actor processes of all ranks; `connect` is rank 0's URL and the options that go with it."""
-    threads = max(1, (os.cpu_count() or 1) // max(1, ranks * actors))
+    threads = max(1, cores() // max(1, ranks * actors))
     found = []
     for number in range(ranks * actors):
         name = f"actor-{number}"

@@ -1,6 +1,5 @@
 """Pictures and videos of recorded episodes."""
 
-import os
 import pathlib
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from common.hands import known_hand
 from common.hands.spec import Hand
+from common.parallel import cores
 from common.wire.codec import Message
 from services.record.goals import active_blocks
 from services.record.palette import HEADING, OBJECT, SKIN, WAYPOINT
@@ -140,7 +140,7 @@ def render_episode_frames(
     """
     steps = list(steps)
     seen_from = camera or best_camera(episode, steps, size[0] / size[1])
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         yield from pool.map(lambda step: render_scene(episode_shapes(episode, step), seen_from, size), steps)
 
 

@@ -20,6 +20,7 @@ from common.objects.procedural import MASS_RANGE
 from common.objects.resting import rest_poses
 from common.objects.spec import GraspObject, Piece
 from common.objects.surface import halves, mass_properties, sample_mesh
+from common.parallel import cores
 from services.assets.objects import decompose, repair
 from services.assets.objects.fidelity import Fidelity, fidelity
 from services.assets.objects.options import ImportOptions, check_options
@@ -81,7 +82,7 @@ def import_sources(
                 except Exception as error:  # raised in the caller's thread
                     done.put((i, error))
 
-    for _ in range(min(len(sources), len(os.sched_getaffinity(0)))):
+    for _ in range(min(len(sources), cores())):
         threading.Thread(target=work, daemon=True).start()
     meshes = max((len(source.visuals) for source in sources), default=0)
     patience = meshes * (options.time_limit + decompose.FALLBACK_LIMIT) + _PATIENCE

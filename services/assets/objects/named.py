@@ -23,7 +23,7 @@ class ObjectAt(NamedTuple):
     name: str
     path: pathlib.Path
     source: Source | None
-    """Its meshes; None for an object file."""
+    """Its meshes; None for an object file, and for an object of the generator."""
 
     def load(self, options: ImportOptions = _METRES_OR_ASK) -> GraspObject:
         """The object; an object file is taken as it is.
@@ -31,15 +31,21 @@ class ObjectAt(NamedTuple):
         Raises:
           CongraspError: it cannot be read or imported.
         """
-        return import_source(self.source, options) if self.source else store.load(self.path)
+        if self.source:
+            return import_source(self.source, options)
+        return _generated(self.path) or store.load(self.path)
 
 
 def objects_at(path: pathlib.Path) -> list[ObjectAt]:
     """What a path holds: an object file, the object files of a folder, or else meshes (see `find_sources`).
 
+    FAMILY:SEED, such as mug:7, is an object of the generator, where no file has that name.
+
     Raises:
       CongraspError: there is nothing of the kind.
     """
+    if made := _generated(path):
+        return [ObjectAt(made.name, path, None)]
     files = [path] if path.suffix == store.SUFFIX else sorted(path.glob(f"*{store.SUFFIX}"))
     if files:
         return [ObjectAt(file.stem, file, None) for file in files]
@@ -99,9 +105,8 @@ def find_object(text: str, folder: str = "objects") -> GraspObject:
     path = pathlib.Path(text)
     if path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or path.is_dir():
         return one_object(path)
-    family, colon, seed = text.partition(":")
-    if colon and seed.isdigit():
-        return generate(int(seed), family)
+    if made := _generated(path):
+        return made
     catalogue = store.Catalogue(folder)
     if not catalogue.path(text).is_file():
         raise CongraspError(
@@ -109,3 +114,9 @@ def find_object(text: str, folder: str = "objects") -> GraspObject:
             "Name an object of the folder, an object file, a mesh, or FAMILY:SEED such as mug:7.",
         )
     return catalogue.get(text)
+
+
+def _generated(path: pathlib.Path) -> GraspObject | None:
+    """The object of the generator that FAMILY:SEED means; None for any other text."""
+    family, colon, seed = str(path).partition(":")
+    return generate(int(seed), family) if colon and seed.isdigit() and not path.exists() else None

@@ -1,7 +1,6 @@
 """Grasps of a policy as the studio asks for them: exactly as drawn, and close to it where that fails."""
 
 import dataclasses
-import os
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from common.errors import CongraspError, TransportError
 from common.hands import get_hand
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
+from common.parallel import cores
 from common.request import GraspRequest
 from common.task.constraints import known, require_known
 from common.wire.codec import Message
@@ -54,7 +54,7 @@ class PolicyGrasping:
         self.hand = get_hand(first.spec.hand)
         self.task = dataclasses.replace(first.task, end_when_fallen=False)
         hold = max(self.task.hold_steps, round(HOLD_SECONDS / self.task.control_dt))
-        self._attempts = Attempts(self.hand, self.task, first, hold=hold, threads=threads or os.cpu_count() or 1)
+        self._attempts = Attempts(self.hand, self.task, first, hold=hold, threads=threads or cores())
         self._compiled = False
 
     def newest(self) -> dict[str, Any]:

@@ -1,0 +1,34 @@
+"""Objects that a user points to."""
+
+import pathlib
+
+import pytest
+
+from common.errors import CongraspError
+from common.objects.procedural import generate
+from common.objects.store import digest
+from services.assets.objects.named import find_object, objects_at
+
+
+def test_a_family_and_a_seed_name_an_object_wherever_paths_do():
+    (found,) = objects_at(pathlib.Path("mug:7"))
+    assert found.name == "mug-7" and digest(found.load()) == digest(find_object("mug:7")) == digest(generate(7, "mug"))
+
+
+@pytest.mark.parametrize("text", ["mug:", ":7", "mug:x", "nothing.obj"])
+def test_other_text_is_a_path(tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CongraspError):
+        objects_at(pathlib.Path(text))
+
+
+def test_a_family_that_does_not_exist_is_named():
+    with pytest.raises(CongraspError, match="mugg"):
+        objects_at(pathlib.Path("mugg:7"))
+
+
+def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("mug:7").mkdir()
+    with pytest.raises(CongraspError):  # an empty folder
+        objects_at(pathlib.Path("mug:7"))
