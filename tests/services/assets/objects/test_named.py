@@ -12,7 +12,7 @@ from services.assets.objects.named import find_object, objects_at
 
 def test_a_family_and_a_seed_name_an_object_wherever_paths_do():
     (found,) = objects_at(pathlib.Path("mug:7"))
-    assert found.name == "mug-7" and digest(found.load()) == digest(find_object("mug:7")) == digest(generate(7, "mug"))
+    assert found.name == "mug_7" and digest(found.load()) == digest(find_object("mug:7")) == digest(generate(7, "mug"))
 
 
 @pytest.mark.parametrize("text", ["mug:", ":7", "mug:x", "nothing.obj"])
