@@ -179,8 +179,6 @@ def _prepare_environment() -> None:
     start processes, out; what the user set stays."""
     cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "jax"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
-    # Small programs too: starting up compiles dozens of them.
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("MUJOCO_GL", "disable")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
