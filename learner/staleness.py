@@ -181,8 +181,8 @@ class StalenessManager:
     def arrive(self, owner: Owner, ticket_id: str, version: int, *, beyond_capacity: bool = False) -> Verdict:
         """Decides about a valid rollout that arrived for the first time.
 
-        Its ticket ends unless the verdict is `full`: it has none (any more), and nothing more may come in. It may come
-        again later.
+        Its ticket ends unless the verdict is `full`: neither it nor its owner has one (any more), and nothing more may
+        come in. It may come again later.
 
         Args:
           owner: who made it.
@@ -196,7 +196,11 @@ class StalenessManager:
                 return "stale"
             self._expire()
             if (owner, ticket_id) not in self._tickets and self.capacity <= 0 and not beyond_capacity:
-                return "full"
+                # Perhaps its ticket is of a session before: one of its owner's present ones does as well. Otherwise an
+                # actor with one upload at a time would hold the place that its own rollout waits for.
+                ticket_id = next((other for of, other in self._tickets if of == owner), "")
+                if not ticket_id:
+                    return "full"
             if ticket := self._tickets.get((owner, ticket_id)) or self._expired.pop((owner, ticket_id), None):
                 self._budget.deliver(owner[0], self._clock() - ticket.granted)
             self.redeem(owner, ticket_id)

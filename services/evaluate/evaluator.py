@@ -222,8 +222,8 @@ class Evaluator:
         samples = self.samples(names, episodes, progress, keep=keep)
         return [self.row(name, sample) for name, sample in samples.items()]
 
-    def row(self, name: str, sample: Sample, group: str = "") -> Row:
-        """A row of episodes of this evaluator's protocol."""
+    def row(self, name: str, sample: Sample, group: str = "", objects: Sequence[str] = ()) -> Row:
+        """A row of episodes of this evaluator's protocol, on its own objects or on those of these names."""
         return summarise(
             name,
             self._hand.name,
@@ -232,7 +232,7 @@ class Evaluator:
             group=group,
             method=self.task.method,
             paper=self.paper,
-            objects=[obj.name for obj in self.objects],
+            objects=objects or [obj.name for obj in self.objects],
         )
 
     def draws(self, name: str, episodes: int, count: int) -> list[Row]:

@@ -114,9 +114,9 @@ def _summary(rows: Sequence[Row]) -> str:
 
 def _compared(row: Row) -> tuple[str, ...]:
     """A row's cells: rates, then errors, each followed by the paper's."""
-    name, episodes, success, held, errors, _ = rate_cells(row)
+    name, episodes, objects, success, held, errors, _ = rate_cells(row)
     rate, paper_errors = paper_cells(row)
-    return name, episodes, success, rate, held, errors, paper_errors
+    return name, episodes, objects, success, rate, held, errors, paper_errors
 
 
 def _verdict(row: Row) -> str:

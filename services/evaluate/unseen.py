@@ -78,6 +78,7 @@ def evaluate_objects(
     )
     samples: list[Sample] = []
     traits: list[tuple[float, float, str]] = []
+    names: list[str] = []
 
     def report(done: int) -> None:
         """Adds the episodes of earlier pools."""
@@ -87,14 +88,15 @@ def evaluate_objects(
         sample.values["object_index"] = sample.values["object_index"] + len(traits)
         samples.append(sample)
         traits += [_traits(obj) for obj in evaluator.objects]
+        names += [obj.name for obj in evaluator.objects]
     whole = joined(samples)
     index = whole.values["object_index"].astype(int)
     sizes, masses, families = (np.array(column) for column in zip(*traits, strict=True))
-    rows = [evaluator.row("heading", whole)]
+    rows = [evaluator.row("heading", whole, objects=names)]
     for label, members in object_groups(sizes, masses, families):
         chosen = members[index]
         if chosen.any():
-            rows.append(evaluator.row("heading", whole.where(chosen), label))
+            rows.append(evaluator.row("heading", whole.where(chosen), label, names))
     return rows
 
 

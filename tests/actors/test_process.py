@@ -10,6 +10,7 @@ import pytest
 from actors import process
 from actors.env import episode_fields
 from actors.rollout import Rollout, Trace
+from actors.training_set import TrainingSet
 from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
 from common.errors import CongraspError
 from common.hands import get_hand
@@ -101,8 +102,8 @@ def heard(monkeypatch):
     def run(rollout: Rollout):
         monkeypatch.setattr(InventedWorker, "rollout", rollout, raising=False)
         monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
-        monkeypatch.setattr(process, "build_bank", lambda *args: None)
-        monkeypatch.setattr(process, "load_pool", lambda *args: [procedural.generate(0, "box")])
+        found = TrainingSet([procedural.generate(0, "box")], None)
+        monkeypatch.setattr(process, "training_set", lambda *args: found)
         broker, stop = MemoryHub(), threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
             logs = server.subscribe(Keys("t").logs, depth=100)

@@ -39,7 +39,7 @@ def test_a_folder_takes_the_place_of_procedural_objects_and_others_may_stand_bes
     assert [obj.name for obj in training_set(HAND, _run(), 0).objects] == [
         obj.name for obj in procedural.generate_many(3, 0)
     ]
-    assert [obj.name for obj in training_set(HAND, _run(folder=folders[0]), 0).objects] == ["box-0", "mug-7"]
+    assert [obj.name for obj in training_set(HAND, _run(folder=folders[0]), 0).objects] == ["box_0", "mug_7"]
     mixed = training_set(HAND, _run(folder=folders[0], procedural=4, folder_share=0.75), 0)
     assert len(mixed.objects) == 6 and len(mixed.bank.points) == 6
     np.testing.assert_allclose(mixed.bank.weight, [0.375] * 2 + [0.0625] * 4)
@@ -49,7 +49,7 @@ def test_constraint_sets_keep_their_split_and_their_references(folders):
     """Grasps of the policy in training replace references of its procedural objects, never captured ones."""
     objects, sets = folders
     found = training_set(HAND, _run(folder=objects, constraints=sets, procedural=1), 0)
-    assert found.objects[0].name == "mug-7" and len(found.objects) == 2
+    assert found.objects[0].name == "mug_7" and len(found.objects) == 2
     assert np.asarray(found.bank.renewable).tolist() == [False, True]
     apart = [
         np.asarray(training_set(HAND, _run(folder=objects, constraints=sets, split=split), 0).bank.pose_valid)
@@ -89,7 +89,7 @@ def test_objects_of_different_sizes_stack_and_come_apart_again(folders):
         np.testing.assert_array_equal(a, b)
     first = rows[0]._replace(
         pose_valid=rows[0].pose_valid[:, :, :3],
-        **{name: getattr(rows[0], name)[:, :3] for name in bank._fields if name.startswith(("pose_q", "pose_p"))},
+        **{name: getattr(rows[0], name)[:, :3] for name in bank._fields if name in ("pose_q", "pose_position")},
         pose_quaternion=rows[0].pose_quaternion[:, :3],
         trajectory_position=rows[0].trajectory_position[:, :3],
         trajectory_quaternion=rows[0].trajectory_quaternion[:, :3],

@@ -31,6 +31,8 @@ def test_what_is_shipped_is_installed_and_can_be_loaded():
     patterns = [pathlib.Path("common/policy", pattern) for pattern in data["common.policy"]]
     assert [module._FOLDER.relative_to(ROOT) / "*.safetensors"] == patterns
     assert pretrained_hands() == ["human", "allegro", "sharpa"]
-    assert {path.stem for path in module._FOLDER.glob("*.safetensors")} == set(pretrained_hands())
+    assert {path.stem for path in module._FOLDER.glob("*.safetensors")} == {
+        f"{hand}{kind}" for hand in pretrained_hands() for kind in ("", "-reference")
+    }
     for hand in pretrained_hands():
         assert bundles.load(policy_file(None, hand)).spec.hand == hand

@@ -208,7 +208,7 @@ def served(endpoint, folder):
         hub.publish_weights(bundle(0, "e"), 0)
         transport.serve(KEYS.act, act, workers=2, depth=64)
         transport.serve(KEYS.health, lambda key, request: Message(meta={"ready": True}))
-        with Recorder(transport, "chaos", folder, warn=lambda text: None, max_bytes=4 << 20) as recorder:
+        with Recorder(transport, "chaos", folder, warn=lambda text: None) as recorder:
             yield hub, recorder
 
 

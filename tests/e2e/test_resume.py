@@ -33,7 +33,9 @@ def rollout(number, bundle):
     """The same whatever policy is asked for it."""
     rng = np.random.default_rng(number)
     size = sum(width for _, width in bundle.meta["layout"])
-    observation = rng.normal(size=(STEPS + 1, WORLDS, size)).astype(np.float16)
+    observation = rng.uniform(-1.0, 1.0, (STEPS + 1, WORLDS, size)).astype(
+        np.float16
+    )  # what every entry of a task can be
     arrays = {
         "observation": observation[:-1],
         "last_observation": observation[-1],
@@ -51,7 +53,7 @@ def feed(hub):
     keys, known, transport = Keys(RUN.name), None, MemoryTransport(hub)
     while True:
         try:
-            bundle = transport.query(keys.weights, Message(meta={"newer_than": -1}), timeout=5)
+            bundle = transport.query(keys.weights_for("actor", "a"), Message(meta={"newer_than": -1}), timeout=5)
             if not bundle.arrays or bundle.meta["version"] == known:
                 time.sleep(0.005)
                 continue

@@ -234,7 +234,7 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     assert "Rank 0 ended. Rank 1 cannot go on alone: start all ranks with --resume." in words
 
     kept = int((job.run_dir / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
-    assert kept >= 4 and kept % CONFIG.checkpoint_every == 0
+    assert kept >= 5  # the first update after a resume has a checkpoint of its own
     job.start(kept + 3, "resume")
     first, second = job.finish()
     steps = 2 * CONFIG.ppo.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments

@@ -92,6 +92,16 @@ def test_tickets_return():
     assert (counters["granted"], counters["returned"], counters["expired"]) == (4, 3, 1)
 
 
+def test_a_rollout_of_an_earlier_session_comes_in_under_a_present_ticket_of_its_owner():
+    """An actor with one upload at a time would wait for the very place that its next ticket holds."""
+    staleness = manager(batch=1, max_staleness=0)  # room for 1
+    assert staleness.grant(A, "new")
+    assert staleness.arrive(B, "old", 0) == "full"
+    assert staleness.arrive(A, "old", 0) == "accepted"
+    assert staleness.counters()["redeemed"] == 1
+    assert staleness.arrive(A, "new", 0) == "full"  # until the next version
+
+
 def test_rollout_without_a_ticket_comes_in_only_where_there_is_room():
     staleness = manager(batch=1)  # room for 2
     assert staleness.arrive(A, "lost", 0) == "accepted"
@@ -193,8 +203,11 @@ class Admission(RuleBasedStateMachine):
         if not 0 <= self.staleness.version - version <= self.eta:
             assert verdict == "stale"
             self.fates["stale"] += 1
-        elif must_fit or capacity > 0:
+        elif must_fit or capacity > 0 or (mine := [held for held in self.tickets if held[0] == key[0]]):
             assert verdict == "accepted"
+            if not must_fit and capacity <= 0:  # under the oldest of its owner's tickets
+                del self.tickets[mine[0]]
+                must_fit = True
             self.delivered += [key[0]] if must_fit else []
             self.fates["accepted"] += 1
             self.queue.append(version)

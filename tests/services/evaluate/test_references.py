@@ -52,10 +52,10 @@ def test_tables_and_training_share_no_reference(count):
 def test_objects_that_the_policy_cannot_grasp_keep_geometric_references(bank, policy):
     bank = bank._replace(rest=np.repeat(np.asarray(bank.rest)[:, :1], bank.rest.shape[1], 1))
     valid = np.asarray(bank.pose_valid)
-    good = int(np.flatnonzero(valid[0, 0].any(0))[0])
-    own = Poses(*(np.asarray(field)[0, 0, good] for field in (bank.pose_q, bank.pose_position, bank.pose_quaternion)))
+    good = int(np.flatnonzero(valid[0, 0, 0])[0])
+    low = Poses(*(np.asarray(field)[0, 0, good] for field in (bank.pose_q, bank.pose_position, bank.pose_quaternion)))
     down = [Rotation.from_quat(rest[3:], scalar_first=True).inv().apply([0, 0, -1.0]) for rest in bank.rest[:, 0]]
-    below = [own._replace(position=own.position + way.astype(np.float32)) for way in down]  # the table is in the way
+    own, *below = (low._replace(position=low.position + way.astype(np.float32)) for way in (-down[0], *down))
     made = references._filled(policy, TASK, bank, [[[own, below[0], own], []], [[below[1]], []]])
     np.testing.assert_array_equal(made.grasps, [[2, 0], [0, 0]])
     np.testing.assert_array_equal(made.bank.pose_q[0, 0], np.tile(own.q, (POSES, 1)))

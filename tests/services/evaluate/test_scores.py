@@ -137,14 +137,14 @@ def test_objects_are_grouped_by_terciles_and_family():
 
 
 def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
-    rows = [
-        summarise(name, "human", _sample([1, 0], [1, 0]), held_2s=True) for names in TABLES.values() for name in names
-    ]
+    names = dict.fromkeys(name for names in TABLES.values() for name in names)
+    objects = list("abcdefgh")
+    rows = [summarise(name, "human", _sample([1, 0], [1, 0]), held_2s=True, objects=objects) for name in names]
     rows.append(dataclasses.replace(rows[0], group="small (up to 8 cm)", paper=None))
     write_json(rows, tmp_path / "new" / "rows.json", {"seed": 0})
     read = json.loads((tmp_path / "new" / "rows.json").read_text())
-    assert read["seed"] == 0 and len(read["rows"]) == 8
+    assert read["seed"] == 0 and len(read["rows"]) == len(rows) == 9
     for row in read["rows"]:
         assert set(REQUIRED) <= set(row) and row["method"] == "ours"
     assert read["rows"][0]["pose_rad"] is None and read["rows"][0]["heading_rad"] == 0.0
-    assert all(table.row_count == 8 for table in tables_of(rows, "title"))
+    assert all(table.row_count == 9 for table in tables_of(rows, "title"))

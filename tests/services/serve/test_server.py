@@ -207,7 +207,7 @@ def test_a_client_of_another_hand_is_refused(served):
     _, endpoint, episode = served
     with PolicyClient(endpoint, hand="paw") as client:
         client.reset(episode.request)
-        with pytest.raises(RefusedError, match="no hand 'paw'"):
+        with pytest.raises(RefusedError, match="for the hand 'human', not 'paw'"):
             client.act(episode.state)
 
 

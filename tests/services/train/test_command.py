@@ -165,12 +165,12 @@ def test_a_training_that_others_may_join_has_all_certificates_before_it_starts(t
     create_authority(tmp_path)
     for role in ("learner", "actor", "observer"):
         issue(tmp_path, role)
-    _check_connections(None, "tls/0.0.0.0:7447", tmp_path, insecure=False)
-    _check_connections(None, "tcp/0.0.0.0:7447", None, insecure=True)
+    _check_connections(None, "tls/0.0.0.0:7447", tmp_path, "quickstart", insecure=False)
+    _check_connections(None, "tcp/0.0.0.0:7447", None, "quickstart", insecure=True)
     with pytest.raises(CongraspError, match="belongs to one role"):
-        _check_connections(None, "tls/0.0.0.0:7447", tmp_path / "learner.0", insecure=False)
+        _check_connections(None, "tls/0.0.0.0:7447", tmp_path / "learner.0", "quickstart", insecure=False)
     with pytest.raises(CongraspError, match="With --actors 0 nothing listens"):
-        _check_connections(0, "tls/0.0.0.0:7447", tmp_path, insecure=False)
+        _check_connections(0, "tls/0.0.0.0:7447", tmp_path, "quickstart", insecure=False)
     (tmp_path / "observer.0" / "tls.key").unlink()
     with pytest.raises(CongraspError, match=r"observer.0/tls.key is missing.*--role observer"):
-        _check_connections(None, "tls/0.0.0.0:7447", tmp_path, insecure=False)
+        _check_connections(None, "tls/0.0.0.0:7447", tmp_path, "quickstart", insecure=False)
