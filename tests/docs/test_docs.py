@@ -87,4 +87,4 @@ def test_the_commands_of_the_tutorials_run(tmp_path):
         assert (tmp_path / "grasps" / "can" / name).stat().st_size > 1000
     assert (tmp_path / "mug.png").stat().st_size > 1000
     report = (tmp_path / "report.html").read_text()
-    assert report.count("data:image/png;base64,") == 6 and "--episodes 1 " in report
+    assert report.count("data:image/png;base64,") == 7 and "--episodes 1 " in report
