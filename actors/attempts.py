@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from actors import initial, protocols
@@ -21,9 +20,9 @@ from common.config import TaskConfig
 from common.hands.spec import Hand
 from common.objects.distance import distance_field
 from common.objects.spec import GraspObject
-from common.policy.bundle import PolicyBundle, mean_action
+from common.policy.bundle import PolicyBundle, act_by_mean
 from common.task import plausibility
-from common.task.types import Array, Goal, Surface
+from common.task.types import Goal, Surface
 from common.wire.codec import Message
 
 
@@ -121,11 +120,7 @@ class Attempts:
 
     def _new_worker(self, obj: GraspObject, batch: int) -> RolloutWorker:
         """A worker of `batch` environments on this object, that acts by the mean and traces all of them."""
-        layout = self._bundle.spec.layout
-
-        def policy(parameters: Any, observation: Array, key: Array) -> tuple[Array, Array]:
-            return mean_action(layout, parameters, observation), jnp.zeros(observation.shape[0])
-
+        policy = functools.partial(act_by_mean, self._bundle.spec.layout)
         physics = NativePhysics(self._hand, self._task, [obj], self._threads)
         return RolloutWorker(
             self._hand,

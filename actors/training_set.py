@@ -14,6 +14,7 @@ from common.objects.pool import load_pool, scale_objects
 from common.objects.spec import GraspObject
 from common.task.bank import ConstraintBank, rows_of, stacked
 from common.task.constraint_sets import bank_of, load_for
+from common.wire.codec import Message
 
 
 class TrainingSet(NamedTuple):
@@ -36,11 +37,9 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
     """
     objects, task, seed = config.objects, config.task, config.seed + number
     if not objects.folder:
-        if objects.constraints:
-            raise CongraspError("Constraint sets need their objects.", "Name their folder: --objects.folder FOLDER.")
         pool = scale_objects(hand, task, load_pool(objects, number))
         return TrainingSet(pool, build_bank(hand, task, pool, seed))
-    found = load_pool(objects)
+    found, sets = load_pool(objects), list[Message]()
     if objects.constraints:
         found, sets = load_for(pathlib.Path(objects.constraints), found)
         if not sets:
@@ -53,14 +52,11 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
                 f"The constraint sets in {objects.constraints} are for the hand '{sets[0].meta['hand']}'.",
                 f"Make them for '{hand.name}', or train that hand.",
             )
-        pool = scale_objects(hand, task, found)
-        bank = bank_of(sets, objects.split)
-    else:
-        pool = scale_objects(hand, task, found)
-        bank = build_bank(hand, task, pool, seed)
+    pool = scale_objects(hand, task, found)
+    bank = bank_of(sets, objects.split) if sets else build_bank(hand, task, pool, seed)
     if not objects.procedural:
         return TrainingSet(pool, bank)
-    more = dataclasses.replace(objects, folder="", count=objects.procedural)
+    more = dataclasses.replace(objects, folder="", constraints="", count=objects.procedural)
     beside = scale_objects(hand, task, load_pool(more, number))
     both = stacked([*rows_of(bank), *rows_of(build_bank(hand, task, beside, seed))])
     if share := objects.folder_share:

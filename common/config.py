@@ -158,6 +158,11 @@ class ObjectsConfig:
     """Share of the episodes that have an object of the folder, where there are procedural ones beside; 0: every object
     is drawn alike."""
 
+    def __post_init__(self) -> None:
+        """Raises a CongraspError for constraint sets without their objects."""
+        if self.constraints and not self.folder:
+            raise CongraspError("Constraint sets need their objects.", "Name their folder: --objects.folder FOLDER.")
+
 
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig:

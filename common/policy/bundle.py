@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import dacite
 import flax.traverse_util
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from common.config import NetworkConfig, TaskConfig
@@ -203,6 +204,11 @@ def sample_action(
     mean, log_std = network.policy(parameters.params, layout, normalizer.apply(parameters.normalization, observation))
     action = network.sample(key, mean, log_std)
     return action, network.log_probability(mean, log_std, action)
+
+
+def act_by_mean(layout: Layout, parameters: InferenceParameters, observation: Array, key: Array) -> tuple[Array, Array]:
+    """`mean_action` in the place of `sample_action`: the key counts for nothing, and the log probability is 0."""
+    return mean_action(layout, parameters, observation), jnp.zeros(observation.shape[:-1])
 
 
 def _dataclass(cls: type, fields: Any) -> Any:

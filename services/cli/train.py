@@ -9,7 +9,6 @@ import tyro
 
 import actors.physics  # noqa: F401 - registers the engines that --physics offers
 from common.config import MetricWriter, RunConfig, Split
-from common.errors import CongraspError
 from common.inputs import file_name
 from common.task.methods import with_method
 from learner.run_directory import CONFIG_FILE, open_run
@@ -75,8 +74,6 @@ def train(
         folder = objects.constraints if constraints is None else str(constraints)
         objects = dataclasses.replace(objects, constraints=folder, split=split or objects.split)
         config = dataclasses.replace(config, objects=objects)
-        if not objects.folder:
-            raise CongraspError("--constraints needs the sets' objects.", "Name their folder with --objects.folder.")
     return run_training(
         config,
         run_dir or pathlib.Path("runs") / f"{file_name(config.name, 'a run')}-{time.strftime('%Y%m%d-%H%M%S')}",

@@ -1,5 +1,6 @@
 """Episodes side by side under a policy's mean action: what evaluations and reference grasps are simulated with."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from common.engines import PhysicsName
 from common.hands import get_hand
 from common.objects.distance import distance_field
 from common.objects.spec import GraspObject
-from common.policy.bundle import PolicyBundle, mean_action
+from common.policy.bundle import PolicyBundle, act_by_mean
 from common.task import plausibility
 from common.task.types import Array, Surface
 from common.wire.codec import Message
@@ -65,26 +66,22 @@ class Episodes:
           measured: whether plausibility is measured at every step (`common.task.plausibility`).
           traced: whether every step of every episode is kept, for recordings.
         """
-        self._bundle, self._task, self._hold, self.measured = bundle, task, hold, measured
+        self._bundle, self._task, self._hold, self._measured = bundle, task, hold, measured
         self._hand, self.batch = get_hand(bundle.spec.hand), batch
-        layout = bundle.spec.layout
-
-        def policy(parameters: Any, observation: Array, key: Array) -> tuple[Array, Array]:
-            """Mean action (B, A), and a log probability (B,) that nobody reads."""
-            return mean_action(layout, parameters, observation), observation[..., 0] * 0.0
-
         self._worker = RolloutWorker(
             self._hand,
             task,
             make_physics(physics, self._hand, task, objects, threads=threads),
             None,
-            policy,
+            functools.partial(act_by_mean, bundle.spec.layout),
             batch=batch,
             seed=0,
             half_precision=False,
             probe=plausibility.sample if measured else _effort,
             traced=slice(None) if traced else slice(0),
         )
+        self.stressable = measured and hold == two_seconds(task)
+        """Whether episodes can go on after the hold: what they survive is asked after two seconds."""
         self._measure(objects)
 
     def __enter__(self) -> "Episodes":
@@ -123,7 +120,7 @@ class Episodes:
                 finished = finished_episodes(rollout, task)
         samples = jax.tree.map(lambda *parts: np.concatenate(parts), *probed)
         values = {name: finished[f"episode/{name}"] for name in metric_names(task)}
-        if self.measured:
+        if self._measured:
             values |= protocols.assess(samples, values["held"] > 0, task, self._hold)
         force, torque = (x[start : start + window].swapaxes(0, 1) for x in (samples.link_force, samples.torque_share))
 
@@ -150,9 +147,8 @@ class Episodes:
     def _measure(self, objects: Sequence[GraspObject]) -> None:
         """Measures against these objects; episodes that go on after their hold are under `protocols.stress`."""
         self._objects = objects
-        if self.measured:
-            lasts = self._hold == two_seconds(self._task)
-            stress = protocols.stress(self._task, objects, self._hold) if lasts else None
+        if self._measured:
+            stress = protocols.stress(self._task, objects, self._hold) if self.stressable else None
             self._worker.adjust(protocol=stress, probe_data=distance_field(objects))
 
     def _message(self, begun: EnvState, trace: Trace, metrics: dict[str, float], episode: int) -> Message:

@@ -299,7 +299,7 @@ class Evaluator:
         """The episodes of a plan, of which some are kept under a name; the first ones go on after the hold."""
         found: list[Sample] = []
         done = 0
-        most = min(plan.total, STRESSED) if running.measured and self._hold == two_seconds(self.task) else 0
+        most = min(plan.total, STRESSED) if running.stressable else 0
         if keep:
             self._kept[name] = {False: [], True: []}
         for conditions, count in batches(self._hand, self.task, bank, plan, self._seed, running.batch):
