@@ -11,7 +11,9 @@ import numpy as np
 from common import rotations
 from common.config import TaskConfig
 from common.errors import CongraspError
+from common.hands import kinematics
 from common.hands.kinematics import grasp_frame
+from common.hands.outline import CENTER, Outline, outline
 from common.hands.spec import Hand
 from common.objects.pool import object_scale
 from common.objects.spec import SURFACE_POINTS, GraspObject
@@ -36,6 +38,8 @@ _CLOSED_TOGETHER = 16
 """Objects around which hands close at once, so that an accelerator has enough to do."""
 _CLEARANCE = 0.02
 """Metres over the table that every waypoint of a trajectory keeps."""
+_SOFT = 0.002
+"""Metres that fingers may be in the table, which contacts are too soft to prevent."""
 _STEEPEST_UP = 0.1
 """Largest upward component of a reference pose's approach direction."""
 
@@ -61,6 +65,7 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
         seeds,
         itertools.repeat(None, count),
         itertools.repeat(scale, count),
+        itertools.repeat(outline(hand), count),
     )
     rests = max(len(row["rest"]) for row in rows)
     for row in rows:
@@ -103,7 +108,25 @@ def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints
       Trajectories (M, K, 3) and (M, K, 4), and (M, R) bool.
     """
     path, turns = make_trajectories(hand, poses.position, poses.quaternion, key, waypoints=waypoints)
-    return path, turns, clear_of_table(hand, poses.quaternion, path, rest)
+    room = jax.lax.map(lambda row: _fingers_over_table(hand, *row), (poses.q, path, turns, rest), batch_size=2048)
+    return path, turns, clear_of_table(hand, poses.quaternion, path, rest) & room
+
+
+def _fingers_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
+    """(R,) bool: the hand stays over the table as its wrist follows a trajectory (K, 3), (K, 4) to a pose.
+
+    With the pose's fingers (F,) all along, and with open ones at the start; `rest` (R, 7) are the object's poses.
+    """
+
+    def lowest(q: Array, path: Array, turns: Array) -> Array:
+        """(R,) m over the table."""
+        ends = kinematics.capsules(hand, kinematics.link_transforms(hand, q)).reshape(-1, 3)
+        ends = rotations.transform(path, turns, jnp.broadcast_to(ends, (len(path), *ends.shape)))
+        up = rotations.to_matrix(rest[:, 3:])[:, None, None, 2]
+        height = jnp.sum(up * ends, -1) + rest[:, None, None, 2] - np.repeat(hand.capsule_radii, 2)
+        return jnp.min(height, (1, 2))
+
+    return jnp.minimum(lowest(q, path, turns), lowest(jnp.array(hand.q_open), path[:1], turns[:1])) > -_SOFT
 
 
 def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> Array:
@@ -141,7 +164,12 @@ def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Pose
 
 
 def headings_of(
-    task: TaskConfig, obj: GraspObject, seed: tuple[int, int], given: Headings | None = None, scale: float = 1.0
+    task: TaskConfig,
+    obj: GraspObject,
+    seed: tuple[int, int],
+    given: Headings | None = None,
+    scale: float = 1.0,
+    hand: Outline = CENTER,
 ) -> dict[str, np.ndarray]:
     """What NumPy finds out about one object; resting poses without a reachable heading are left out.
 
@@ -151,6 +179,7 @@ def headings_of(
       seed: of its headings.
       given: `HEADINGS` headings to take instead of sampled ones.
       scale: of the object; the rules' lengths follow it, so that a larger hand gets the headings of the smaller object.
+      hand: what must stay clear of the table.
 
     Raises:
       CongraspError: it has no heading that the hand can reach in any resting pose.
@@ -163,7 +192,13 @@ def headings_of(
     )
     assert whole is not None, "only the graspable region may be out of reach"
     sets = [whole, graspable or whole]
-    reachable = np.array([[_reachable(task, headings, rest) for rest in obj.rest_poses] for headings in sets])
+    cleared = [[clear_table(headings, rest, hand) for rest in obj.rest_poses] for headings in sets]
+    reachable = np.array(
+        [
+            [feasible(*pair, hand, back_off=task.back_off) for pair in zip(of, obj.rest_poses, strict=True)]
+            for of in cleared
+        ]
+    )
     if task.headings == "above" and reachable[0].any():
         steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
         reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
@@ -175,7 +210,12 @@ def headings_of(
         )
     reachable, rest = reachable[:, usable], obj.rest_poses[usable]
     index = np.array([[_repeated(row) for row in region] for region in reachable])
-    back = np.array([[_back(headings, pose) for pose in rest] for headings in sets])
+    back = np.array(
+        [
+            [np.linalg.norm(of[rest].position - headings.position, axis=-1) for rest in usable]
+            for headings, of in zip(sets, cleared, strict=True)
+        ]
+    )
     # Reference poses are made at headings that some resting pose allows, where there are any.
     chosen = [_some(rng, region.any(0)) for region in reachable]
     keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
@@ -196,16 +236,6 @@ def headings_of(
         "heading_index": index.astype(np.int32),
         "has_affordance": (graspable is not None) & avoid.any() & reachable[1].any(-1),
     }
-
-
-def _reachable(task: TaskConfig, headings: Headings, rest: np.ndarray) -> np.ndarray:
-    """(H,) bool: headings that can be followed in a resting pose (7,), moved clear of the table where they must be."""
-    return feasible(clear_table(headings, rest), rest, back_off=task.back_off)
-
-
-def _back(headings: Headings, rest: np.ndarray) -> np.ndarray:
-    """(H,) metres by which positions move back to stay clear of the table."""
-    return np.linalg.norm(clear_table(headings, rest).position - headings.position, axis=-1)
 
 
 def _repeated(which: np.ndarray) -> np.ndarray:

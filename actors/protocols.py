@@ -155,8 +155,7 @@ def carried_targets(u_target: Array, hand: Hand, base_quaternion: Array, frame: 
     They lead by what makes up for the servo's damping of the frame's speed, and for the hand's inertia.
     """
     gains = hand.wrist
-    inertia = gains.slide_armature + sum(link.mass for link in hand.links)
-    lead = (gains.slide_kv * frame.speed + inertia * frame.acceleration) / gains.slide_kp
+    lead = (gains.slide_kv * frame.speed + hand.wrist_inertia[0] * frame.acceleration) / gains.slide_kp
     return u_target + slides(base_quaternion, frame.height + lead)
 
 

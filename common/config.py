@@ -61,10 +61,14 @@ class ControlConfig:
     """alpha_w of the three slides, m per unit of action."""
     wrist_rotation_scale: float = 0.1
     """alpha_w of the three hinges, rad per unit of action."""
-    guidance_position_limit: float = 0.08
-    """The guidance target is at most this far ahead of the wrist, m."""
-    guidance_rotation_limit: float = 0.5
-    """The guidance target is at most this far ahead of the wrist, rad."""
+    guidance_position_limit: float = 0.04
+    """The wrist's target is at most this far ahead of it, m: at kp/kv = 20/s a speed of 0.8 m/s."""
+    guidance_rotation_limit: float = 0.3
+    """The wrist's target is at most this far ahead of it, rad: 5 rad/s."""
+    wrist_acceleration: float = 15.0
+    """Greatest acceleration that the wrist's servos give it, m/s^2; by its inertia their greatest force, too."""
+    wrist_angular_acceleration: float = 150.0
+    """The same about its hinges, rad/s^2."""
     lookahead: int = 1
     """Waypoints ahead of the nearest one that the guidance aims at (0 is the paper's ablation without feed-forward)."""
     follow_object: bool = False
@@ -99,10 +103,10 @@ class TaskConfig(_Shares):
     dynamic_center: bool = True
     """Hand centre from the live fingertips; false is the paper's ablation: from the fingertips at the episode's start,
     fixed in the wrist frame."""
-    hand_table_collision: bool = False
+    hand_table_collision: bool = True
     """Whether the hand collides with the table."""
-    hand_self_collision: bool = False
-    """Whether the hand's links collide with one another (slower; the pretrained policies learnt without)."""
+    hand_self_collision: bool = True
+    """Whether the hand's links collide with one another."""
     back_off: float = 0.15
     """Metres from the aligned wrist to its start, against the heading direction."""
     surface_points: int = 256

@@ -18,8 +18,8 @@ from actors.physics.physics_state import has_diverged, initial_qpos, physics_sta
 from actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, addresses
 from actors.physics.slots import Pool
 from common.config import TaskConfig
-from common.errors import CongraspError
 from common.hands.spec import Hand
+from common.objects.mjcf import CONTACT
 from common.objects.spec import GraspObject
 from common.task.types import CONTACTS_PER_LINK, Array
 
@@ -50,20 +50,14 @@ class MjxPhysics:
           hand: the hand.
           task: timing and collision settings.
           objects: the pool that `ResetState.object_index` points into.
-
-        Raises:
-          CongraspError: collisions between the hand's links are to be simulated.
         """
-        if task.hand_self_collision:
-            raise CongraspError(
-                "The engine 'jax' has no contacts between the links of a hand (--task.hand-self-collision).",
-                "Take --physics native or warp.",
-            )
         self._task = task
         self._pool = pool = Pool(hand, task, objects)
         self._where = addresses(pool.model, hand)
         self._links = np.array([pool.model.body(link.name).id for link in hand.links])
         self._nq, self._nv, self._nu = pool.model.nq, pool.model.nv, pool.model.nu
+        # MJX knows no elliptic cones without friction: links get what the hand's own sliding friction is, a tenth.
+        pool.model.geom_condim[:] = CONTACT.condim
         # MJX has no contact sensor between bodies; its contacts are read from the contact list instead.
         pool.model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
         pool.model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN

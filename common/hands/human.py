@@ -5,19 +5,10 @@ lunate, fingers towards -y, thumb side +x, back of the hand +z. Fingers flex wit
 `ip` with negative ones. Limits are MyoHand's, widened where anatomy allows; phalanx masses are of a mean adult hand.
 """
 
-from common.hands.spec import Capsule, Hand, Joint, Link, Vector, WristGains, chain
+from common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain, wrist_gains
 
 FINGER_GAINS = {"kp": 4.0, "kv": 0.15, "torque_limit": 1.5}
-WRIST = WristGains(
-    slide_kp=1000.0,
-    slide_kv=50.0,
-    slide_limit=150.0,
-    slide_armature=0.2,
-    hinge_kp=50.0,
-    hinge_kv=3.0,
-    hinge_limit=20.0,
-    hinge_armature=0.01,
-)
+WRIST = wrist_gains(0.35)
 _MCP_FLEXION = (-0.35, 1.571)
 _MCP_ABDUCTION = (-0.30, 0.30)
 _PIP = (0.0, 1.75)

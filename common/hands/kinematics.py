@@ -95,6 +95,14 @@ def keypoints(hand: Hand, transforms: tuple[Array, Array]) -> Array:
     return points + translation[..., carrier, :]
 
 
+def capsules(hand: Hand, transforms: tuple[Array, Array]) -> Array:
+    """(..., C, 2, 3) where the hand's capsules start and end, from `link_transforms`; see `Hand.capsule_radii`."""
+    rotation, translation = transforms
+    ends = jnp.asarray(hand.capsules)
+    turned = rotations.apply(rotation[..., hand.capsule_links, :, :], ends)
+    return turned + translation[..., hand.capsule_links, None, :]
+
+
 def link_poses(hand: Hand, q: Array) -> tuple[Array, Array]:
     """Origins (..., L, 3) and orientations (..., L, 4) of the links' frames."""
     rotation, translation = link_transforms(hand, q)

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from common.hands.spec import Hand, Link, link_origin
+from common.objects.mjcf import CONTACT
 
 HAND_CONTYPE = 1
 """Collision bit of the hand: whatever collides with it has this bit in its conaffinity."""
@@ -125,5 +126,6 @@ def _add_capsules(body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_col
             contype=HAND_CONTYPE,
             conaffinity=HAND_CONTYPE if self_collision else 0,
             condim=1,  # between links; against the object the greater of two decides, which is the object's
+            solref=CONTACT.solref,
             friction=(0.1, 0.005, 0.0001),  # MuJoCo takes the greater of two: the object's friction decides
         )

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 Vector = tuple[float, float, float]
+_ARM = 0.65  # kg, what an arm adds to the inertia of the hand that it carries
+_GYRATION = 0.06  # m, a hand's radius of gyration about its wrist
 
 
 def vector(array: np.ndarray) -> Vector:
@@ -176,6 +178,27 @@ class Hand:
         weights = np.concatenate([np.ones(len(self.links)), 4 * np.ones(len(self.tip_links))])
         return (weights / weights.mean()).astype(np.float32)
 
+    @functools.cached_property
+    def capsules(self) -> np.ndarray:
+        """(C, 2, 3) where the capsules of all links start and end, in the wrist frame at zero."""
+        return np.array([(c.start, c.end) for link in self.links for c in link.capsules], np.float32)
+
+    @functools.cached_property
+    def capsule_radii(self) -> np.ndarray:
+        """(C,) m."""
+        return np.array([c.radius for link in self.links for c in link.capsules], np.float32)
+
+    @functools.cached_property
+    def capsule_links(self) -> np.ndarray:
+        """(C,) index of the link of each capsule."""
+        return np.array([i for i, link in enumerate(self.links) for _ in link.capsules])
+
+    @functools.cached_property
+    def wrist_inertia(self) -> np.ndarray:
+        """(2,) what the virtual wrist's servos move: kg along a slide, kg.m^2 about a hinge."""
+        mass = sum(link.mass for link in self.links)
+        return np.array([mass + self.wrist.slide_armature, mass * _GYRATION**2 + self.wrist.hinge_armature])
+
     def _pose(self, angles: dict[str, float]) -> np.ndarray:
         """(F,) angles in the order of the joints."""
         return np.array([angles.get(joint.name, 0.0) for joint in self.joints], np.float32)
@@ -229,16 +252,16 @@ def chain_of(hand: Hand, name: str) -> tuple[str, ...]:
 
 
 def wrist_gains(mass: float) -> WristGains:
-    """Gains of the virtual wrist of a hand of this mass (kg): those of a human hand of 350 g, in proportion.
+    """Gains of the virtual wrist of a hand of this mass (kg), on an arm whose inertia there is 0.65 kg.
 
-    The wrist follows its targets with a time constant of 0.05 s whatever the hand weighs.
+    The wrist follows its targets with a time constant of 0.05 s (0.06 s about the hinges) whatever the hand weighs.
     """
-    heavier = (mass + 0.2) / 0.55
+    moved, heavier = mass + _ARM, (mass + 0.2) / 0.55
     return WristGains(
-        slide_kp=1000.0 * heavier,
-        slide_kv=50.0 * heavier,
-        slide_limit=150.0 * heavier,
-        slide_armature=0.2,
+        slide_kp=1800.0 * moved,
+        slide_kv=90.0 * moved,
+        slide_limit=150.0 * moved,
+        slide_armature=_ARM,
         hinge_kp=50.0 * heavier,
         hinge_kv=3.0 * heavier,
         hinge_limit=20.0 * heavier,

@@ -17,6 +17,8 @@ jax.tree_util.register_dataclass(
         "wrist_rotation_scale",
         "guidance_position_limit",
         "guidance_rotation_limit",
+        "wrist_acceleration",
+        "wrist_angular_acceleration",
     ],
     meta_fields=["lookahead", "follow_object", "finger_guidance"],
 )
@@ -41,8 +43,8 @@ def guidance_pose(scene: Scene, control: ControlConfig) -> tuple[Array, Array]:
 def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     """Joint targets of a residual action (B, F + 6).
 
-    q_tgt = clamp(q_tgt_prev + alpha_f a_f, limits); u_tgt = u_g + alpha_w a_w, where u_g is at most the guidance
-    limits ahead of the wrist's present joints.
+    q_tgt = clamp(q_tgt_prev + alpha_f a_f, limits); u_tgt = u_g + alpha_w a_w, nearer to the wrist where it would else
+    become faster or be accelerated harder than the limits allow (`_lead`).
     """
     hand, state = scene.hand, scene.state
     fingers = len(hand.joints)
@@ -50,23 +52,40 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     if control.finger_guidance:
         q_target += _finger_guidance(scene, control.finger_guidance)
     q_target = jnp.clip(q_target, jnp.array(hand.lower), jnp.array(hand.upper))
-    u_guidance = wrist_to_joints(state, *guidance_pose(scene, control))
-    ahead = u_guidance - state.u
-    limited = jnp.concatenate(
-        [
-            _limit(ahead[..., :3], control.guidance_position_limit),
-            _limit(ahead[..., 3:], control.guidance_rotation_limit),
-        ],
-        -1,
+    ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
+    gains, (mass, inertia) = hand.wrist, hand.wrist_inertia
+    slides = _lead(
+        ahead[..., :3],
+        control.wrist_position_scale * action[..., fingers : fingers + 3],
+        state.u_velocity[..., :3] * (gains.slide_kv / gains.slide_kp),
+        control.guidance_position_limit,
+        control.wrist_acceleration * (mass / gains.slide_kp),
     )
-    residual = jnp.concatenate(
-        [
-            control.wrist_position_scale * action[..., fingers : fingers + 3],
-            control.wrist_rotation_scale * action[..., fingers + 3 :],
-        ],
-        -1,
+    hinges = _lead(
+        ahead[..., 3:],
+        control.wrist_rotation_scale * action[..., fingers + 3 :],
+        state.u_velocity[..., 3:] * (gains.hinge_kv / gains.hinge_kp),
+        control.guidance_rotation_limit,
+        control.wrist_angular_acceleration * (inertia / gains.hinge_kp),
     )
-    return Action(q_target, state.u + limited + residual)
+    return Action(q_target, state.u + jnp.concatenate([slides, hinges], -1))
+
+
+def _lead(ahead: Array, residual: Array, steady: Array, farthest: Array | float, hardest: Array | float) -> Array:
+    """How far (B, 3) the target is ahead of three wrist joints.
+
+    A servo moves a mass m by m a = kp (target - u) - kv v: at a target that is kv v / kp ahead it goes on at its speed,
+    and a target r from there accelerates it by kp r / m.
+
+    Args:
+      ahead: (B, 3) how far the guidance is ahead.
+      residual: (B, 3) what the action adds.
+      steady: (B, 3) kv v / kp.
+      farthest: length of the lead.
+      hardest: m / kp times the greatest acceleration.
+    """
+    wanted = _limit(_limit(ahead, farthest) + residual, farthest)
+    return steady + _limit(wanted - steady, hardest)
 
 
 def _finger_guidance(scene: Scene, rate: float) -> Array:
@@ -75,7 +94,7 @@ def _finger_guidance(scene: Scene, rate: float) -> Array:
     return begun[:, None] * jnp.clip(jnp.array(scene.hand.q_closed) - scene.state.q_target, -rate, rate)
 
 
-def _limit(vector: Array, length: float) -> Array:
+def _limit(vector: Array, length: Array | float) -> Array:
     """Vectors (..., 3) shortened to at most `length`."""
     norm = jnp.sqrt(jnp.sum(vector**2, -1, keepdims=True) + 1e-12)
     return vector * jnp.minimum(1.0, length / norm)

@@ -55,11 +55,8 @@ class Sample(NamedTuple):
 
 
 class _Capsules(NamedTuple):
-    """A hand's capsules, in the wrist frame at zero."""
+    """Which of a hand's capsules must not overlap, and points on their axes in the wrist frame at zero."""
 
-    links: np.ndarray  # (C,) the link of each
-    ends: np.ndarray  # (C, 2, 3)
-    radii: np.ndarray  # (C,)
     pairs: np.ndarray  # (2, Q) capsules that must not overlap
     axis_links: np.ndarray  # (P,) the link of each point on the axes
     axis_points: np.ndarray  # (P, 3)
@@ -101,14 +98,12 @@ def hand_hand(hand: Hand, transforms: tuple[Array, Array]) -> Array:
       hand: the hand.
       transforms: of `common.hands.kinematics.link_transforms`.
     """
-    capsules = _capsules(hand)
-    first, second = capsules.pairs
-    ends = _moved(transforms, np.repeat(capsules.links, 2), capsules.ends.reshape(-1, 3))
-    ends = ends.reshape(*ends.shape[:-2], -1, 2, 3)
+    radii, ends = hand.capsule_radii, kinematics.capsules(hand, transforms)
+    first, second = _capsules(hand).pairs
     apart = segment_distance(
         ends[..., first, 0, :], ends[..., first, 1, :], ends[..., second, 0, :], ends[..., second, 1, :]
     )
-    return jnp.maximum(jnp.max(capsules.radii[first] + capsules.radii[second] - apart, -1), 0.0)
+    return jnp.maximum(jnp.max(radii[first] + radii[second] - apart, -1), 0.0)
 
 
 def hand_table(hand: Hand, transforms: tuple[Array, Array], wrist_position: Array, wrist_quaternion: Array) -> Array:
@@ -120,9 +115,9 @@ def hand_table(hand: Hand, transforms: tuple[Array, Array], wrist_position: Arra
       wrist_position: (B, 3) world.
       wrist_quaternion: (B, 4) world.
     """
-    ends = (rotations.transform(wrist_position, wrist_quaternion, points) for points in _ends(hand, transforms))
-    lowest = jnp.minimum(*(points[..., 2] for points in ends))
-    return jnp.maximum(jnp.max(_capsules(hand).radii - lowest, -1), 0.0)
+    ends = kinematics.capsules(hand, transforms)
+    ends = rotations.transform(wrist_position, wrist_quaternion, ends.reshape(*ends.shape[:-3], -1, 3))
+    return jnp.maximum(jnp.max(np.repeat(hand.capsule_radii, 2) - ends[..., 2], -1), 0.0)
 
 
 def hand_object(
@@ -223,13 +218,6 @@ def _dot(a: Array, b: Array) -> Array:
     return jnp.sum(a * b, -1)
 
 
-def _ends(hand: Hand, transforms: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Both ends (..., C, 3) of the hand's capsules, wrist frame."""
-    capsules = _capsules(hand)
-    start, end = (_moved(transforms, capsules.links, capsules.ends[:, side]) for side in (0, 1))
-    return start, end
-
-
 def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarray) -> Array:
     """Points (P, 3) of links (P,) at zero, (..., P, 3) where the links are now, wrist frame."""
     rotation, translation = transforms
@@ -239,27 +227,21 @@ def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarra
 
 @functools.cache
 def _capsules(hand: Hand) -> _Capsules:
-    """The hand's capsules, and which of them must not overlap."""
-    found = [(i, capsule) for i, link in enumerate(hand.links) for capsule in link.capsules]
-    links = np.array([i for i, _ in found])
-    ends = np.array([(capsule.start, capsule.end) for _, capsule in found], np.float32)
-    radii = np.array([capsule.radius for _, capsule in found], np.float32)
+    """Which of the hand's capsules must not overlap, and points on their axes."""
+    links, radii = hand.capsule_links, hand.capsule_radii
     names = [link.name for link in hand.links]
     nested = {frozenset(pair) for pair in (*overlapping(hand), *((link.name, link.parent) for link in hand.links))}
-    first, second = np.triu_indices(len(found), 1)
+    first, second = np.triu_indices(len(links), 1)
     apart = [
         a != b and frozenset((names[a], names[b])) not in nested
         for a, b in zip(links[first], links[second], strict=True)
     ]
     axes = [
         np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / _SPACING)).astype(np.float32)
-        for start, end in ends
+        for start, end in hand.capsules
     ]
     counts = [len(points) for points in axes]
     return _Capsules(
-        links,
-        ends,
-        radii,
         np.stack([first, second])[:, apart],
         np.repeat(links, counts),
         np.concatenate(axes).astype(np.float32),

@@ -78,8 +78,7 @@ def make_trajectories(
 def _replay(hand: Hand, target: Array) -> Array:
     """What the wrist's PD controller reaches of targets (T, M, 6): each axis a damped mass, semi-implicit Euler."""
     gains = hand.wrist
-    mass = sum(link.mass for link in hand.links) + gains.slide_armature
-    inertia = sum(link.mass for link in hand.links) * 0.06**2 + gains.hinge_armature
+    mass, inertia = hand.wrist_inertia.tolist()
     kp = jnp.array([gains.slide_kp] * 3 + [gains.hinge_kp] * 3)
     kv = jnp.array([gains.slide_kv] * 3 + [gains.hinge_kv] * 3)
     limit = jnp.array([gains.slide_limit] * 3 + [gains.hinge_limit] * 3)

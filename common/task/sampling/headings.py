@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from common.hands.outline import CENTER, Outline, depth_below
 from common.objects.shapes import matrix
 from common.objects.spec import GraspObject
 
@@ -21,6 +22,7 @@ _TUBE = 0.01  # radius around the approach in which nothing may stand before the
 _MARGIN = (
     0.01  # an approach stays this far from the avoid region, and closing fingers, which are this thick, meet none of it
 )
+_FARTHEST_BACK = 0.03  # longest way back from the table: to a hand whose centre is 1 cm over the surface
 _FACING = 0.5  # least cosine between a surface's inward normal and a direction that is given
 _ROLLS = 4
 _BATCH = 320
@@ -155,10 +157,8 @@ def _last_resort(
     return Headings(position[best], direction[best], cross[best])
 
 
-def clear_table(
-    headings: Headings, rest_pose: np.ndarray, *, clearance: float = 0.01, limit: float = INWARD
-) -> Headings:
-    """Moves positions that lie too near to the table back along their direction, by `limit` at most.
+def clear_table(headings: Headings, rest_pose: np.ndarray, outline: Outline = CENTER) -> Headings:
+    """Moves positions at which the hand would be in the table back along their direction, by 3 cm at most.
 
     Two centimetres into a flat object may be inside the table; this keeps such an object graspable from above. A
     heading that cannot be cleared is left as it is, and `feasible` is false for it.
@@ -166,13 +166,12 @@ def clear_table(
     Args:
       headings: in the object frame.
       rest_pose: (7,) the object's pose, with the table's top at z = 0.
-      clearance: least height of a position above the table, m.
-      limit: longest way back, m.
+      outline: of the hand.
     """
-    height, direction_z, _ = _in_world(headings, rest_pose)
-    needed = np.maximum(clearance - height, 0.0) / np.maximum(-direction_z, 1e-6)
-    back = np.where(needed <= limit, needed, 0.0)
-    # A micrometre more, so that rounding does not leave a position just below the clearance.
+    room, direction_z, _ = _room(headings, rest_pose, outline)
+    needed = np.maximum(-room, 0.0) / np.maximum(-direction_z, 1e-6)
+    back = np.where(needed <= _FARTHEST_BACK, needed, 0.0)
+    # A micrometre more, so that rounding does not leave a hand that just touches.
     back = np.where(back > 0, back + 1e-6, 0.0)
     return headings._replace(position=(headings.position - back[:, None] * headings.direction).astype(np.float32))
 
@@ -180,41 +179,43 @@ def clear_table(
 def feasible(
     headings: Headings,
     rest_pose: np.ndarray,
+    outline: Outline = CENTER,
     *,
-    clearance: float = 0.01,
     back_off: float = BACK_OFF,
     steepest_up: float = 0.1,
 ) -> np.ndarray:
     """(H,) bool, which headings can be followed while the object lies on the table in a resting pose.
 
     The approach must come from above or level (its direction rises by at most `steepest_up` per metre), and the hand
-    centre must stay `clearance` above the table at its start and at the heading position. It may be false for all
-    headings of a thin object: see `clear_table`.
+    must be over the table: at its start open, at the heading position in one of the outline's poses. It may be false
+    for all headings of a thin object: see `clear_table`.
 
     Args:
       headings: in the object frame.
       rest_pose: (7,) the object's pose, with the table's top at z = 0.
-      clearance: least height of the hand centre above the table, m.
+      outline: of the hand.
       back_off: length of the approach, m.
       steepest_up: largest upward component of a direction.
     """
-    height, direction_z, start = _in_world(headings, rest_pose, back_off)
-    return (direction_z <= steepest_up) & (height >= clearance) & (start >= clearance)
+    room, direction_z, start = _room(headings, rest_pose, outline, back_off)
+    return (direction_z <= steepest_up) & (room >= 0) & (start >= 0)
 
 
 def above(headings: Headings, rest_pose: np.ndarray, cone: float = np.radians(30)) -> np.ndarray:
     """(H,) bool, which directions are within `cone` (rad) of straight down for an object in a resting pose (7,)."""
-    return _in_world(headings, rest_pose)[1] <= -np.cos(cone)
+    return headings.direction @ matrix(rest_pose[3:])[2] <= -np.cos(cone)
 
 
-def _in_world(
-    headings: Headings, rest_pose: np.ndarray, back_off: float = BACK_OFF
+def _room(
+    headings: Headings, rest_pose: np.ndarray, outline: Outline, back_off: float = BACK_OFF
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """World heights (H,) of the positions, z of the directions, and heights of the approaches' starts."""
+    """Heights (H,) of the hand over the table at the positions, z of the directions, and heights at the starts."""
     up = matrix(rest_pose[3:])[2]
     height = headings.position @ up + rest_pose[2]
-    direction_z = headings.direction @ up
-    return height, direction_z, height - back_off * direction_z
+    direction_z, cross_z = headings.direction @ up, headings.cross @ up
+    local = np.stack([direction_z, cross_z, np.cross(headings.direction, headings.cross) @ up], -1)
+    below = depth_below(outline, local)
+    return height - below.min(0), direction_z, height - back_off * direction_z - below[0]
 
 
 def _in_cone(axes: np.ndarray, cone: float, rng: np.random.Generator) -> np.ndarray:

@@ -1,0 +1,59 @@
+"""How far a hand reaches around its centre, in a few fixed finger poses: what decides whether a table leaves it room."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from common.hands import kinematics
+from common.hands.spec import Hand
+
+CLOSURES = (0.0, 0.25, 0.5)
+"""Shares of the way from the open to the closed pose: open, and half closed around things of usual widths."""
+
+
+class Outline(NamedTuple):
+    """Balls in S finger poses, from the least closed to the most, that the hand lies in the hull of.
+
+    The frame has its origin in the hand's centre and the axes v, w and v x w of the grasp frame.
+    """
+
+    points: np.ndarray
+    """(S, E, 3) m, their centres."""
+    radii: np.ndarray
+    """(E,) m."""
+
+
+CENTER = Outline(np.zeros((1, 1, 3)), np.array([0.01]))
+"""A ball of 1 cm around the hand's centre, where no hand is named."""
+
+
+@functools.cache
+def outline(hand: Hand) -> Outline:
+    """The hand's capsules in the poses of `CLOSURES`."""
+    frame = kinematics.grasp_frame(hand)
+    axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
+    q = np.stack([hand.q_open + share * (hand.q_closed - hand.q_open) for share in CLOSURES])
+    with jax.ensure_compile_time_eval():
+        ends, center = (np.asarray(part, np.float64) for part in _ends_and_center(hand, jnp.asarray(q)))
+    return Outline((ends - center[:, None]) @ axes.T, np.repeat(hand.capsule_radii, 2).astype(np.float64))
+
+
+def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
+    """(S, H) metres that the hand in each of S poses reaches below its centre.
+
+    Args:
+      outline: of the hand.
+      up: (H, 3) unit, the world's vertical in the outline's frame.
+    """
+    return -(np.einsum("sei,hi->she", outline.points, up) - outline.radii).min(-1)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _ends_and_center(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Ends (S, E, 3) of the hand's capsules and its centre (S, 3) at finger angles (S, F), wrist frame."""
+    transforms = kinematics.link_transforms(hand, q)
+    ends = kinematics.capsules(hand, transforms)
+    return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(hand, kinematics.keypoints(hand, transforms))
