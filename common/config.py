@@ -140,7 +140,7 @@ class ObjectsConfig:
     """Which objects a run uses."""
 
     families: tuple[str, ...] = ()
-    """Families of the procedural generator; empty means all."""
+    """Families of the procedural generator, or groups of them (basic, household, all); empty means basic."""
     count: int = 64
     """Procedural objects in one actor's pool."""
     seed: int = 0
