@@ -11,6 +11,7 @@ import numpy as np
 
 from actors.env import EnvState, episode_fields
 from actors.episode import episode_message
+from actors.failure_weights import FailureWeights
 from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes
@@ -116,6 +117,9 @@ class _Actor:
             seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
             half_precision=config.half_observations,
         )
+        self._failures: FailureWeights | None = None
+        if config.objects.by_failure:
+            self._failures = FailureWeights(np.asarray(bank.weight), [obj.family for obj in self._objects])
         self._on_rollout = on_rollout
         self._bundle: PolicyBundle | None = None
         self._rollouts = 0
@@ -182,6 +186,9 @@ class _Actor:
         arrays = taken | episodes
         if config.task.own_references:
             self._worker.renew_references()
+        if self._failures is not None:
+            self._failures.add(episodes["episode/object_index"], episodes["episode/held"])
+            self._worker.weigh_objects(self._failures.weights)
         meta = {"version": bundle.version, "schema": self._spec.schema, "steps": steps}
         collected = time.monotonic()
         self._link.upload(Message(arrays, meta), ticket)
@@ -193,6 +200,7 @@ class _Actor:
             "rollouts": self._rollouts + 1.0,
             "episodes_left_out": float(left_out),
             **buffer_occupancy(np.asarray(rollout.occupancy)),
+            **(self._failures.metrics() if self._failures is not None else {}),
         }
         self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
         self._on_rollout({"version": float(bundle.version), **values})

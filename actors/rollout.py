@@ -183,6 +183,10 @@ class RolloutWorker:
         assert self._bank is not None, "these episodes are given"
         return self._bank
 
+    def weigh_objects(self, weight: np.ndarray) -> None:
+        """Episodes that start from now on draw objects by these weights (N,)."""
+        self._bank = self.bank._replace(weight=jnp.asarray(weight, jnp.float32))
+
     def renew_references(self) -> None:
         """Puts the grasps that succeeded since the last call into the bank as reference poses."""
         self._key, key = jax.random.split(self._key)

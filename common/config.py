@@ -144,7 +144,7 @@ class ObjectsConfig:
     """Which objects a run uses."""
 
     families: tuple[str, ...] = ()
-    """Families of the procedural generator; empty means all."""
+    """Families of the procedural generator, or groups of them (basic, household, all); empty means basic."""
     count: int = 64
     """Procedural objects in one actor's pool."""
     seed: int = 0
@@ -161,6 +161,9 @@ class ObjectsConfig:
     folder_share: float = 0.0
     """Share of the episodes that have an object of the folder, where there are procedural ones beside; 0: every object
     is drawn alike."""
+    by_failure: bool = False
+    """Objects that fall more often than others are drawn up to twice as often, and those that fall less often down to
+    half as often, by the actor's own episodes (the folder's share shifts with them)."""
 
     def __post_init__(self) -> None:
         """Raises a CongraspError for constraint sets without their objects."""

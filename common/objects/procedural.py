@@ -1,25 +1,31 @@
 """Procedural objects: any number of them from a seed, no two alike, with part labels and resting poses."""
 
 import dataclasses
+import zlib
 from collections.abc import Sequence
 
 import numpy as np
 
 from common.errors import CongraspError
 from common.objects import shapes
-from common.objects.families import BUILDERS, Draft
+from common.objects.families import BASIC, BUILDERS, HOUSEHOLD, Draft
 from common.objects.resting import rest_poses
 from common.objects.spec import GraspObject
 from common.objects.surface import halves, mass_properties, sample_union
 from common.parallel import parallel_map
 
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)
-PRIMITIVE_FAMILIES = tuple(family for family in FAMILIES if family not in ("ring", "bowl", "cup"))
-"""Families whose objects have no mesh pieces."""
+BASIC_FAMILIES = tuple(BASIC)
+HOUSEHOLD_FAMILIES = tuple(HOUSEHOLD)
+PRIMITIVE_FAMILIES = tuple(family for family in BASIC_FAMILIES if family not in ("ring", "bowl", "cup"))
+"""Basic families whose objects have no mesh pieces."""
+GROUPS = {"basic": BASIC_FAMILIES, "household": HOUSEHOLD_FAMILIES, "all": FAMILIES}
+"""Names that stand for several families."""
 MASS_RANGE = (0.05, 0.5)
-"""Kilograms."""
-_SIZE_RANGE = (0.03, 0.25)
-_DENSITY_RANGE = (300.0, 1000.0)
+"""Kilograms, of basic families."""
+HOUSEHOLD_MASS_RANGE = (0.02, 0.5)
+"""Kilograms, of household families."""
+_SIZE_RANGE, _HOUSEHOLD_SIZE_RANGE = (0.03, 0.25), (0.03, 0.3)
 _LEAST_SHARE = 0.1
 _ATTEMPTS = 100
 
@@ -27,21 +33,24 @@ _ATTEMPTS = 100
 def generate(seed: int, family: str | None = None) -> GraspObject:
     """A random object, the same for the same seed and family.
 
-    Its largest side is between 3 and 25 cm, its mass between 0.05 and 0.5 kg, and both its graspable and its
-    non-graspable region cover at least a tenth of the surface. Mass and inertia are those of the sum of its pieces
-    (overlaps count twice), scaled together where the mass had to be brought into range.
+    Its largest side is between 3 and 25 cm and its mass between 0.05 and 0.5 kg (3 to 30 cm and 0.02 to 0.5 kg in
+    household families), and both its graspable and its non-graspable region cover at least a tenth of the surface.
+    Mass and inertia are those of the sum of its pieces (overlaps count twice), scaled together where the mass had to
+    be brought into range.
 
     Args:
       seed: not negative; seeds from one million upward are kept for evaluation.
-      family: one of `FAMILIES`; chosen by the seed if not given.
+      family: one of `FAMILIES`; one of the basic ones, chosen by the seed, if not given.
 
     Raises:
       CongraspError: unknown family or negative seed.
     """
     _check(seed, () if family is None else (family,))
     if family is None:
-        family = FAMILIES[np.random.default_rng((seed, len(FAMILIES))).integers(len(FAMILIES))]
-    rng = np.random.default_rng((seed, FAMILIES.index(family)))
+        family = BASIC_FAMILIES[np.random.default_rng((seed, len(BASIC))).integers(len(BASIC))]
+    # By name, so that families come and go without changing the others' objects; basic ones keep their first numbers.
+    stream = BASIC_FAMILIES.index(family) if family in BASIC else zlib.crc32(family.encode())
+    rng = np.random.default_rng((seed, stream))
     for _ in range(_ATTEMPTS):
         obj = _build(f"{family}_{seed}", family, BUILDERS[family](rng), rng)
         if obj is not None:
@@ -55,7 +64,7 @@ def generate_many(count: int, seed: int, families: Sequence[str] = ()) -> list[G
     Args:
       count: number of objects.
       seed: the first seed.
-      families: some of `FAMILIES`; empty means all.
+      families: names of `FAMILIES` or `GROUPS`; empty means the basic ones.
 
     Raises:
       CongraspError: unknown family or negative seed.
@@ -65,8 +74,8 @@ def generate_many(count: int, seed: int, families: Sequence[str] = ()) -> list[G
 
 def family_turns(count: int, seed: int, families: Sequence[str] = ()) -> list[str]:
     """The families of the objects of `generate_many`, in their order."""
-    _check(seed, families)
-    chosen = tuple(families) or FAMILIES
+    chosen = [name for entry in families or ("basic",) for name in GROUPS.get(entry, (entry,))]
+    _check(seed, chosen)
     return [chosen[(seed + i) % len(chosen)] for i in range(count)]
 
 
@@ -76,13 +85,16 @@ def _check(seed: int, families: Sequence[str]) -> None:
         raise CongraspError(f"The seed {seed} is negative.", "Seeds start at 0.")
     for family in families:
         if family not in BUILDERS:
-            raise CongraspError(f"There is no object family '{family}'.", f"Families: {', '.join(FAMILIES)}.")
+            raise CongraspError(
+                f"There is no object family '{family}'.", f"Families: {', '.join((*FAMILIES, *GROUPS))}."
+            )
 
 
 def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> GraspObject | None:
     """The object of a draft without its resting poses, or None where its size or its parts are out of range."""
+    sizes, masses = (_SIZE_RANGE, MASS_RANGE) if family in BASIC else (_HOUSEHOLD_SIZE_RANGE, HOUSEHOLD_MASS_RANGE)
     weight = np.array(draft.weight or [1.0] * max(1, len(draft.part_names)))
-    densities = rng.uniform(*_DENSITY_RANGE) * weight[[piece.part for piece in draft.pieces]]
+    densities = rng.uniform(*draft.density) * weight[[piece.part for piece in draft.pieces]]
     mass, center, inertia = mass_properties(draft.pieces, densities)
     pieces = tuple(
         dataclasses.replace(piece, pos=tuple((np.array(piece.pos) - center).tolist())) for piece in draft.pieces
@@ -99,9 +111,9 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
         graspable = np.array([first, not first])
         labels = halves(points, rng.uniform(0.35, 0.65))
     share = graspable[labels].mean()
-    if not (_SIZE_RANGE[0] <= size <= _SIZE_RANGE[1] and _LEAST_SHARE <= share <= 1 - _LEAST_SHARE):
+    if not (sizes[0] <= size <= sizes[1] and _LEAST_SHARE <= share <= 1 - _LEAST_SHARE):
         return None
-    clipped = float(np.clip(mass, *MASS_RANGE))
+    clipped = float(np.clip(mass, *masses))
     meshes = [shapes.tessellate(piece) for piece in pieces]
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes[:-1])])
     return GraspObject(

@@ -44,7 +44,7 @@ def generate(
     Args:
       objects: Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7.
       count: Besides, this many procedural objects.
-      families: Their families, in turn; all if none is named.
+      families: Their families, in turn, or groups of them: basic (if none is named), household, all.
       first_seed: Seed of the first of them; the others follow.
       hand: Name of the hand, or its file.
       references: closed: poses that close the hand around the object; policy: final states of a policy's grasps under

@@ -23,7 +23,7 @@ def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tup
       out: Folder for the objects.
       count: Number of objects.
       seed: Seed of the first; the others follow. Training never uses seeds from one million upward.
-      families: Families, in turn; all if none is named.
+      families: Families, in turn, or groups of them: basic (if none is named), household, all.
     """
     from common.objects import procedural
     from common.objects.store import Catalogue

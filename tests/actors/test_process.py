@@ -1,7 +1,9 @@
 """What an actor sends, with rollouts that a test invents and a real learner's end."""
 
+import dataclasses
 import threading
 import types
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -74,6 +76,7 @@ class InventedWorker:
     """Stands in for environments: gives the same rollout again and again."""
 
     rollout: Rollout
+    weights: ClassVar[list[np.ndarray]] = []
 
     def __init__(self, *args, **options):
         neutral = goal_of(HAND, CONFIG.task, GraspRequest())
@@ -88,6 +91,9 @@ class InventedWorker:
     def renew_references(self):
         pass
 
+    def weigh_objects(self, weight):
+        self.weights.append(weight)
+
     def collect(self, parameters, steps):
         return self.rollout
 
@@ -99,16 +105,17 @@ class InventedWorker:
 def heard(monkeypatch):
     """Runs an actor on one invented rollout; what the learner took, and what the logs heard."""
 
-    def run(rollout: Rollout):
+    def run(rollout: Rollout, config: RunConfig = CONFIG):
+        objects = [procedural.generate(0, "box"), procedural.generate(0, "mug")]
         monkeypatch.setattr(InventedWorker, "rollout", rollout, raising=False)
         monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
-        found = TrainingSet([procedural.generate(0, "box")], None)
+        found = TrainingSet(objects, types.SimpleNamespace(weight=np.ones(len(objects))))
         monkeypatch.setattr(process, "training_set", lambda *args: found)
         broker, stop = MemoryHub(), threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
             logs = server.subscribe(Keys("t").logs, depth=100)
             hub = LearnerHub(
-                server, run="t", config_json=to_json(CONFIG), run_id="e", schema=SPEC.schema, form=FORM,
+                server, run="t", config_json=to_json(config), run_id="e", schema=SPEC.schema, form=FORM,
                 staleness=StalenessManager(0, 1),
             )  # fmt: skip
             algorithm = make_algorithm(SPEC, CONFIG)
@@ -155,3 +162,19 @@ def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(he
     for message in logs.values():
         encode(message)  # a number that JSON has not would be an error here, and the end of the actor
     validate(logs["episode"], EPISODE)
+
+
+@pytest.mark.timeout(60)
+def test_objects_that_fall_are_drawn_more_often_where_the_run_says_so(heard, monkeypatch):
+    monkeypatch.setattr(InventedWorker, "weights", [])
+    episodes = np.zeros((B, len(FIELDS)), np.float32)
+    episodes[:, FIELDS.index("episode/object_index")] = np.arange(B) % 2
+    episodes[:, FIELDS.index("episode/held")] = np.arange(B) % 2  # the box always falls
+    heard(invented(episodes))
+    assert InventedWorker.weights == []
+    config = dataclasses.replace(CONFIG, objects=dataclasses.replace(CONFIG.objects, by_failure=True))
+    _, logs = heard(invented(episodes), config)
+    box, mug = InventedWorker.weights[0]
+    assert 1.0 < box <= 2.0 and 0.5 <= mug < 1.0
+    values = logs["metrics"].meta["values"]
+    assert values["failure/box"] > 2 / 3 > values["failure/mug"]

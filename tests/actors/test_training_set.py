@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from actors import harvest, initial
+from actors.bank import headings_of
 from actors.harvest import Grasps
 from actors.training_set import training_set
 from common.config import ObjectsConfig, RunConfig, TaskConfig
@@ -64,6 +65,12 @@ def test_constraint_sets_keep_their_split_and_their_references(folders):
     for _ in range(4):  # a random place each time
         renewed = harvest.renew(HAND, TaskConfig(), found.bank, grasps, jax.random.key(0))
         np.testing.assert_array_equal(renewed.pose_q[0], found.bank.pose_q[0])
+
+
+@pytest.mark.parametrize("family", procedural.HOUSEHOLD_FAMILIES)
+def test_household_objects_can_be_approached_and_grasped_by_a_part(family):
+    row = headings_of(TaskConfig(), procedural.generate(1, family), (0, 1))
+    assert row["has_affordance"].any()
 
 
 @pytest.mark.parametrize(

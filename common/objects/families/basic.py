@@ -1,122 +1,53 @@
-"""The families of the procedural generator: what pieces a mug, a knife or a ring is made of.
+"""Simple objects: shapes, tools and vessels in outline.
 
-A family is a function of a random generator that returns a `Draft`. Sizes are in metres. The generator
-(`common.objects.procedural`) weighs, recentres and checks what it gets, and asks again where it does not like it.
+Their draws stay as they are, because evaluation's held-out objects come from them.
 """
 
+import functools
 import itertools
-from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
+from common.objects.families import draft
+from common.objects.families.draft import Builder, Draft, Rng
 from common.objects.spec import Piece
 
-Rng = np.random.Generator
-Vector = tuple[float, float, float]
-
-
-class Draft(NamedTuple):
-    """What a family proposes."""
-
-    pieces: tuple[Piece, ...]
-    part_names: tuple[str, ...] = ()
-    """Empty: the object is labelled by its two halves."""
-    graspable: tuple[bool, ...] = ()
-    """Which parts form the graspable region."""
-    weight: tuple[float, ...] = ()
-    """Relative density of each part; empty means equal."""
-
-
-BUILDERS: dict[str, Callable[[Rng], Draft]] = {}
-
-
-def _family(builder: Callable[[Rng], Draft]) -> Callable[[Rng], Draft]:
-    """Enters a family into the table."""
-    BUILDERS[builder.__name__.strip("_")] = builder
-    return builder
-
-
-def _box(half: Vector, center: Vector = (0, 0, 0), part: int = 0) -> Piece:
-    """A box with these half extents."""
-    return Piece("box", half, center, part=part)
-
-
-def _ellipsoid(radii: Vector, center: Vector = (0, 0, 0), part: int = 0) -> Piece:
-    """An ellipsoid with these radii."""
-    return Piece("ellipsoid", radii, center, part=part)
-
-
-def _cylinder(start: Vector, end: Vector, radius: float, part: int = 0) -> Piece:
-    """A cylinder along z."""
-    center, quat, half = _between(start, end)
-    return Piece("cylinder", (radius, half, 0), center, quat, part=part)
-
-
-def _capsule(start: Vector, end: Vector, radius: float, part: int = 0) -> Piece:
-    """A capsule along z."""
-    center, quat, half = _between(start, end)
-    return Piece("capsule", (radius, half, 0), center, quat, part=part)
-
-
-def _between(start: Vector, end: Vector) -> tuple[Vector, tuple[float, float, float, float], float]:
-    """Centre, quaternion (the z axis along the segment) and half length of a segment."""
-    a, b = np.array(start, float), np.array(end, float)
-    x, y, z = (b - a) / np.linalg.norm(b - a)
-    q = np.array([1 + z, -y, x, 0.0]) if z > -1 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
-    q /= np.linalg.norm(q)
-    return tuple((a + b) / 2), tuple(q), float(np.linalg.norm(b - a)) / 2
-
-
-def _mesh(vertices: np.ndarray) -> Piece:
-    """A convex mesh piece."""
-    center = vertices.mean(0)
-    return Piece("mesh", (0, 0, 0), tuple(center), vertices=vertices - center)
-
-
-def _polar(radius: float, turn: float, z: float) -> Vector:
-    """A point by cylindrical coordinates."""
-    return radius * np.cos(turn), radius * np.sin(turn), z
-
-
-def _either(rng: Rng) -> tuple[bool, bool]:
-    """One of two parts, at random."""
-    first = bool(rng.random() < 0.5)
-    return first, not first
+BUILDERS: dict[str, Builder] = {}
+_family = functools.partial(draft.enter, BUILDERS)
 
 
 @_family
 def box(rng: Rng) -> Draft:
     """A cuboid with at least one side under 8 cm."""
     half = [rng.uniform(0.012, 0.04), rng.uniform(0.015, 0.045), rng.uniform(0.02, 0.11)]
-    return Draft((_box(tuple(rng.permutation(half))),))
+    return Draft((draft.box(tuple(rng.permutation(half))),))
 
 
 @_family
 def cylinder(rng: Rng) -> Draft:
     """From a flat tin to a long rod."""
     half = rng.uniform(0.015, 0.11)
-    return Draft((_cylinder((0, 0, -half), (0, 0, half), rng.uniform(0.012, 0.042)),))
+    return Draft((draft.cylinder((0, 0, -half), (0, 0, half), rng.uniform(0.012, 0.042)),))
 
 
 @_family
 def capsule(rng: Rng) -> Draft:
     """A rod with round ends."""
     half = rng.uniform(0.01, 0.08)
-    return Draft((_capsule((0, 0, -half), (0, 0, half), rng.uniform(0.012, 0.04)),))
+    return Draft((draft.capsule((0, 0, -half), (0, 0, half), rng.uniform(0.012, 0.04)),))
 
 
 @_family
 def ellipsoid(rng: Rng) -> Draft:
     """From a pebble to a rugby ball."""
     radii = [rng.uniform(0.015, 0.04), rng.uniform(0.02, 0.045), rng.uniform(0.025, 0.1)]
-    return Draft((_ellipsoid(tuple(rng.permutation(radii))),))
+    return Draft((draft.ellipsoid(tuple(rng.permutation(radii))),))
 
 
 @_family
 def ball(rng: Rng) -> Draft:
     """Nearly a sphere, as fruit is."""
-    return Draft((_ellipsoid(tuple(rng.uniform(0.02, 0.043) * rng.uniform(0.95, 1.05, 3))),))
+    return Draft((draft.ellipsoid(tuple(rng.uniform(0.02, 0.043) * rng.uniform(0.95, 1.05, 3))),))
 
 
 @_family
@@ -125,9 +56,9 @@ def bottle(rng: Rng) -> Draft:
     radius, half = rng.uniform(0.022, 0.038), rng.uniform(0.03, 0.065)
     shoulder, neck = radius * rng.uniform(0.5, 1.0), rng.uniform(0.025, 0.05)
     pieces = (
-        _cylinder((0, 0, -half), (0, 0, half), radius),
-        _ellipsoid((radius, radius, shoulder), (0, 0, half)),
-        _cylinder((0, 0, half), (0, 0, half + shoulder + neck), radius * rng.uniform(0.35, 0.55), part=1),
+        draft.cylinder((0, 0, -half), (0, 0, half), radius),
+        draft.ellipsoid((radius, radius, shoulder), (0, 0, half)),
+        draft.cylinder((0, 0, half), (0, 0, half + shoulder + neck), radius * rng.uniform(0.35, 0.55), part=1),
     )
     grasp_body = bool(rng.random() < 0.75)
     return Draft(pieces, ("body", "neck"), (grasp_body, not grasp_body))
@@ -139,12 +70,12 @@ def mug(rng: Rng) -> Draft:
     radius, half, thick = rng.uniform(0.028, 0.04), rng.uniform(0.035, 0.055), rng.uniform(0.006, 0.009)
     high, reach = half * rng.uniform(0.5, 0.75), radius + rng.uniform(0.024, 0.038)
     pieces = (
-        _cylinder((0, 0, -half), (0, 0, half), radius),
-        _capsule((radius, 0, high), (reach, 0, high), thick, part=1),
-        _capsule((radius, 0, -high), (reach, 0, -high), thick, part=1),
-        _capsule((reach, 0, -high), (reach, 0, high), thick, part=1),
+        draft.cylinder((0, 0, -half), (0, 0, half), radius),
+        draft.capsule((radius, 0, high), (reach, 0, high), thick, part=1),
+        draft.capsule((radius, 0, -high), (reach, 0, -high), thick, part=1),
+        draft.capsule((reach, 0, -high), (reach, 0, high), thick, part=1),
     )
-    return Draft(pieces, ("body", "handle"), _either(rng))
+    return Draft(pieces, ("body", "handle"), draft.either(rng))
 
 
 @_family
@@ -154,10 +85,10 @@ def teapot(rng: Rng) -> Draft:
     ear, rise = radius + rng.uniform(0.028, 0.04), height * rng.uniform(0.5, 0.75)
     tip = (-radius - rng.uniform(0.015, 0.035), 0, height * rng.uniform(0.2, 0.8))
     pieces = (
-        _ellipsoid((radius, radius, height)),
-        _capsule((-0.7 * radius, 0, -0.2 * height), tip, rng.uniform(0.007, 0.01)),
-        _capsule((0.6 * radius, 0, rise), (ear, 0, 0.4 * rise), thick, part=1),
-        _capsule((ear, 0, 0.4 * rise), (0.75 * radius, 0, -0.6 * rise), thick, part=1),
+        draft.ellipsoid((radius, radius, height)),
+        draft.capsule((-0.7 * radius, 0, -0.2 * height), tip, rng.uniform(0.007, 0.01)),
+        draft.capsule((0.6 * radius, 0, rise), (ear, 0, 0.4 * rise), thick, part=1),
+        draft.capsule((ear, 0, 0.4 * rise), (0.75 * radius, 0, -0.6 * rise), thick, part=1),
     )
     return Draft(pieces, ("body", "handle"), (False, True))
 
@@ -167,11 +98,11 @@ def wineglass(rng: Rng) -> Draft:
     """A bowl on a stem on a foot."""
     radius, high, stem = rng.uniform(0.026, 0.036), rng.uniform(0.032, 0.045), rng.uniform(0.06, 0.09)
     pieces = (
-        _ellipsoid((radius, radius, high), (0, 0, stem + 0.9 * high)),
-        _capsule((0, 0, 0), (0, 0, stem), rng.uniform(0.006, 0.009), part=1),
-        _cylinder((0, 0, -0.004), (0, 0, 0.004), rng.uniform(0.028, 0.036), part=1),
+        draft.ellipsoid((radius, radius, high), (0, 0, stem + 0.9 * high)),
+        draft.capsule((0, 0, 0), (0, 0, stem), rng.uniform(0.006, 0.009), part=1),
+        draft.cylinder((0, 0, -0.004), (0, 0, 0.004), rng.uniform(0.028, 0.036), part=1),
     )
-    return Draft(pieces, ("bowl", "stem"), _either(rng))
+    return Draft(pieces, ("bowl", "stem"), draft.either(rng))
 
 
 @_family
@@ -181,7 +112,7 @@ def knife(rng: Rng) -> Draft:
     half = (grip, rng.uniform(0.012, 0.017), rng.uniform(0.009, 0.014))
     edge = (blade, half[1] * rng.uniform(0.8, 1.4), rng.uniform(0.002, 0.0035))
     offset = (grip + blade, half[1] * rng.uniform(-0.3, 0.3), 0)
-    return Draft((_box(half), _box(edge, offset, part=1)), ("handle", "blade"), (True, False), (1, 3))
+    return Draft((draft.box(half), draft.box(edge, offset, part=1)), ("handle", "blade"), (True, False), (1, 3))
 
 
 @_family
@@ -189,7 +120,10 @@ def hammer(rng: Rng) -> Draft:
     """A handle and a heavy head across it."""
     length, radius = rng.uniform(0.12, 0.2), rng.uniform(0.009, 0.014)
     half = (rng.uniform(0.012, 0.018), rng.uniform(0.03, 0.05), rng.uniform(0.012, 0.018))
-    pieces = (_capsule((0, 0, 0), (length, 0, 0), radius), _box(half, (length, rng.uniform(-0.01, 0.01), 0), part=1))
+    pieces = (
+        draft.capsule((0, 0, 0), (length, 0, 0), radius),
+        draft.box(half, (length, rng.uniform(-0.01, 0.01), 0), part=1),
+    )
     return Draft(pieces, ("handle", "head"), (True, False), (1, 3))
 
 
@@ -198,8 +132,8 @@ def screwdriver(rng: Rng) -> Draft:
     """A thick handle and a thin shaft."""
     half, shaft = rng.uniform(0.038, 0.055), rng.uniform(0.06, 0.1)
     pieces = (
-        _cylinder((-half, 0, 0), (half, 0, 0), rng.uniform(0.012, 0.018)),
-        _capsule((half, 0, 0), (half + shaft, 0, 0), rng.uniform(0.0035, 0.0055), part=1),
+        draft.cylinder((-half, 0, 0), (half, 0, 0), rng.uniform(0.012, 0.018)),
+        draft.capsule((half, 0, 0), (half + shaft, 0, 0), rng.uniform(0.0035, 0.0055), part=1),
     )
     return Draft(pieces, ("handle", "shaft"), (True, False), (1, 3))
 
@@ -209,8 +143,8 @@ def flashlight(rng: Rng) -> Draft:
     """A tube with a wider head."""
     half, head = rng.uniform(0.04, 0.065), rng.uniform(0.024, 0.04)
     pieces = (
-        _cylinder((0, 0, -half), (0, 0, half), rng.uniform(0.011, 0.017)),
-        _cylinder((0, 0, half), (0, 0, half + head), rng.uniform(0.02, 0.029), part=1),
+        draft.cylinder((0, 0, -half), (0, 0, half), rng.uniform(0.011, 0.017)),
+        draft.cylinder((0, 0, half), (0, 0, half + head), rng.uniform(0.02, 0.029), part=1),
     )
     return Draft(pieces, ("body", "head"), (True, False))
 
@@ -220,8 +154,8 @@ def lightbulb(rng: Rng) -> Draft:
     """A round head and a socket."""
     radius, high, socket = rng.uniform(0.026, 0.037), rng.uniform(0.03, 0.042), rng.uniform(0.025, 0.04)
     pieces = (
-        _ellipsoid((radius, radius, high)),
-        _cylinder((0, 0, -high - socket), (0, 0, -0.8 * high), radius * rng.uniform(0.38, 0.5), part=1),
+        draft.ellipsoid((radius, radius, high)),
+        draft.cylinder((0, 0, -high - socket), (0, 0, -0.8 * high), radius * rng.uniform(0.38, 0.5), part=1),
     )
     return Draft(pieces, ("head", "socket"), (True, False))
 
@@ -236,12 +170,12 @@ def dumbbell(rng: Rng) -> Draft:
     for side in (-1, 1):
         center = (0, 0, side * (half + thick))
         if shape == 0:
-            ends.append(_ellipsoid((end, end, 1.5 * thick), center, part=1))
+            ends.append(draft.ellipsoid((end, end, 1.5 * thick), center, part=1))
         elif shape == 1:
-            ends.append(_cylinder((0, 0, side * half), (0, 0, side * (half + 2 * thick)), end, part=1))
+            ends.append(draft.cylinder((0, 0, side * half), (0, 0, side * (half + 2 * thick)), end, part=1))
         else:
-            ends.append(_box((end, end, thick), center, part=1))
-    bar = _capsule((0, 0, -half - thick), (0, 0, half + thick), radius)
+            ends.append(draft.box((end, end, thick), center, part=1))
+    bar = draft.capsule((0, 0, -half - thick), (0, 0, half + thick), radius)
     return Draft((bar, *ends), ("bar", "ends"), (True, False), (1, 2))
 
 
@@ -251,8 +185,8 @@ def pan(rng: Rng) -> Draft:
     radius, half, handle = rng.uniform(0.035, 0.055), rng.uniform(0.009, 0.016), rng.uniform(0.07, 0.11)
     grip, rise = rng.uniform(0.009, 0.013), rng.uniform(0.0, 0.02)
     pieces = (
-        _capsule((0.9 * radius, 0, 0), (radius + handle, 0, rise), grip),
-        _cylinder((0, 0, -half), (0, 0, half), radius, part=1),
+        draft.capsule((0.9 * radius, 0, 0), (radius + handle, 0, rise), grip),
+        draft.cylinder((0, 0, -half), (0, 0, half), radius, part=1),
     )
     return Draft(pieces, ("handle", "disc"), (True, False))
 
@@ -263,8 +197,8 @@ def spoon(rng: Rng) -> Draft:
     length, scoop = rng.uniform(0.1, 0.145), rng.uniform(0.026, 0.038)
     radii = (scoop, scoop * rng.uniform(0.7, 1.0), rng.uniform(0.01, 0.015))
     pieces = (
-        _capsule((0, 0, 0), (length, 0, 0), rng.uniform(0.008, 0.012)),
-        _ellipsoid(radii, (length + 0.8 * scoop, 0, 0), part=1),
+        draft.capsule((0, 0, 0), (length, 0, 0), rng.uniform(0.008, 0.012)),
+        draft.ellipsoid(radii, (length + 0.8 * scoop, 0, 0), part=1),
     )
     return Draft(pieces, ("handle", "scoop"), (True, False))
 
@@ -274,8 +208,8 @@ def brush(rng: Rng) -> Draft:
     """A rod with a block on its end."""
     length, half = rng.uniform(0.08, 0.12), rng.uniform(0.03, 0.045)
     pieces = (
-        _capsule((0, 0, 0), (length, 0, 0), rng.uniform(0.009, 0.014)),
-        _box((half, rng.uniform(0.018, 0.03), rng.uniform(0.01, 0.016)), (length + half, 0, 0), part=1),
+        draft.capsule((0, 0, 0), (length, 0, 0), rng.uniform(0.009, 0.014)),
+        draft.box((half, rng.uniform(0.018, 0.03), rng.uniform(0.01, 0.016)), (length + half, 0, 0), part=1),
     )
     return Draft(pieces, ("handle", "head"), (True, False))
 
@@ -286,8 +220,8 @@ def camera(rng: Rng) -> Draft:
     half = (rng.uniform(0.045, 0.065), rng.uniform(0.013, 0.022), rng.uniform(0.028, 0.04))
     lens, side = rng.uniform(0.02, 0.04), rng.uniform(-0.3, 0.3) * half[0]
     pieces = (
-        _box(half),
-        _cylinder((side, half[1], 0), (side, half[1] + lens, 0), half[2] * rng.uniform(0.6, 0.85), part=1),
+        draft.box(half),
+        draft.cylinder((side, half[1], 0), (side, half[1] + lens, 0), half[2] * rng.uniform(0.6, 0.85), part=1),
     )
     return Draft(pieces, ("body", "lens"), (True, False))
 
@@ -304,10 +238,10 @@ def cross(rng: Rng) -> Draft:
         center = axes[0] * rng.uniform(-0.02, 0.02) * (i > 0)
         if as_box:
             size = tuple(np.where(axes[i] > 0, half, thick))
-            pieces.append(_box(size, tuple(center), part=min(i, 1)))
+            pieces.append(draft.box(size, tuple(center), part=min(i, 1)))
         else:
             ends = tuple(center - half * axes[i]), tuple(center + half * axes[i])
-            pieces.append(_capsule(*ends, thick, part=min(i, 1)))
+            pieces.append(draft.capsule(*ends, thick, part=min(i, 1)))
     return Draft(tuple(pieces), ("long bar", "cross bars"), (True, False))
 
 
@@ -323,7 +257,7 @@ def compound(rng: Rng) -> Draft:
         direction = rng.normal(size=3)
         center = direction / np.linalg.norm(direction) * rng.uniform(0.03, 0.045) if i else np.zeros(3)
         pieces.append(Piece(kind, size, tuple(center), tuple(q / np.linalg.norm(q)), part=min(i, 1)))
-    return Draft(tuple(pieces), ("core", "growths"), _either(rng))
+    return Draft(tuple(pieces), ("core", "growths"), draft.either(rng))
 
 
 @_family
@@ -333,8 +267,8 @@ def ring(rng: Rng) -> Draft:
     rim = np.pi / 4 * (np.arange(8) + 0.5)
     profile = np.stack([major + thick * np.cos(rim), high * np.sin(rim)], -1)
     turns = 2 * np.pi / 8 * np.arange(9)
-    ends = [np.array([_polar(r, turn, z) for r, z in profile]) for turn in turns]
-    return Draft(tuple(_mesh(np.concatenate(pair)) for pair in itertools.pairwise(ends)))
+    ends = [np.array([draft.polar(r, turn, z) for r, z in profile]) for turn in turns]
+    return Draft(tuple(draft.mesh(np.concatenate(pair)) for pair in itertools.pairwise(ends)))
 
 
 @_family
@@ -354,9 +288,9 @@ def cup(rng: Rng) -> Draft:
 def _vessel(bottom: float, top: float, height: float, wall: float) -> Draft:
     """A floor and a wall of seven sides; radii at bottom and top, height and thickness in m."""
     turns = 2 * np.pi / 7 * np.arange(8)
-    floor = np.array([_polar(bottom, turn, z) for turn in turns[:-1] for z in (0.0, wall)])
-    pieces = [_mesh(floor)]
+    floor = np.array([draft.polar(bottom, turn, z) for turn in turns[:-1] for z in (0.0, wall)])
+    pieces = [draft.mesh(floor)]
     for pair in itertools.pairwise(turns):
         corners = [(bottom - wall, wall), (bottom, wall), (top - wall, height), (top, height)]
-        pieces.append(_mesh(np.array([_polar(r, turn, z) for turn in pair for r, z in corners])))
+        pieces.append(draft.mesh(np.array([draft.polar(r, turn, z) for turn in pair for r, z in corners])))
     return Draft(tuple(pieces))

@@ -1,0 +1,225 @@
+"""Random solids and toys: lathed and extruded profiles, blobs, animals, clusters."""
+
+import functools
+
+import numpy as np
+
+from common.objects.families import draft
+from common.objects.families.draft import Builder, Draft, Rng
+from common.objects.families.profiles import extrude, hull, lathe, ring, smooth, sweep
+from common.objects.spec import Piece
+
+BUILDERS: dict[str, Builder] = {}
+_family = functools.partial(draft.enter, BUILDERS)
+_GOLDEN = np.pi * (3 - np.sqrt(5))
+_CORNERS = 60
+
+
+@_family
+def lathed(rng: Rng) -> Draft:
+    """A random smooth profile turned around an axis."""
+    height, count = rng.uniform(0.06, 0.22), 9
+    radii = smooth(rng, count, rng.uniform(0.012, 0.025), rng.uniform(0.028, 0.048))
+    profile = list(zip(np.linspace(0, height, count), radii, strict=True))
+    return Draft(tuple(lathe(profile, squash=rng.choice([1.0, rng.uniform(0.6, 1.0)]))))
+
+
+@_family
+def extruded(rng: Rng) -> Draft:
+    """A random outline, convex or not, with a height, and a taper on some."""
+    count = rng.integers(5, 13)
+    turns = 2 * np.pi / count * (np.arange(count) + rng.uniform(-0.3, 0.3, count))
+    radii = rng.uniform(0.02, 0.05) * (1 + rng.uniform(0, 0.5) * rng.uniform(-1, 1, count))
+    outline = radii[:, None] * np.stack([np.cos(turns), np.sin(turns)], -1) * [1, rng.uniform(0.5, 1)]
+    taper = rng.choice([1.0, rng.uniform(0.5, 1.0)])
+    return Draft(tuple(extrude(outline, 0.0, rng.uniform(0.02, 0.18), taper=taper)))
+
+
+@_family
+def prism(rng: Rng) -> Draft:
+    """A prism, a frustum or a pyramid of three to eight sides."""
+    count, taper = rng.integers(3, 9), rng.choice([1.0, rng.uniform(0.05, 1.0)])
+    outline = ring(rng.uniform(0.025, 0.055), 0.0, int(count), rng.uniform(0.6, 1.0))[:, :2]
+    return Draft(tuple(extrude(outline, 0.0, rng.uniform(0.03, 0.15), taper=taper)))
+
+
+@_family
+def bracket(rng: Rng) -> Draft:
+    """Bars in the shape of an L, T, U, Z or H."""
+    a, b, c = rng.uniform(0.03, 0.075), rng.uniform(0.03, 0.07), rng.uniform(0.03, 0.07)
+    bar, thick = rng.uniform(0.014, 0.028), rng.uniform(0.014, 0.045)
+    strokes: dict[str, list[list[tuple[float, float]]]] = {
+        "L": [[(b, 0), (0, 0), (0, 2 * a)]],
+        "T": [[(0, 0), (0, 2 * a)], [(-b, 2 * a), (c, 2 * a)]],
+        "U": [[(-b, 2 * a), (-b, 0), (b, 0), (b, 2 * c)]],
+        "Z": [[(-b, 0), (0, 0), (0.3 * b, 2 * a), (b + c, 2 * a)]],
+        "H": [[(-b, -a), (-b, a)], [(b, -c), (b, c)], [(-b, 0), (b, 0)]],
+    }
+    kind = str(rng.choice(list(strokes)))
+    pieces = []
+    for stroke in strokes[kind]:
+        path = np.array([(x, y, 0.0) for x, y in stroke])
+        pieces += sweep(path, (0, 0, 1), bar, thick)
+    return Draft(tuple(pieces), density=(300.0, 1500.0))
+
+
+@_family
+def banana(rng: Rng) -> Draft:
+    """A bent bar that is thinner at its ends."""
+    bend, length = rng.uniform(0.5, 2.2), rng.uniform(0.1, 0.19)
+    turns, radius = np.linspace(-bend / 2, bend / 2, 7), length / bend
+    path = radius * np.stack([np.sin(turns), np.cos(turns), 0 * turns], -1)
+    thick = rng.uniform(0.024, 0.042) * np.array([0.3, 0.75, 0.95, 1.0, 0.95, 0.75, 0.35])
+    return Draft(tuple(sweep(path, (0, 0, 1), thick, thick * rng.uniform(0.7, 1.1), rounded=True)))
+
+
+@_family
+def blob(rng: Rng) -> Draft:
+    """A potato, a stone, or two of them grown together."""
+    radii = rng.uniform(0.02, 0.04), rng.uniform(0.025, 0.045), rng.uniform(0.028, 0.06)
+    pieces = [_blob(rng, radii, (0, 0, 0))]
+    if rng.random() < 0.4:
+        away = np.array([0.7 * radii[0], 0, 0.7 * radii[2]])
+        pieces.append(_blob(rng, tuple(rng.uniform(0.5, 0.8) * np.array(radii)), tuple(away)))
+    return Draft(tuple(pieces))
+
+
+@_family
+def dome(rng: Rng) -> Draft:
+    """The upper half of an egg: a computer mouse, a bun, a piece of soap."""
+    x, y, z = rng.uniform(0.024, 0.04), rng.uniform(0.03, 0.065), rng.uniform(0.018, 0.045)
+    lean = rng.uniform(-0.3, 0.3)
+    heights = np.array([0.0, 0.35, 0.65, 0.85, 0.97])
+    rings = [
+        ring(x, h * z, 12) * [w, w * y / x, 1] + [0, lean * h * y, 0]
+        for h, w in zip(heights, np.sqrt(1 - heights**2), strict=True)
+    ]
+    return Draft((hull(*rings),))
+
+
+@_family
+def piggy(rng: Rng) -> Draft:
+    """A round body on four legs with a snout and two ears."""
+    length, wide, high = rng.uniform(0.04, 0.07), rng.uniform(0.03, 0.046), rng.uniform(0.03, 0.046)
+    leg, thick = rng.uniform(0.015, 0.03), rng.uniform(0.008, 0.013)
+    pieces: list[Piece] = [draft.ellipsoid((length, wide, high))]
+    for x in (-0.5, 0.5):
+        for y in (-0.5, 0.5):
+            foot = np.array([x * length, y * wide, -0.8 * high])
+            pieces.append(
+                hull(ring(thick, -leg - 0.2 * high, 8) + foot, ring(1.2 * thick, 0.3 * high, 8) + foot, part=1)
+            )
+    snout = draft.cylinder((0.85 * length, 0, 0), (length + rng.uniform(0.006, 0.02), 0, 0), 0.4 * high, part=1)
+    for y in (-1, 1):
+        root = np.array([0.55 * length, 0.45 * y * wide, 0.6 * high])
+        base = root + np.array([(0.0, -0.008, 0), (0.0, 0.008, 0), (-0.01, 0, 0)])
+        pieces.append(hull(base, [np.add(root, (0.006, 0.006 * y, rng.uniform(0.02, 0.03)))], part=1))
+    return Draft((*pieces, snout), ("body", "limbs"), (True, False))
+
+
+@_family
+def animal(rng: Rng) -> Draft:
+    """A body, a head on a neck, a tail, and four legs or a flat belly."""
+    body = rng.uniform(0.035, 0.06), rng.uniform(0.022, 0.038), rng.uniform(0.022, 0.038)
+    head, lift = rng.uniform(0.016, 0.028), rng.uniform(0.02, 0.06)
+    crown = np.array([body[0] * rng.uniform(0.7, 1.0), 0, body[2] + lift])
+    nose = np.add(crown, (head + rng.uniform(0.01, 0.025), 0, -0.2 * head))
+    half = 0.4 * head
+    pieces: list[Piece] = [
+        draft.ellipsoid(body),
+        draft.ellipsoid((1.1 * head, head, head), tuple(crown), part=1),
+        draft.capsule((0.6 * body[0], 0, 0.3 * body[2]), tuple(crown), 0.55 * head, part=1),
+        hull([(crown[0], y, crown[2] + z) for y in (-half, half) for z in (-half, half)], [nose], part=1),
+        draft.capsule(
+            (-0.7 * body[0], 0, 0.3 * body[2]), (-body[0] - 0.02, 0, body[2] * rng.uniform(0, 1.2)), 0.007, part=1
+        ),
+    ]
+    if rng.random() < 0.6:
+        leg, thick = rng.uniform(0.02, 0.05), rng.uniform(0.006, 0.01)
+        for x in (-0.55, 0.55):
+            for y in (-0.6, 0.6):
+                foot = np.array([x * body[0], y * body[1], -0.4 * body[2]])
+                pieces.append(hull(ring(thick, -leg, 6) + foot, ring(thick, 0.0, 6) + foot, part=1))
+    else:
+        pieces.append(hull(ring(0.7 * body[1], -body[2], 12), ring(0.9 * body[1], -0.3 * body[2], 12)))
+    return Draft(tuple(pieces), ("body", "limbs"), draft.either(rng))
+
+
+@_family
+def car(rng: Rng) -> Draft:
+    """A chassis, a cabin and four wheels."""
+    x, y, z = rng.uniform(0.045, 0.08), rng.uniform(0.02, 0.032), rng.uniform(0.009, 0.016)
+    wheel, cabin = rng.uniform(0.011, 0.018), rng.uniform(0.015, 0.03)
+    base = np.array([(s * 0.55 * x, t * 0.95 * y, z) for s in (-1, 1) for t in (-1, 1)])
+    pieces = [draft.box((x, y, z)), hull(base, base * [0.7, 0.85, 1] + [0, 0, cabin])]
+    for s in (-0.6, 0.6):
+        for side in (-1, 1):
+            disc = ring(wheel, 0, 12)[:, [0, 2, 1]] + [s * x, 0, -z]
+            pieces.append(hull(np.add(disc, (0, side * 0.8 * y, 0)), np.add(disc, (0, side * (y + 0.006), 0)), part=1))
+    return Draft(tuple(pieces), ("body", "wheels"), (True, False))
+
+
+@_family
+def figure(rng: Rng) -> Draft:
+    """A doll that stands on a foot: trunk, head and arms."""
+    high, wide, deep = rng.uniform(0.06, 0.11), rng.uniform(0.016, 0.026), rng.uniform(0.014, 0.022)
+    head = rng.uniform(0.015, 0.026)
+    shoulder, hand = np.array([0, wide, 0.85 * high]), rng.uniform(0.03, 0.05)
+    turn = rng.uniform(-1.0, 1.0, 2)
+    pieces: list[Piece] = [
+        hull(
+            ring(1.25 * wide, 0, 12, deep / wide),
+            ring(0.8 * wide, 0.55 * high, 12, deep / wide),
+            ring(wide, high, 12, deep / wide),
+        ),
+        draft.ellipsoid((head, head, 1.15 * head), (0, 0, high + 0.95 * head), part=1),
+    ]
+    for side, t in zip((-1, 1), turn, strict=True):
+        start = shoulder * [1, side * 0.8, 1]
+        pieces.append(
+            draft.capsule(
+                tuple(start), tuple(start + hand * np.array([0.3, side * np.cos(t), np.sin(t)])), 0.008, part=1
+            )
+        )
+    if rng.random() < 0.5:
+        pieces.append(draft.cylinder((0, 0, -0.006), (0, 0, 0.002), 1.6 * wide))
+    return Draft(tuple(pieces), ("trunk", "limbs"), (True, False))
+
+
+@_family
+def cluster(rng: Rng) -> Draft:
+    """Four to eight random pieces, each grown out of an earlier one."""
+    centers, radii, pieces = (
+        [np.zeros(3)],
+        [rng.uniform(0.02, 0.034)],
+        [_chunk(rng, rng.uniform(0.02, 0.034), np.zeros(3))],
+    )
+    for _ in range(rng.integers(3, 8)):
+        parent = rng.integers(len(centers))
+        radius, way = rng.uniform(0.011, 0.026), rng.normal(size=3)
+        center = centers[parent] + (0.75 * radii[parent] + 0.5 * radius) * way / np.linalg.norm(way)
+        centers.append(center)
+        radii.append(radius)
+        pieces.append(_chunk(rng, radius, center, part=1))
+    return Draft(tuple(pieces), ("core", "growths"), draft.either(rng))
+
+
+def _chunk(rng: Rng, radius: float, center: np.ndarray, part: int = 0) -> Piece:
+    """A random convex piece of about this radius: a block, a prism or a stone, turned at random."""
+    stretch = rng.uniform(0.7, 1.5, 3)
+    if rng.random() < 0.4:
+        return _blob(rng, tuple(radius * stretch), tuple(center), part)
+    outline = ring(radius, 0.0, int(rng.integers(3, 8)))
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    corners = np.concatenate([outline - [0, 0, radius], rng.uniform(0.4, 1.0) * outline + [0, 0, radius]]) * stretch
+    return hull(corners @ turn.T + center, part=part)
+
+
+def _blob(rng: Rng, radii: tuple[float, ...], center: tuple[float, ...], part: int = 0) -> Piece:
+    """The hull of an egg whose surface is dented by waves."""
+    i = np.arange(_CORNERS) + 0.5
+    z = 1 - 2 * i / _CORNERS
+    unit = np.stack([np.sqrt(1 - z**2) * np.cos(_GOLDEN * i), np.sqrt(1 - z**2) * np.sin(_GOLDEN * i), z], -1)
+    waves, phases = rng.normal(size=(4, 3)) * 1.5, rng.uniform(0, 2 * np.pi, 4)
+    dented = unit * (1 + 0.07 * np.sin(unit @ waves.T + phases).sum(-1))[:, None]
+    return hull(dented * radii + center, part=part)
