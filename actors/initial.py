@@ -70,7 +70,16 @@ def sample(
         c.name: jax.random.uniform(own_key(key, c.name, 0), (batch,)) < getattr(task, f"p_{c.name}")
         for c in optional(task)
     }
-    return _drawn(hand, task, Draw(bank, objects, rests), next(keys), wanted, stationary)
+    draw = Draw(bank, objects, rests, disturbance=_disturbance(task, own_key(key, "disturbance", 0), batch))
+    return _drawn(hand, task, draw, next(keys), wanted, stationary)
+
+
+def _disturbance(task: TaskConfig, key: Array, batch: int) -> Array | None:
+    """(B,) between 0 and 1, how far an episode's references are off; None where none ever is."""
+    if not task.disturbed_references:
+        return None
+    which, amount = jax.random.uniform(key, (2, batch))
+    return jnp.where(which < task.disturbed_references, amount, 0.0)
 
 
 class PlannedEpisodes(NamedTuple):

@@ -123,6 +123,9 @@ class TaskConfig(_Shares):
     aligned_references: bool = False
     """An episode with a reference pose and a wrist trajectory gets the trajectory to that pose; otherwise the two are
     drawn independently, as in the paper, and the trajectory may end elsewhere."""
+    disturbed_references: float = 0.0
+    """Share of the episodes whose reference pose and wrist trajectory have errors as captured ones have
+    (`common.task.sampling.disturbances`)."""
     mass_range: tuple[float, float] = (1.0, 1.0)
     """Factors of the object's mass, uniform at every reset."""
     friction_range: tuple[float, float] = (1.0, 1.0)

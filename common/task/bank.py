@@ -101,6 +101,9 @@ class Draw(NamedTuple):
     reference: Mapping[str, Array] = MappingProxyType({})
     """(B,) int by the name of each constraint that is drawn from references: one that it allows, if there is any."""
 
+    disturbance: Array | None = None
+    """(B,) between 0 and 1, how far references are off (`common.task.sampling.disturbances`); None for not at all."""
+
     @property
     def allowed(self) -> Array:
         """(B, M) bool: references that the table leaves room for."""

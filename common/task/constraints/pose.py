@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,6 +22,7 @@ from common.task.constraints.base import (
 )
 from common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
 from common.task.geometry import flat, in_world, square, squared_distances, wrist_to_joints
+from common.task.sampling.disturbances import disturbed_fingers, disturbed_wrist
 from common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
@@ -95,7 +97,13 @@ class Pose(Constraint):
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> PoseGoal:
         """One of the object's reference poses."""
         index = draw.objects, draw.region, draw.reference["pose"]
-        return PoseGoal(draw.bank.pose_q[index], draw.bank.pose_position[index], draw.bank.pose_quaternion[index])
+        q, *wrist = draw.bank.pose_q[index], draw.bank.pose_position[index], draw.bank.pose_quaternion[index]
+        if draw.disturbance is not None:
+            finger_key, wrist_key = jax.random.split(key)
+            q = disturbed_fingers(hand, q, draw.disturbance, finger_key)
+            wrist = disturbed_wrist(*(part[:, None] for part in wrist), draw.disturbance, wrist_key)
+            wrist = [part[:, 0] for part in wrist]
+        return PoseGoal(q, *wrist)
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
         """The heading becomes that of the reference pose."""

@@ -22,6 +22,7 @@ from common.task.constraints.base import (
 from common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
 from common.task.constraints.pose import heading_message
 from common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
+from common.task.sampling.disturbances import disturbed_wrist
 from common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
@@ -84,7 +85,10 @@ class Trajectory(Constraint):
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> TrajectoryGoal:
         """The trajectory to one of the object's reference poses."""
         index = draw.objects, draw.region, draw.reference["trajectory"]
-        return TrajectoryGoal(draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index])
+        path = draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index]
+        if draw.disturbance is not None:
+            path = disturbed_wrist(*path, draw.disturbance, key)
+        return TrajectoryGoal(*path)
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
         """The last waypoint is the wrist of a reference pose, and the heading becomes the waypoint's."""

@@ -1,0 +1,59 @@
+"""Errors that references of people's hands have, for training: tracked joints, depth, wrists and waypoints are never exact.
+
+A captured pose is off by some tenths of a radian in its joints and by a centimetre in its wrist, its fingers are more or
+less closed than those of the hand that follows it, and the waypoints of a captured path jitter. What an episode is asked
+for is disturbed by an amount of its own, between nothing and all of the below.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from common import rotations
+from common.hands.spec import Hand
+from common.task.types import Array
+
+JOINTS = 0.3
+"""rad, largest standard deviation of an independent error of every finger joint."""
+CLOSURE = (0.6, 1.1)
+"""Least and greatest share of the way from the open hand to the reference's fingers that is asked for."""
+WRIST = 0.01, 0.2
+"""m and rad, largest standard deviation of the wrist's errors along and about each axis."""
+JITTER = 0.005
+"""m, largest standard deviation of an independent error of every coordinate of every waypoint but the last."""
+
+
+def disturbed_fingers(hand: Hand, q: Array, amount: Array, key: Array) -> Array:
+    """Reference fingers (B, F) with errors, within their limits.
+
+    Args:
+      hand: the hand.
+      q: (B, F) rad.
+      amount: (B,) between 0 and 1, share of the largest errors.
+      key: random key.
+    """
+    closure_key, joint_key = jax.random.split(key)
+    share = jax.random.uniform(closure_key, (len(q), 1), minval=CLOSURE[0], maxval=CLOSURE[1])
+    q_open, amount = jnp.array(hand.q_open), amount[:, None]
+    q = q_open + (1 + amount * (share - 1)) * (q - q_open)
+    return jnp.clip(q + amount * JOINTS * jax.random.normal(joint_key, q.shape), hand.lower, hand.upper)
+
+
+def disturbed_wrist(position: Array, quaternion: Array, amount: Array, key: Array) -> tuple[Array, Array]:
+    """Wrist poses (B, K, 3), (B, K, 4) moved and turned by one error for all K, with waypoints that jitter.
+
+    All turn about the last one, so that a path keeps its shape.
+
+    Args:
+      position: m, object frame.
+      quaternion: wrist frame to object frame.
+      amount: (B,) between 0 and 1, share of the largest errors.
+      key: random key.
+    """
+    move_key, turn_key, jitter_key = jax.random.split(key, 3)
+    amount = amount[:, None]
+    move = amount * WRIST[0] * jax.random.normal(move_key, (len(position), 3))
+    turn = rotations.from_rotation_vector(amount * WRIST[1] * jax.random.normal(turn_key, (len(position), 3)))
+    jitter = amount[..., None] * JITTER * jax.random.normal(jitter_key, position.shape)
+    jitter = jitter.at[:, -1].set(0.0)
+    turn, last = jnp.broadcast_to(turn[:, None], quaternion.shape), position[:, -1:]
+    return last + move[:, None] + rotations.rotate(turn, position - last) + jitter, rotations.multiply(turn, quaternion)
