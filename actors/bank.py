@@ -56,6 +56,7 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
+    grasp_frame(hand)  # kept; inside of a trace, it would be compiled operation by operation
     count, scale = len(objects), object_scale(hand, task)
     seeds = [(seed, n) for n in range(count)]
     rows = parallel_map(
@@ -72,28 +73,45 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
         fill = np.resize(np.arange(len(row["rest"])), rests)
         row["rest"], row["has_affordance"] = row["rest"][fill], row["has_affordance"][fill]
         row["heading_index"], row["heading_back"] = row["heading_index"][:, fill], row["heading_back"][:, fill]
-    columns = {name: jnp.asarray(np.stack([row[name] for row in rows])) for name in rows[0]}
-    surfaces = [
-        jnp.asarray(np.stack([getattr(obj, name) for obj in objects]), jnp.float32) for name in ("points", "normals")
-    ]
-    poses = _closed(hand, *surfaces, *(columns.pop(f"chosen_{name}") for name in Headings._fields))
+    columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    chosen = [columns.pop(f"chosen_{name}") for name in Headings._fields]
+    surfaces = [np.stack([getattr(obj, name) for obj in objects]).astype(np.float32) for name in ("points", "normals")]
+    key = jax.random.key(seed)
+    references = _references(hand, *surfaces, *chosen, columns["rest"], key, waypoints=task.trajectory_points)
+    weight, renewable = np.ones(count, np.float32), np.ones(count, bool)
+    return jax.device_put(ConstraintBank(**columns, **references, weight=weight, renewable=renewable))
+
+
+@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
+def _references(
+    hand: Hand,
+    points: Array,
+    normals: Array,
+    position: Array,
+    direction: Array,
+    cross: Array,
+    rest: Array,
+    key: Array,
+    *,
+    waypoints: int,
+) -> dict[str, Array]:
+    """The bank's poses and trajectories: the hand closed around N objects (N, P, 3) at headings (N, V, M, 3)."""
+    poses = _closed(hand, points, normals, position, direction, cross)
+    shape = position.shape[:-1]
     flat = Poses(*(field.reshape(-1, field.shape[-1]) for field in poses))
-    rest = jnp.repeat(columns["rest"], 2 * POSES, axis=0)
-    path, turns, valid = make_references(hand, flat, rest, jax.random.key(seed), task.trajectory_points)
-    shape = (len(objects), 2, POSES)
-    return ConstraintBank(
-        **columns,
-        pose_q=poses.q,
-        pose_position=poses.position,
-        pose_quaternion=poses.quaternion,
-        trajectory_position=path.reshape(*shape, *path.shape[1:]),
-        trajectory_quaternion=turns.reshape(*shape, *turns.shape[1:]),
-        pose_valid=jnp.swapaxes(valid.reshape(*shape, -1), -1, -2),
-        weight=jnp.ones(len(objects)),
-        renewable=jnp.ones(len(objects), bool),
-    )
+    rest = jnp.repeat(rest, 2 * POSES, axis=0)
+    path, turns, valid = make_references(hand, flat, rest, key, waypoints)
+    return {
+        "pose_q": poses.q,
+        "pose_position": poses.position,
+        "pose_quaternion": poses.quaternion,
+        "trajectory_position": path.reshape(*shape, *path.shape[1:]),
+        "trajectory_quaternion": turns.reshape(*shape, *turns.shape[1:]),
+        "pose_valid": jnp.swapaxes(valid.reshape(*shape, -1), -1, -2),
+    }
 
 
+@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
 def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int) -> tuple[Array, Array, Array]:
     """A trajectory to each of M reference poses, and where the two can be used.
 
@@ -151,7 +169,6 @@ def above_table(path: Array, rest: Array) -> Array:
     return jnp.min(jnp.einsum("mri,mki->mrk", up, path), -1) + rest[..., 2] > _CLEARANCE
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Poses:
     """Reference poses (N, V, M, ...) at headings (N, V, M, 3) by closing the hand around the objects."""
 

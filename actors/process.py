@@ -153,6 +153,9 @@ class _Actor:
                 self._link.give_back(ticket)
         assert self._bundle is not None
         self._configure(self._bundle.version)
+        if self._physics.compiled:
+            self._worker.compile(self._bundle.inference_parameters, self._config.rollout_steps)
+            return
         for _ in range(2):  # the second time, environments have been restarted, which is traced apart
             self._worker.collect(self._bundle.inference_parameters, self._config.rollout_steps)
             self._worker.restart()

@@ -4,6 +4,7 @@ With a compiled engine the whole rollout is one program (`jax.lax.scan`); with o
 functions are compiled piecewise around its step.
 """
 
+import concurrent.futures
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -126,13 +127,13 @@ class RolloutWorker:
           traced: of which environments a trace is kept.
         """
         self.physics, self.env = physics, GraspEnv(hand, task, physics)
-        self._hand, self._task, self._bank, self._policy = hand, task, bank, policy
+        self._hand, self._task, self._bank, self._policy = hand, task, _on_device(bank), policy
         self._probe, self._traced, self.batch = probe, traced, batch
         self._dtype = jnp.float16 if half_precision else jnp.float32
         self._settings, self._stationary = self.env.settings, np.array(False)
-        self._episode_key, self._key = jax.random.split(jax.random.key(seed))
+        self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
         self._sample_jit = jax.jit(self._sample)
-        self._begin_jit = jax.jit(self.env.state_of)
+        self._begin_jit = jax.jit(self._begin)
         self._decide_jit = jax.jit(self._decide)
         self._advance_jit = jax.jit(self._advance)
         self._merge_jit = jax.jit(self._merge)
@@ -153,29 +154,43 @@ class RolloutWorker:
     def replace_objects(self, objects: Sequence[GraspObject], bank: ConstraintBank | None) -> None:
         """Episodes that start from now on are drawn from these objects, as many as before, and their bank."""
         physics = self.physics.replace_objects(self.state.physics if self.state else None, objects)
-        self._bank = bank
+        self._bank = _on_device(bank)
         if self.state is not None:
             self.state = self.state._replace(physics=physics if self.physics.compiled else None)
             self.take_grasps()
 
     def restart(self) -> None:
         """Fresh episodes in every environment."""
-        self._episode_key, key = jax.random.split(self._episode_key)
+        self._episode_key, key = _split(self._episode_key)
         self.begin(self._sample_jit(self._bank, key, self._stationary))
 
     def begin(self, conditions: InitialConditions) -> None:
         """Goes on with these episodes, which are about to begin, one for each environment."""
-        if self.state is None:
-            physics = self.physics.start(conditions.reset_state)
-        else:
-            everywhere = np.ones(self.batch, bool)
-            physics = self.physics.reset(self.state.physics, everywhere, conditions.reset_state)
         kept = self.state
-        self.state = self._begin_jit(conditions, physics if self.physics.compiled else None)
-        if not self.physics.compiled:
-            self.state = self._with_scene_jit(self.state._replace(scene=()), self.physics.read(None))
+        if self.physics.compiled:
+            self.state = self._begin_jit(*_on_device((conditions, kept)))
+            return
+        if kept is None:
+            self.physics.start(conditions.reset_state)
+        else:
+            self.physics.reset(None, np.ones(self.batch, bool), conditions.reset_state)
+        state = self._begin_jit(conditions, None)
+        self.state = self._with_scene_jit(state._replace(scene=()), self.physics.read(None))
         if kept is not None:
             self.state = self.state._replace(grasps=kept.grasps)
+
+    def compile(self, parameters: Any, steps: int) -> None:
+        """Compiles what `collect` and `renew_references` run, all at once, and runs nothing; for compiled engines.
+
+        Args:
+          parameters: of the policy, as for `collect`.
+          steps: T.
+        """
+        given, grasps = self._scan_arguments(parameters, self._key), self.state.grasps if self.state else None
+        programs = [self._scan_jit.lower(*given, steps=steps)]
+        programs.append(harvest.renew.lower(self._hand, self._task, self._bank, grasps, self._key))
+        with concurrent.futures.ThreadPoolExecutor(len(programs)) as threads:
+            list(threads.map(lambda program: program.compile(), programs))
 
     @property
     def bank(self) -> ConstraintBank:
@@ -189,14 +204,14 @@ class RolloutWorker:
 
     def renew_references(self) -> None:
         """Puts the grasps that succeeded since the last call into the bank as reference poses."""
-        self._key, key = jax.random.split(self._key)
+        self._key, key = _split(self._key)
         self._bank = harvest.renew(self._hand, self._task, self.bank, self.take_grasps(), key)
 
     def take_grasps(self) -> Grasps:
         """The grasps that succeeded since the last call."""
         assert self.state is not None, "no episode was begun"
         grasps = self.state.grasps
-        self.state = self.state._replace(grasps=grasps._replace(found=jnp.zeros_like(grasps.found)))
+        self.state = self.state._replace(grasps=grasps._replace(found=np.zeros(self.batch, bool)))
         return grasps
 
     def collect(self, parameters: Any, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
@@ -208,8 +223,8 @@ class RolloutWorker:
           progress: told how many steps are done, by engines that are not compiled.
         """
         assert self.state is not None, "no episode was begun"
-        self._key, key = jax.random.split(self._key)
-        self.state = self.state._replace(has_finished=jnp.zeros_like(self.state.has_finished))
+        self._key, key = _split(self._key)
+        self.state = self.state._replace(has_finished=np.zeros(self.batch, bool))
         if self.physics.compiled:
             return self._collect_compiled(parameters, key, steps)
         return self._collect_stepwise(parameters, key, steps, progress)
@@ -217,6 +232,15 @@ class RolloutWorker:
     def _sample(self, bank: ConstraintBank, key: Array, stationary: Array) -> InitialConditions:
         """Fresh episodes for all environments, drawn from the bank."""
         return initial.sample(self._hand, self._task, bank, key, self.batch, stationary)
+
+    def _begin(self, conditions: InitialConditions, kept: EnvState | None) -> EnvState:
+        """Episodes in every environment, of which a compiled engine's are started or, where it runs already, reset."""
+        if not self.physics.compiled:
+            return self.env.state_of(conditions, None)
+        if kept is None:
+            return self.env.reset(conditions)
+        physics = self.physics.reset(kept.physics, jnp.ones(self.batch, bool), conditions.reset_state)
+        return self.env.state_of(conditions, physics)._replace(grasps=kept.grasps)
 
     def _merge(self, state: EnvState, mask: Array, fresh: InitialConditions) -> EnvState:
         """Fresh episodes in the masked environments (B,), whose engine was reset apart."""
@@ -278,7 +302,7 @@ class RolloutWorker:
             rows.append((*row, transition.reward, transition.terminal, transition.occupancy))
             extras.append(kept)
             if self._bank is not None and np.asarray(transition.terminal).any():
-                self._episode_key, episode_key = jax.random.split(self._episode_key)
+                self._episode_key, episode_key = _split(self._episode_key)
                 fresh = self._sample_jit(self._bank, episode_key, self._stationary)
                 self.physics.reset(None, transition.terminal, fresh.reset_state)
                 state = self._merge_jit(state, transition.terminal, fresh)
@@ -295,14 +319,13 @@ class RolloutWorker:
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         """A rollout as one program; see `collect`."""
-        # Committed to the device, whether they were there already or not: anything else would compile once more.
-        parameters, bank, carry = jax.device_put(
-            (parameters, self._bank, (self.state, self._episode_key)), jax.local_devices()[0]
-        )
-        (self.state, self._episode_key), rollout = self._scan_jit(
-            parameters, self._settings, self._stationary, bank, carry, key, steps=steps
-        )
+        (self.state, self._episode_key), rollout = self._scan_jit(*self._scan_arguments(parameters, key), steps=steps)
         return rollout
+
+    def _scan_arguments(self, parameters: Any, key: Array) -> tuple[Any, ...]:
+        """What `_scan` takes but for the steps."""
+        parameters, bank, carry = _on_device((parameters, self._bank, (self.state, self._episode_key)))
+        return parameters, self._settings, self._stationary, bank, carry, key
 
     def _scan(
         self,
@@ -339,6 +362,15 @@ class RolloutWorker:
         state, _ = carry
         finished = state.finished, state.has_finished
         return carry, Rollout(*(*columns, self._observe(state), *finished, trace, probed))
+
+
+def _on_device(tree: Any) -> Any:
+    """The arrays committed to this process's device: those that are not would have programs compiled once more."""
+    return jax.device_put(tree, jax.local_devices()[0])
+
+
+_split = jax.jit(lambda key: tuple(jax.random.split(key)))
+"""Two random keys, in one call."""
 
 
 def _traced(state: EnvState, action: Array, transition: Transition, task: TaskConfig, where: int | slice) -> Trace:

@@ -21,9 +21,12 @@ REPLICATED = PartitionSpec()
 
 
 def shard(tree: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
-    """Arrays over all of the mesh from this process's part of them; `specs` are those of `jax.shard_map`."""
+    """Arrays over all of the mesh from this process's part of them; `specs` are those of `jax.shard_map`.
+
+    Without a mesh they are committed to this process's device: those that are not would have programs compiled anew.
+    """
     if mesh is None:
-        return tree
+        return jax.device_put(tree, jax.local_devices()[0])
     devices = [device for device in mesh.devices.flat if device.process_index == jax.process_index()]
 
     def place(spec: PartitionSpec, array: Array) -> Array:

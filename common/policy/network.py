@@ -137,15 +137,15 @@ def init(seed: int, layout: Layout, action_size: int, config: NetworkConfig) -> 
         gains = {name: output_gain if name == "output" else _HIDDEN_GAIN for name in layers}
         return {
             name: {
-                "kernel": jnp.asarray(gains[name] * _orthogonal(rng, layer["kernel"].shape), jnp.float32),
-                "bias": jnp.zeros(layer["bias"].shape, jnp.float32),
+                "kernel": (gains[name] * _orthogonal(rng, layer["kernel"].shape)).astype(np.float32),
+                "bias": np.zeros(layer["bias"].shape, np.float32),
             }
             for name, layer in layers.items()
         }
 
-    log_std = jnp.full((action_size,), math.log(config.initial_std), jnp.float32)
+    log_std = np.full(action_size, math.log(config.initial_std), np.float32)
     actor = {"network": fill(tree["actor"]["network"], _ACTION_GAIN), "log_std": log_std}
-    return {"actor": actor, "critic": fill(tree["critic"], 1.0)}
+    return jax.device_put({"actor": actor, "critic": fill(tree["critic"], 1.0)})
 
 
 def _orthogonal(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:

@@ -81,7 +81,7 @@ class PPO:
         params = jax.tree.map(jnp.asarray, initial.params)
         return TrainState(
             params,
-            _optimizer(self._config.learning_rate, self._config.max_grad_norm).init(params),
+            jax.jit(_optimizer(self._config.learning_rate, self._config.max_grad_norm).init)(params),
             jax.random.PRNGKey(seed),
             initial.observation,
             initial.value,
