@@ -1,4 +1,4 @@
-"""How far a hand reaches around its centre, in a few fixed finger poses: what decides whether a table leaves it room."""
+"""How far a hand reaches around its centre in a few finger poses: what decides whether a table leaves it room."""
 
 import functools
 from typing import NamedTuple

@@ -1,8 +1,8 @@
-"""Errors that references of people's hands have, for training: tracked joints, depth, wrists and waypoints are never exact.
+"""Errors that references of people's hands have, for training.
 
-A captured pose is off by some tenths of a radian in its joints and by a centimetre in its wrist, its fingers are more or
-less closed than those of the hand that follows it, and the waypoints of a captured path jitter. What an episode is asked
-for is disturbed by an amount of its own, between nothing and all of the below.
+A captured pose is off by some tenths of a radian in its joints and by a centimetre in its wrist, its fingers are more
+or less closed than those of the hand that follows it, and the waypoints of a captured path jitter. What an episode is
+asked for is disturbed by an amount of its own, between nothing and all of the below.
 """
 
 import jax
