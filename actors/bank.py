@@ -26,9 +26,8 @@ from common.task.sampling.headings import (
     MAX_WIDTH,
     Headings,
     above,
-    clear_table,
-    feasible,
     sample_headings,
+    within_reach,
 )
 from common.task.types import Array
 
@@ -209,13 +208,8 @@ def headings_of(
     )
     assert whole is not None, "only the graspable region may be out of reach"
     sets = [whole, graspable or whole]
-    cleared = [[clear_table(headings, rest, hand) for rest in obj.rest_poses] for headings in sets]
-    reachable = np.array(
-        [
-            [feasible(*pair, hand, back_off=task.back_off) for pair in zip(of, obj.rest_poses, strict=True)]
-            for of in cleared
-        ]
-    )
+    found = [within_reach(headings, obj.rest_poses, hand, task.back_off) for headings in sets]
+    reachable = np.stack([fine for _, fine in found])
     if task.headings == "above" and reachable[0].any():
         steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
         reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
@@ -229,8 +223,8 @@ def headings_of(
     index = np.array([[_repeated(row) for row in region] for region in reachable])
     back = np.array(
         [
-            [np.linalg.norm(of[rest].position - headings.position, axis=-1) for rest in usable]
-            for headings, of in zip(sets, cleared, strict=True)
+            [np.linalg.norm(cleared[rest].position - headings.position, axis=-1) for rest in usable]
+            for headings, (cleared, _) in zip(sets, found, strict=True)
         ]
     )
     # Reference poses are made at headings that some resting pose allows, where there are any.

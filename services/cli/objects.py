@@ -10,6 +10,7 @@ from services.assets.objects.options import ImportOptions
 
 if TYPE_CHECKING:
     from common.objects.spec import GraspObject
+    from common.task.sampling.headings import Headings
 
 _COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "yellow": (255, 255, 0)}
 
@@ -135,7 +136,7 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     import numpy as np
 
     from common.objects.store import digest
-    from common.task.sampling.headings import above, clear_table, feasible, sample_headings
+    from common.task.sampling.headings import sample_headings
     from services.assets.objects.named import find_object
     from services.cli.console import show_facts
 
@@ -157,17 +158,10 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
         "avoid region": avoided or "nothing",
         "digest": digest(obj),
     }
-    for i, pose in enumerate(obj.rest_poses):
-        counts = []
-        for headings in (free, on_graspable):
-            if headings is None:
-                counts.append("none")
-                continue
-            cleared = clear_table(headings, pose)
-            reachable = feasible(cleared, pose)
-            counts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
+    for i, texts in enumerate(zip(_reach(obj, free), _reach(obj, on_graspable), strict=True)):
         facts[f"resting pose {i + 1}"] = (
-            f"{100 * pose[2]:.1f} cm high; headings within reach {counts[0]}, on the graspable region {counts[1]}"
+            f"{100 * obj.rest_poses[i][2]:.1f} cm high; headings within reach of the human hand {texts[0]}, on the "
+            f"graspable region {texts[1]}"
         )
     print(obj.name)
     show_facts(facts)
@@ -179,6 +173,21 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
         save_png(png, object_sheet(obj, free))
         print(f"The picture is {png}.")
     return 0
+
+
+def _reach(obj: "GraspObject", headings: "Headings | None") -> list[str]:
+    """For each resting pose, what share of the headings the table leaves the human hand."""
+    from common.hands.human import HUMAN
+    from common.hands.outline import outline
+    from common.task.sampling.headings import above, within_reach
+
+    if headings is None:
+        return ["none"] * len(obj.rest_poses)
+    texts = []
+    found = within_reach(headings, obj.rest_poses, outline(HUMAN))
+    for pose, cleared, reachable in zip(obj.rest_poses, *found, strict=True):
+        texts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
+    return texts
 
 
 def set_affordance(

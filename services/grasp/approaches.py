@@ -4,16 +4,17 @@ import numpy as np
 
 from actors.bank import clear_of_table
 from common.errors import CongraspError
+from common.hands.outline import outline
 from common.hands.spec import Hand
 from common.objects.shapes import matrix
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.task.constraints import CONSTRAINTS
-from common.task.sampling.headings import above, clear_table, feasible, sample_headings
+from common.task.sampling.headings import above, sample_headings, within_reach
 
 
 def headings(
-    obj: GraspObject, request: GraspRequest, batch: int, back_off: float, rng: np.random.Generator
+    hand: Hand, obj: GraspObject, request: GraspRequest, batch: int, back_off: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of attempts that the table allows.
 
@@ -30,11 +31,11 @@ def headings(
             else "Leave out --heading and --at, or make the graspable part larger.",
         )
     options, weights = [], []
-    for r, rest in enumerate(obj.rest_poses):
-        cleared = clear_table(found, rest)
-        room = feasible(cleared, rest, back_off=back_off)
+    for r, (cleared, room) in enumerate(
+        zip(*within_reach(found, obj.rest_poses, outline(hand), back_off), strict=True)
+    ):
         if request.above:
-            room &= above(cleared, rest)
+            room &= above(cleared, obj.rest_poses[r])
         for h in np.flatnonzero(room):
             options.append((r, cleared.position[h], found.direction[h], found.cross[h]))
         weights += [1.0 / ((r + 1) * max(room.sum(), 1))] * int(room.sum())

@@ -6,9 +6,11 @@ import itertools
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from common.hands.human import HUMAN
+from common.hands.outline import outline
 from common.objects.shapes import tessellate
 from common.objects.spec import GraspObject
-from common.task.sampling.headings import Headings, clear_table, feasible
+from common.task.sampling.headings import Headings, within_reach
 from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, PIECES
 from services.viz.raster import render_scene
 from services.viz.scene import Shape
@@ -24,15 +26,15 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
     """Three views of the object in its most likely resting pose.
 
     Left: the surface, the graspable region green and the avoid region red. Middle: the convex pieces. Right: some of
-    the headings that the table leaves, drawn from 8 cm before the heading position up to it.
+    the headings that the table leaves the human hand, drawn from 8 cm before the heading position up to it.
 
     Returns:
       (H, W, 3) uint8.
     """
     pose = np.asarray(obj.rest_poses[0], float)
     place, turn = pose[:3], Rotation.from_quat(pose[3:], scalar_first=True)
-    cleared = clear_table(headings, pose)
-    chosen = np.flatnonzero(feasible(cleared, pose))[:_ARROWS]
+    (cleared,), (reachable,) = within_reach(headings, pose[None], outline(HUMAN))
+    chosen = np.flatnonzero(reachable)[:_ARROWS]
     tips, ways = turn.apply(cleared.position[chosen]) + place, turn.apply(cleared.direction[chosen])
 
     whole = Shape("mesh", (0, 0), OBJECT, place, pose[3:], vertices=obj.visual_vertices, faces=obj.visual_faces)

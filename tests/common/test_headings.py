@@ -2,11 +2,15 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from common.hands import get_hand
+from common.hands.kinematics import capsules, grasp_frame, link_transforms
+from common.hands.outline import Outline, depth_below, outline
 from common.objects.procedural import FAMILIES, generate
 from common.task.sampling.headings import (
     INWARD,
@@ -16,6 +20,7 @@ from common.task.sampling.headings import (
     clear_table,
     feasible,
     sample_headings,
+    within_reach,
 )
 
 DOWN, LEVEL, UP = [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
@@ -167,7 +172,9 @@ def test_feasible_keeps_what_stays_above_the_table():
         ([0, 0, 0.3], steep),
     )
     np.testing.assert_array_equal(feasible(headings, FLAT), [1, 0, 1, 0, 1, 0, 0])
-    np.testing.assert_array_equal(feasible(headings, FLAT, clearance=0.004), [1, 1, 1, 0, 1, 1, 0])
+    np.testing.assert_array_equal(
+        feasible(headings, FLAT, Outline(np.zeros((1, 1, 3)), np.array([0.004]))), [1, 1, 1, 0, 1, 1, 0]
+    )
     np.testing.assert_array_equal(feasible(headings, FLAT, steepest_up=1.0, back_off=0.03), [1, 0, 1, 1, 1, 1, 1])
     upside_down = np.array([0, 0, 0.05, 0, 1.0, 0, 0])
     np.testing.assert_array_equal(feasible(headings, upside_down)[[0, 3]], [0, 1])
@@ -189,7 +196,7 @@ def test_clearing_the_table_backs_out_along_the_direction():
         ([0, 0, -0.045], DOWN),  # 5 mm high: 5 mm back
         ([0, 0, -0.045], [np.sin(half), 0, -np.cos(half)]),  # the same height takes twice the way
         ([0, 0, -0.045], LEVEL),  # no way helps
-        ([0, 0, -0.065], DOWN),  # 2.5 cm back is too far
+        ([0, 0, -0.075], DOWN),  # 3.5 cm back is too far
         ([0, 0, 0.0], DOWN),
     )
     cleared = clear_table(headings, FLAT)
@@ -213,3 +220,52 @@ def test_parts_that_are_made_to_be_held_can_be(family):
         obj = generate(seed, family)
         headings = sample_headings(obj, np.random.default_rng(0), use_affordance=True)
         assert max(feasible(clear_table(headings, pose), pose).mean() for pose in obj.rest_poses) > 0.1
+
+
+def test_a_hand_needs_room_below_its_centre():
+    """A bar of 6 cm along the cross-finger axis, 1 cm thick: level it needs 1 cm, upright 4 cm."""
+    bar = Outline(np.array([[[0, -0.03, 0], [0, 0.03, 0]]]), np.array([0.01, 0.01]))
+    upright = Headings(*(np.array([row], np.float32) for row in ([0, 0, -0.02], LEVEL, UP)))
+    level = upright._replace(cross=np.array([[0, 1, 0]], np.float32))
+    assert not feasible(upright, FLAT, bar)[0] and feasible(level, FLAT, bar)[0]  # 3 cm high
+    higher = upright._replace(position=np.array([[0, 0, -0.009]], np.float32))
+    assert feasible(higher, FLAT, bar)[0]  # 4.1 cm high
+    down = Headings(*(np.array([row], np.float32) for row in ([0, 0, -0.06], DOWN, LEVEL)))
+    cleared = clear_table(down, FLAT, bar)
+    np.testing.assert_allclose(cleared.position[0], [0, 0, -0.04], atol=2e-6)  # 1 cm high: as thick as the bar is
+    assert feasible(cleared, FLAT, bar)[0]
+
+
+def test_an_open_hand_starts_over_the_table_and_may_close_on_the_way():
+    """Open it reaches 5 cm down, closed 1 cm; a level approach starts as high as it ends."""
+    hand = Outline(np.array([[[0, 0, -0.04]], [[0, 0, 0.0]]]), np.array([0.01]))
+    cross = np.array([[0, 1, 0]], np.float32)  # v x w is up
+    low = Headings(np.array([[0, 0, -0.02]], np.float32), np.array([LEVEL], np.float32), cross)
+    assert not feasible(low, FLAT, hand)[0]
+    falling = low._replace(direction=np.array([[0.8, 0, -0.6]], np.float32))
+    assert feasible(falling, FLAT, hand)[0]  # it starts 9 cm higher, and is closed when it arrives
+
+
+@pytest.mark.parametrize("name", ["human", "allegro", "sharpa"])
+def test_a_table_that_the_outline_clears_is_clear_of_the_hand(name):
+    """Against the hand's capsules themselves, posed at random headings."""
+    hand = get_hand(name)
+    rng = np.random.default_rng(0)
+    v, w = np.linalg.qr(rng.normal(size=(50, 3, 3)))[0].transpose(0, 2, 1)[:, :2].transpose(1, 0, 2)
+    up = np.stack([v[:, 2], w[:, 2], np.cross(v, w)[:, 2]], -1)
+    frame = grasp_frame(hand)
+    own = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)], -1)
+    turn = np.einsum("hij,kj->hik", np.stack([v, w, np.cross(v, w)], -1), own)
+    transforms = link_transforms(hand, jnp.array(hand.q_open))
+    ends = np.asarray(capsules(hand, transforms)).reshape(-1, 3) - frame.center
+    lowest = np.einsum("hj,ej->he", turn[:, 2], ends) - np.repeat(hand.capsule_radii, 2)
+    np.testing.assert_allclose(depth_below(outline(hand), up)[0], -lowest.min(-1), atol=1e-6)
+
+
+def test_a_card_is_approached_as_well_as_it_goes():
+    card = made(([0, 0, -0.05], DOWN), ([0, 0, -0.05], UP))
+    tall = Outline(np.array([[[0.05, 0, 0]]]), np.array([0.01]))  # fingers reach 6 cm beyond the centre
+    assert not feasible(clear_table(card, FLAT, tall), FLAT, tall).any()
+    (cleared,), (reachable,) = within_reach(card, FLAT[None], tall)
+    np.testing.assert_array_equal(reachable, [True, False])
+    np.testing.assert_allclose(cleared.position[0], [0, 0, -0.04], atol=2e-6)

@@ -201,6 +201,22 @@ def feasible(
     return (direction_z <= steepest_up) & (room >= 0) & (start >= 0)
 
 
+def within_reach(
+    headings: Headings, rest_poses: np.ndarray, outline: Outline, back_off: float = BACK_OFF
+) -> tuple[list[Headings], np.ndarray]:
+    """The headings clear of the table in each of R resting poses (R, 7), and (R, H) bool whether they can be followed.
+
+    Where the table leaves the hand no room at all, as beside a card, what counts is its centre alone.
+    """
+    for own in (outline, CENTER):
+        cleared = [clear_table(headings, rest, own) for rest in rest_poses]
+        pairs = zip(cleared, rest_poses, strict=True)
+        reachable = np.array([feasible(moved, rest, own, back_off=back_off) for moved, rest in pairs])
+        if reachable.any():
+            break
+    return cleared, reachable
+
+
 def above(headings: Headings, rest_pose: np.ndarray, cone: float = np.radians(30)) -> np.ndarray:
     """(H,) bool, which directions are within `cone` (rad) of straight down for an object in a resting pose (7,)."""
     return headings.direction @ matrix(rest_pose[3:])[2] <= -np.cos(cone)

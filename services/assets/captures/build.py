@@ -13,6 +13,7 @@ from actors.bank import HEADINGS, above_table, clear_of_table, headings_of
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands.human import HUMAN
+from common.hands.outline import CENTER, outline
 from common.hands.spec import Hand
 from common.objects import store
 from common.objects.pool import object_scale
@@ -214,7 +215,8 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
     given = None
     if options.headings == "demonstrated":
         given = Headings(*(np.resize(x, (HEADINGS, 3)) for x in demonstrated_headings(demonstrations, scale)))
-    fields = headings_of(task, fitting, seed, given, scale)
+    # What people did is not measured against the hand's outline: their table was where it was.
+    fields = headings_of(task, fitting, seed, given, scale, CENTER if given else outline(hand))
     if hand is HUMAN:
         posed = tuple(np.stack([getattr(d, x) for d in demonstrations]) for x in ("q", "position", "quaternion"))
     else:

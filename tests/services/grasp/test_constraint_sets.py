@@ -8,6 +8,7 @@ from actors.bank import build_bank
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
+from common.hands.outline import outline
 from common.objects import procedural, store
 from common.task import constraint_sets as stored_sets
 from common.task.sampling.headings import Headings, clear_table, feasible
@@ -54,8 +55,10 @@ def test_a_set_is_what_training_draws_from(sets):
         assert len(np.unique(rest, axis=0)) == len(rest) <= bank.rest.shape[1]
         for r, pose in enumerate(rest):
             headings = Headings(*(arrays[f"heading/{name}"][0] for name in Headings._fields))
-            cleared = clear_table(headings, pose)
-            np.testing.assert_array_equal(arrays["heading/allowed"][0, r], feasible(cleared, pose, back_off=0.15))
+            cleared = clear_table(headings, pose, outline(HAND))
+            np.testing.assert_array_equal(
+                arrays["heading/allowed"][0, r], feasible(cleared, pose, outline(HAND), back_off=0.15)
+            )
             moved = np.linalg.norm(cleared.position - headings.position, axis=-1)
             allowed = arrays["heading/allowed"][0, r]
             np.testing.assert_allclose(arrays["heading/back"][0, r][allowed], moved[allowed], atol=1e-6)
