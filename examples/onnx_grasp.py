@@ -185,6 +185,17 @@ class Grasp:
         numbers = [np.ravel(fields.get(f["field"], np.zeros(f["size"]))) for f in self.meta["observation"]]
         return np.concatenate(numbers).astype(np.float32)
 
+    def lead(self, ahead, residual, speed):
+        """How far the wrist's targets are ahead of it, within its limits of speed and acceleration."""
+        found = []
+        for part, kind in ((slice(0, 3), "position"), (slice(3, 6), "rotation")):
+            servo, most = self.meta["wrist"][kind], self.control[f"guidance_{kind}_limit"]
+            steady = servo["kv"] / servo["kp"] * speed[part]
+            wanted = shorten(shorten(ahead[part], most) + residual[part], most)
+            hardest = servo["inertia"] / servo["kp"] * self.control[servo["limit"]]
+            found.append(steady + shorten(wanted - steady, hardest))
+        return np.concatenate(found)
+
     def step(self):
         """Asks the policy, turns its action into joint targets, and steps the physics."""
         (action,) = self.session.run(["action"], {"observation": self.observe()[None]})
@@ -202,9 +213,7 @@ class Grasp:
         u = self.data.qpos[self.wrist]
         ahead = np.concatenate([self.base.T @ (position - self.base_position), angles]) - u
         ahead[3:] = (ahead[3:] + np.pi) % (2 * np.pi) - np.pi
-        ahead[:3] = shorten(ahead[:3], self.control["guidance_position_limit"])
-        ahead[3:] = shorten(ahead[3:], self.control["guidance_rotation_limit"])
-        self.u_target = u + ahead + wrist
+        self.u_target = u + self.lead(ahead, wrist, self.data.qvel[self.wrist_speeds])
 
         self.data.ctrl[self.ctrl] = np.concatenate([self.u_target, self.q_target])
         if self.time == self.task["approach_steps"]:

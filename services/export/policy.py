@@ -18,7 +18,7 @@ from common.files import write_atomically
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from common.hands.mjcf import WRIST_JOINTS
-from common.hands.spec import link_origin
+from common.hands.spec import Hand, link_origin
 from common.objects.mjcf import CONTACT
 from common.policy.bundle import PolicyBundle, content_hash, mean_action
 from common.policy.network import gated
@@ -54,6 +54,7 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
         "joint_limits": [[joint.lower, joint.upper] for joint in hand.joints],
         "open_pose": hand.q_open.tolist(),
         "wrist_joints": list(WRIST_JOINTS),
+        "wrist": wrist_servos(hand),
         "links": [link.name for link in hand.links],
         "link_origins": [list(link_origin(link)) for link in hand.links],
         "keypoint_links": hand.keypoint_links.tolist(),
@@ -84,6 +85,20 @@ def observation_fields(bundle: PolicyBundle) -> list[dict[str, Any]]:
     ]
 
 
+def wrist_servos(hand: Hand) -> dict[str, dict[str, Any]]:
+    """Gains and inertia of the wrist's slides (N/m, N.s/m, kg) and hinges (N.m/rad, N.m.s/rad, kg.m^2)."""
+    gains, (mass, inertia) = hand.wrist, hand.wrist_inertia.tolist()
+    return {
+        "position": {"kp": gains.slide_kp, "kv": gains.slide_kv, "inertia": mass, "limit": "wrist_acceleration"},
+        "rotation": {
+            "kp": gains.hinge_kp,
+            "kv": gains.hinge_kv,
+            "inertia": inertia,
+            "limit": "wrist_angular_acceleration",
+        },
+    }
+
+
 def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
     """The action's numbers in order: which joint they move, the scale, and how a target comes of them."""
     control = bundle.task.control
@@ -95,7 +110,9 @@ def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
         {
             "joint": name,
             "scale": control.wrist_position_scale if i < 3 else control.wrist_rotation_scale,
-            "target": "present joint + limited way to the guidance's joint + scale * action",
+            "target": "present joint + lead; lead = steady + limit(limit(limit(guidance - joint, L) + scale * action, L) "
+            "- steady, inertia / kp * A), steady = kv / kp * velocity, limit shortens the three slides or hinges "
+            "together; L: guidance_..._limit, A: 'limit' of 'wrist', both of the task's control",
         }
         for i, name in enumerate(WRIST_JOINTS)
     ]

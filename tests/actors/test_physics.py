@@ -265,12 +265,6 @@ def test_jax_agrees_with_native(env):
     native.close()
 
 
-def test_contacts_between_links_are_refused_where_there_are_none():
-    task = dataclasses.replace(TASK, hand_self_collision=True)
-    with pytest.raises(CongraspError, match=r"'jax' has no contacts between the links .* native or warp"):
-        MjxPhysics(HAND, task, OBJECTS)
-
-
 def test_a_demanded_gpu_that_is_missing_is_one_clear_line():
     with pytest.raises(CongraspError, match="NVIDIA GPU"):
         resolve_physics("warp")

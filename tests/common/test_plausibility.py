@@ -76,7 +76,7 @@ def test_hand_in_hand_is_the_deepest_contact_of_the_hands_model(name):
 def test_neighbours_and_nested_links_do_not_count():
     hand = get_hand("human")
     capsules = plausibility._capsules(hand)
-    names = [hand.links[i].name for i in capsules.links]
+    names = [hand.links[i].name for i in hand.capsule_links]
     pairs = {frozenset((names[a], names[b])) for a, b in capsules.pairs.T}
     assert frozenset(("thumb_distal", "index_distal")) in pairs and frozenset(("palm", "thumb_distal")) in pairs
     assert not pairs & {frozenset((link.name, link.parent)) for link in hand.links}

@@ -308,19 +308,51 @@ def test_guidance_follows_the_strongest_constraint_on_the_initial_object(on, sou
     np.testing.assert_allclose(position[0], body.apply(local) + state.object_position_initial[0], atol=1e-4)
 
 
-def test_wrist_target_is_guidance_plus_residual_within_the_limits():
+def test_wrist_target_is_guidance_plus_residual_where_no_limit_stands():
     state, surface, goal = scene(17)
+    far = dataclasses.replace(
+        TASK.control,
+        guidance_position_limit=1e3,
+        guidance_rotation_limit=1e3,
+        wrist_acceleration=1e6,
+        wrist_angular_acceleration=1e6,
+    )
     zero, one = np.zeros((4, F + 6), np.float32), np.zeros((4, F + 6), np.float32)
     one[:, F:] = 1.0
-    still, pushed = (np.asarray(DECODE(state, surface, goal, TASK.control, a).u_target) for a in (zero, one))
+    still, pushed = (np.asarray(DECODE(state, surface, goal, far, a).u_target) for a in (zero, one))
     np.testing.assert_allclose(pushed - still, np.tile([0.02] * 3 + [0.1] * 3, (4, 1)), atol=1e-5)
-    ahead = still - state.u
-    assert np.all(np.linalg.norm(ahead[:, :3], axis=-1) <= 0.08 + 1e-5)
-    assert np.all(np.linalg.norm(ahead[:, 3:], axis=-1) <= 0.5 + 1e-5)
-    goal_joints = wrist_to_joints(state, *GUIDANCE(state, surface, goal, TASK.control))
-    toward = np.asarray(goal_joints)[:, :3] - state.u[:, :3]
+    np.testing.assert_allclose(still, wrist_to_joints(state, *GUIDANCE(state, surface, goal, far)), atol=1e-5)
+
+
+def test_no_action_drives_the_wrist_beyond_its_limits():
+    """By the servos' own law: acceleration (kp (target - u) - kv v) / m, and speeds that targets can sustain."""
+    state, surface, goal = scene(17)
+    wrist, (mass, inertia) = HAND.wrist, HAND.wrist_inertia
+    for scale in (0.0, 1.0, -30.0):
+        action = np.full((4, F + 6), scale, np.float32)
+        target = np.asarray(DECODE(state, surface, goal, TASK.control, action).u_target)
+        lead, speed = target - state.u, state.u_velocity
+        for part, kp, kv, inert, most, farthest in (
+            (slice(0, 3), wrist.slide_kp, wrist.slide_kv, mass, 15.0, 0.04),
+            (slice(3, 6), wrist.hinge_kp, wrist.hinge_kv, inertia, 150.0, 0.3),
+        ):
+            force = kp * lead[:, part] - kv * speed[:, part]
+            acceleration = np.linalg.norm(force, axis=-1) / inert
+            assert np.all(acceleration <= most * 1.001)
+            # Where the wrist is faster than a target sustains, it is slowed down.
+            fast = np.linalg.norm(speed[:, part], axis=-1) * kv / kp > farthest
+            assert np.all((np.sum(force * speed[:, part], -1) < 0)[fast])
+
+
+def test_a_wrist_at_rest_starts_towards_its_guidance():
+    state, surface, goal = scene(17)
+    state = state._replace(u_velocity=np.zeros((4, 6), np.float32))
+    ahead = np.asarray(DECODE(state, surface, goal, TASK.control, np.zeros((4, F + 6), np.float32)).u_target) - state.u
+    toward = np.asarray(wrist_to_joints(state, *GUIDANCE(state, surface, goal, TASK.control)))[:, :3] - state.u[:, :3]
     cosine = np.sum(toward * ahead[:, :3], -1) / np.linalg.norm(toward, axis=-1) / np.linalg.norm(ahead[:, :3], axis=-1)
     np.testing.assert_allclose(cosine, 1.0, atol=1e-4)
+    # 15 m/s^2 times 0.988 kg over 1,800 N/m
+    np.testing.assert_allclose(np.linalg.norm(ahead[:, :3], axis=-1), 0.00823, atol=1e-5)
 
 
 def test_metrics_against_numpy():
