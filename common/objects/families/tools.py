@@ -46,8 +46,7 @@ def scissors(rng: Rng) -> Draft:
         loop = np.array([(center[0] + 1.3 * bow * np.cos(t), center[1] + bow * np.sin(t), 0) for t in turns])
         pieces += sweep(loop, (0, 0, 1), rng.uniform(0.006, 0.008), thick, closed=True)
         tip = (blade, -side * open_ * blade)
-        root = (-reach + 0.5 * bow, 0.5 * side * bow)
-        z = 0.25 * thick * side
+        root, z = (-reach + 0.8 * bow, 1.15 * side * bow), 0.002 * side
         corners = [(*root, z), (root[0], root[1] + 0.006 * side, z), (0, 0.007, z), (0, -0.007, z), (*tip, z)]
         pieces.append(hull(*(np.add(corners, (0, 0, dz)) for dz in (-0.002, 0.002)), part=1))
     return Draft(tuple(pieces), ("handles", "blades"), (True, False), (1, 4), (700.0, 1300.0))
