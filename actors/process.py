@@ -22,6 +22,7 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from common.journal import Journal
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
+from common.task.bank import ConstraintBank
 from common.task.types import Array, Surface
 from common.transport.base import Transport
 from common.wire.codec import Message, finite
@@ -102,8 +103,8 @@ class _Actor:
             )
         self._config, self._arrays, self._link, self._transport = config, arrays, link, transport
         self._hand = get_hand(config.task.hand)
-        number = zlib.crc32(link.actor.encode())
-        self._objects, bank = training_set(self._hand, config, number)
+        self._number = zlib.crc32(link.actor.encode())
+        self._objects, bank = training_set(self._hand, config, self._number)
         self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
         self._spec = policy_spec(config.task, config.network)
         self._worker = RolloutWorker(
@@ -117,9 +118,7 @@ class _Actor:
             seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
             half_precision=config.half_observations,
         )
-        self._failures: FailureWeights | None = None
-        if config.objects.by_failure:
-            self._failures = FailureWeights(np.asarray(bank.weight), [obj.family for obj in self._objects])
+        self._failures = self._failure_weights(bank)
         self._on_rollout = on_rollout
         self._bundle: PolicyBundle | None = None
         self._rollouts = 0
@@ -143,6 +142,20 @@ class _Actor:
                 asked = time.monotonic()
         finally:
             self._physics.close()
+
+    def _failure_weights(self, bank: ConstraintBank) -> FailureWeights | None:
+        """Counts for the present objects, where the run draws them by failure."""
+        if not self._config.objects.by_failure:
+            return None
+        return FailureWeights(np.asarray(bank.weight), [obj.family for obj in self._objects])
+
+    def _renew_objects(self) -> None:
+        """Other objects in the place of all, and fresh episodes with them."""
+        self._number += 1
+        self._objects, bank = training_set(self._hand, self._config, self._number)
+        self._worker.replace_objects(self._objects, bank)
+        self._worker.restart()
+        self._failures = self._failure_weights(bank)
 
     def _warm_up(self, stop: threading.Event) -> None:
         """Compiles before the first ticket is asked for, whose rollout would be too old by the time that it is made."""
@@ -213,6 +226,8 @@ class _Actor:
         if config.log_rollout_every and self._rollouts % config.log_rollout_every == 0:
             self._publish("rollout", self._sampled(bundle, taken))
         self._rollouts += 1
+        if config.objects.renew_every and self._rollouts % config.objects.renew_every == 0:
+            self._renew_objects()
 
     def _sampled(self, bundle: PolicyBundle, arrays: dict[str, Array]) -> Message:
         """A rollout's first environments, with what a reader needs to take the arrays apart."""

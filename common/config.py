@@ -164,6 +164,9 @@ class ObjectsConfig:
     folder_share: float = 0.0
     """Share of the episodes that have an object of the folder, where there are procedural ones beside; 0: every object
     is drawn alike."""
+    renew_every: int = 0
+    """Rollouts after which an actor's procedural objects are replaced by the next ones by their seeds, and its episodes
+    start anew; 0 keeps them. Making them takes the time that the first ones took."""
     by_failure: bool = False
     """Objects that fall more often than others are drawn up to twice as often, and those that fall less often down to
     half as often, by the actor's own episodes (the folder's share shifts with them)."""

@@ -91,12 +91,17 @@ def import_meshes(
     return 2 if failures else 0
 
 
-def list_objects(folder: Annotated[str, tyro.conf.Positional] = "objects", families: bool = False) -> int:
+def list_objects(
+    folder: Annotated[str, tyro.conf.Positional] = "objects", families: bool = False, png: pathlib.Path | None = None
+) -> int:
     """List the objects of a folder, or the families of the generator.
+
+    Examples: congrasp objects list my-objects --png my-objects.png
 
     Args:
       folder: Folder of objects.
       families: List the generator's families instead.
+      png: Picture to write: every object, its graspable region green and its avoid region red.
     """
     from common.objects.procedural import FAMILIES
     from common.objects.store import Catalogue
@@ -105,7 +110,7 @@ def list_objects(folder: Annotated[str, tyro.conf.Positional] = "objects", famil
     if families:
         print("\n".join(FAMILIES))
         return 0
-    catalogue, rows, failures = Catalogue(folder), [], 0
+    catalogue, found, rows, failures = Catalogue(folder), [], [], 0
     names = catalogue.list()
     for name in names:
         try:
@@ -114,12 +119,19 @@ def list_objects(folder: Annotated[str, tyro.conf.Positional] = "objects", famil
             report_error(error)
             failures += 1
             continue
+        found.append(obj)
         weight, pieces, poses = f"{1000 * obj.mass:.0f}", str(len(obj.pieces)), str(len(obj.rest_poses))
         rows.append((name, obj.family, _size(obj), weight, pieces, *_parts(obj), poses))
     if names:
         show_table(("name", "family", "size (cm)", "mass (g)", "pieces", "graspable", "avoid", "poses"), rows)
     else:
         print(f"{folder} holds no object.")
+    if png is not None and found:
+        from services.viz.object_sheet import overview
+        from services.viz.sheets import save_png
+
+        save_png(png, overview(found))
+        print(f"The picture is {png}.")
     return 2 if failures else 0
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,7 @@ from services.viz.shapes import arrow, fit, shape_points, table_shape
 from services.viz.sheets import contact_sheet
 
 _ARROWS, _LENGTH = 24, 0.08  # how many headings, and from how far before them they are drawn, m
-_SIZE = (460, 400)
+_SIZE, _SMALL, _COLUMNS = (460, 400), (240, 200), 7
 _VIEW = (0.8, -0.6, 0.6)
 
 
@@ -37,17 +38,15 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
     chosen = np.flatnonzero(reachable)[:_ARROWS]
     tips, ways = turn.apply(cleared.position[chosen]) + place, turn.apply(cleared.direction[chosen])
 
-    whole = Shape("mesh", (0, 0), OBJECT, place, pose[3:], vertices=obj.visual_vertices, faces=obj.visual_faces)
-    paint = np.where(obj.non_graspable_points[:, None], AVOID, GRASPABLE)
+    painted = _painted(obj)
+    whole = dataclasses.replace(painted, paint_points=None, paint_colours=None)
     pieces = [
         dataclasses.replace(whole, colour=PIECES[i % len(PIECES)], vertices=vertices, faces=faces)
         for i, (vertices, faces) in enumerate(map(tessellate, obj.pieces))
     ]
     arrows = [arrow(tip - _LENGTH * way, tip, 0.0015, HEADING) for tip, way in zip(tips, ways, strict=True)]
     panels = {
-        "surface: graspable region green, avoid region red": [
-            dataclasses.replace(whole, paint_points=obj.points, paint_colours=paint)
-        ],
+        "surface: graspable region green, avoid region red": [painted],
         f"{len(obj.pieces)} convex pieces": pieces,
         f"{len(chosen)} of the headings that the table leaves": [
             dataclasses.replace(whole, alpha=0.5),
@@ -60,3 +59,31 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
         images.append(render_scene([*shapes, table_shape(place)], camera, _SIZE))
     title = f"{obj.name}: {1000 * obj.mass:.0f} g, resting pose 1 of {len(obj.rest_poses)}"
     return contact_sheet(images, list(panels), columns=len(panels), title=title)
+
+
+def overview(objects: Sequence[GraspObject]) -> np.ndarray:
+    """(H, W, 3) uint8: each object as it lies most often, its graspable region green and its avoid region red."""
+    images, titles = [], []
+    for obj in objects:
+        shape = _painted(obj)
+        camera = fit(shape_points(shape), np.array(_VIEW), _SMALL[0] / _SMALL[1])
+        images.append(render_scene([shape, table_shape(shape.position)], camera, _SMALL))
+        titles.append(f"{obj.name}: {1000 * obj.mass:.0f} g")
+    return contact_sheet(images, titles, columns=_COLUMNS)
+
+
+def _painted(obj: GraspObject) -> Shape:
+    """The object in its most likely resting pose, in the colours of its regions."""
+    pose = np.asarray(obj.rest_poses[0], float)
+    paint = np.where(obj.non_graspable_points[:, None], AVOID, GRASPABLE)
+    return Shape(
+        "mesh",
+        (0, 0),
+        OBJECT,
+        pose[:3],
+        pose[3:],
+        vertices=obj.visual_vertices,
+        faces=obj.visual_faces,
+        paint_points=obj.points,
+        paint_colours=paint,
+    )

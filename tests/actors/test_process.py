@@ -77,6 +77,7 @@ class InventedWorker:
 
     rollout: Rollout
     weights: ClassVar[list[np.ndarray]] = []
+    pools: ClassVar[list[list[str]]] = []
 
     def __init__(self, *args, **options):
         neutral = goal_of(HAND, CONFIG.task, GraspRequest())
@@ -94,6 +95,9 @@ class InventedWorker:
     def weigh_objects(self, weight):
         self.weights.append(weight)
 
+    def replace_objects(self, objects, bank):
+        self.pools.append([obj.name for obj in objects])
+
     def collect(self, parameters, steps):
         return self.rollout
 
@@ -110,7 +114,8 @@ def heard(monkeypatch):
         monkeypatch.setattr(InventedWorker, "rollout", rollout, raising=False)
         monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
         found = TrainingSet(objects, types.SimpleNamespace(weight=np.ones(len(objects))))
-        monkeypatch.setattr(process, "training_set", lambda *args: found)
+        numbers = []
+        monkeypatch.setattr(process, "training_set", lambda hand, config, number: numbers.append(number) or found)
         broker, stop = MemoryHub(), threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
             logs = server.subscribe(Keys("t").logs, depth=100)
@@ -131,6 +136,7 @@ def heard(monkeypatch):
             stop.set()
             actor.join(30.0)
             received = list(iter(lambda: logs.receive(0.0), None))
+        assert list(np.diff(numbers)) == [1] * len(InventedWorker.pools)  # the next objects by their seeds
         return batch, {key.split("/")[3]: message for key, message in received if "/actor/" in key}
 
     return run
@@ -162,6 +168,16 @@ def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(he
     for message in logs.values():
         encode(message)  # a number that JSON has not would be an error here, and the end of the actor
     validate(logs["episode"], EPISODE)
+
+
+@pytest.mark.timeout(60)
+def test_objects_change_as_often_as_the_run_says(heard, monkeypatch):
+    monkeypatch.setattr(InventedWorker, "pools", [])
+    episodes = invented(np.zeros((B, len(FIELDS)), np.float32))
+    heard(episodes)
+    assert InventedWorker.pools == []
+    heard(episodes, dataclasses.replace(CONFIG, objects=dataclasses.replace(CONFIG.objects, renew_every=1)))
+    assert InventedWorker.pools[0] == ["box_0", "mug_0"]
 
 
 @pytest.mark.timeout(60)

@@ -101,7 +101,23 @@ def test_rollouts_go_through_whole_episodes_and_on(bank):
     assert not np.asarray(worker.state.time).any()
     third = worker.collect(None, 1)
     np.testing.assert_allclose(third.trace.object_position[0], worker.state.reset_state.object_position[0], atol=0.01)
+    _other_objects_take_the_place_of_the_first_ones(worker)
     worker.physics.close()
+
+
+def _other_objects_take_the_place_of_the_first_ones(worker):
+    others = procedural.generate_many(4, 50, ("can", "dish", "wrench", "piggy"))
+    bank = build_bank(HAND, TASK, others, 1)
+    worker.replace_objects(others, bank)
+    worker.restart()
+    index = np.asarray(worker.state.reset_state.object_index)
+    np.testing.assert_array_equal(worker.state.surface.points, np.asarray(bank.points)[index])
+    heights = np.asarray(worker.state.reset_state.object_position)[:, 2]
+    for i, height in zip(index, heights, strict=True):
+        assert np.abs(others[i].rest_poses[:, 2] - height).min() < 1e-5
+    worker.collect(None, 3)
+    # Each lies where it was put: a wrong shape would fall, or be thrown up by the table.
+    np.testing.assert_allclose(np.asarray(worker.state.scene[0].object_position)[:, 2], heights, atol=2e-3)
 
 
 def test_success_needs_the_object_to_stay_up(bank):

@@ -1,13 +1,18 @@
 """Invariants of procedural objects, for any family and seed."""
 
+import itertools
+
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
 
 from common.errors import CongraspError
 from common.objects import shapes
 from common.objects.families import BUILDERS
+from common.objects.mjcf import add_object
 from common.objects.procedural import (
     BASIC_FAMILIES,
     FAMILIES,
@@ -55,6 +60,20 @@ def test_geometry_is_sound(obj):
     assert 0.03 <= (reach[:3] + reach[3:]).max() <= (0.25 if obj.family in BASIC_FAMILIES else 0.3)
     assert np.abs(obj.visual_vertices).max() <= reach.max() + 1e-6
     assert obj.visual_faces.max() < len(obj.visual_vertices)
+
+
+@pytest.mark.parametrize("family", HOUSEHOLD_FAMILIES)
+def test_household_objects_are_of_one_piece(family):
+    for seed in range(3):
+        spec = mujoco.MjSpec()
+        add_object(spec, generate(seed, family))
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        touching = np.eye(model.ngeom, dtype=bool)
+        for i, j in itertools.combinations(range(model.ngeom), 2):
+            touching[i, j] = mujoco.mj_geomDistance(model, data, i, j, 0.01, None) < 5e-4
+        assert connected_components(touching, directed=False)[0] == 1
 
 
 @settings(max_examples=60, deadline=None)

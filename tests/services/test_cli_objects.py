@@ -21,6 +21,9 @@ def test_generate_list_and_show(tmp_path, capsys):
     output = capsys.readouterr().out
     assert "4 objects are in" in output
     assert all(word in output for word in ("mug_6", "knife_3", "handle", "blade"))
+    assert parse(["list", folder, "--png", str(tmp_path / "all.png")])() == 0
+    assert f"The picture is {tmp_path / 'all.png'}" in capsys.readouterr().out.replace("\n", "")
+    assert Image.open(tmp_path / "all.png").width > 7 * 200
     (tmp_path / "things" / "bad.safetensors").write_bytes(b"no object")
     assert parse(["list", folder])() == 2
     captured = capsys.readouterr()

@@ -68,7 +68,9 @@ def eyeglasses(rng: Rng) -> Draft:
     temple, thick = rng.uniform(0.1, 0.14), rng.uniform(0.0025, 0.004)
     middle, open_ = gap + wide, rng.uniform(0.05, 1.0) * np.pi / 2
     solid, rim = bool(rng.random() < 0.5), rng.uniform(0.003, 0.005)
-    turns = 2 * np.pi / 5 * np.arange(5) + 0.3 * np.pi if not solid else 2 * np.pi / 10 * np.arange(10)
+    # A corner is on the bridge's side, and one where the temple is.
+    turns = np.pi + np.linspace(0, 2 * np.pi, 10 if solid else 5, endpoint=False)
+    outside, above = wide * np.cos(0.2 * np.pi), high * np.sin(0.2 * np.pi)
     pieces = []
     for side in (-1, 1):
         loop = np.array([(side * (middle + wide * np.cos(t)), 0, high * np.sin(t)) for t in turns])
@@ -76,12 +78,12 @@ def eyeglasses(rng: Rng) -> Draft:
             pieces.append(hull(*(np.add(loop, (0, y, 0)) for y in (-0.0015, 0.0015))))
         else:
             pieces += sweep(loop, (0, -1, 0), rim, 0.005, closed=True)
-        hinge = np.array((side * (middle + wide), 0, 0.4 * high))
+        hinge = np.array((side * (middle + outside), 0, above))
         way = np.array((-side * np.cos(open_), -np.sin(open_), 0))
         ear, tip = hinge + 0.75 * temple * way, hinge + temple * way - [0, 0, 0.015]
         pieces.append(draft.capsule(tuple(hinge), tuple(ear), thick, part=1))
         pieces += sweep(np.array([ear, tip]), np.cross(way, [0, 0, 1]), 2 * thick, 2 * thick, part=1)
-    pieces.append(draft.capsule((-gap, 0, 0.3 * high), (gap, 0, 0.3 * high), 0.0025))
+    pieces.append(draft.capsule((-gap, 0, 0), (gap, 0, 0), 0.0025))
     return Draft(tuple(pieces), ("front", "temples"), draft.either(rng), (), (1200.0, 2500.0))
 
 

@@ -29,7 +29,7 @@ def extruded(rng: Rng) -> Draft:
     """A random outline, convex or not, with a height, and a taper on some."""
     count = rng.integers(5, 13)
     turns = 2 * np.pi / count * (np.arange(count) + rng.uniform(-0.3, 0.3, count))
-    radii = rng.uniform(0.02, 0.05) * (1 + rng.uniform(0, 0.5) * rng.uniform(-1, 1, count))
+    radii = rng.uniform(0.02, 0.045) * (1 + rng.uniform(0, 0.8) * rng.uniform(-0.7, 1, count))
     outline = radii[:, None] * np.stack([np.cos(turns), np.sin(turns)], -1) * [1, rng.uniform(0.5, 1)]
     taper = rng.choice([1.0, rng.uniform(0.5, 1.0)])
     return Draft(tuple(extrude(outline, 0.0, rng.uniform(0.02, 0.18), taper=taper)))

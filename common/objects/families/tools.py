@@ -37,7 +37,7 @@ def drill(rng: Rng) -> Draft:
 @_family
 def scissors(rng: Rng) -> Draft:
     """Two blades that cross, with a ring on each handle."""
-    thick, blade, open_ = rng.uniform(0.009, 0.014), rng.uniform(0.06, 0.1), rng.uniform(0.05, 0.2)
+    thick, blade, open_ = rng.uniform(0.0115, 0.016), rng.uniform(0.06, 0.1), rng.uniform(0.05, 0.2)
     bow, reach = rng.uniform(0.016, 0.024), rng.uniform(0.035, 0.055)
     pieces = []
     for side in (-1, 1):
@@ -46,8 +46,7 @@ def scissors(rng: Rng) -> Draft:
         loop = np.array([(center[0] + 1.3 * bow * np.cos(t), center[1] + bow * np.sin(t), 0) for t in turns])
         pieces += sweep(loop, (0, 0, 1), rng.uniform(0.006, 0.008), thick, closed=True)
         tip = (blade, -side * open_ * blade)
-        root = (-reach + 0.5 * bow, 0.5 * side * bow)
-        z = 0.25 * thick * side
+        root, z = (-reach + 0.8 * bow, 1.15 * side * bow), 0.002 * side
         corners = [(*root, z), (root[0], root[1] + 0.006 * side, z), (0, 0.007, z), (0, -0.007, z), (*tip, z)]
         pieces.append(hull(*(np.add(corners, (0, 0, dz)) for dz in (-0.002, 0.002)), part=1))
     return Draft(tuple(pieces), ("handles", "blades"), (True, False), (1, 4), (700.0, 1300.0))
@@ -56,7 +55,7 @@ def scissors(rng: Rng) -> Draft:
 @_family
 def cutlery(rng: Rng) -> Draft:
     """A fork, a spoon or a table knife with an arched handle."""
-    length, arch, thick = rng.uniform(0.09, 0.13), rng.uniform(0.012, 0.02), rng.uniform(0.0035, 0.006)
+    length, arch, thick = rng.uniform(0.09, 0.13), rng.uniform(0.015, 0.022), rng.uniform(0.0035, 0.006)
     x = np.linspace(0, length, 5)
     path = np.stack([x, 0 * x, arch * np.sin(np.pi * x / length)], -1)
     handle = sweep(path, (0, 1, 0), thick, rng.uniform(0.012, 0.02) * np.array([1.0, 0.9, 0.75, 0.6, 0.5]))

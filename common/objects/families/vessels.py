@@ -54,9 +54,10 @@ def hollow_mug(rng: Rng) -> Draft:
 def pitcher(rng: Rng) -> Draft:
     """A tall jug with a handle, and a spout on some."""
     radius, height, wall = rng.uniform(0.04, 0.06), rng.uniform(0.13, 0.235), rng.uniform(0.004, 0.006)
-    body = vessel([(0, radius), (height, radius * rng.uniform(0.8, 1.1))], wall, 7)
+    top = radius * rng.uniform(0.8, 1.1)
+    body = vessel([(0, radius), (height, top)], wall, 7)
     if rng.random() < 0.6:
-        lip = 0.9 * radius
+        lip = 0.9 * top
         corners = [(-lip, y, z) for y in (-0.02, 0.02) for z in (0.85 * height, height)]
         body.append(hull(corners, [(-lip - rng.uniform(0.015, 0.03), 0, height)]))
     return Draft(
@@ -188,10 +189,10 @@ def spray_bottle(rng: Rng) -> Draft:
     length, half = rng.uniform(0.03, 0.05), rng.uniform(0.01, 0.015)
     head = [(-0.03, y, top + z) for y in (-half, half) for z in (0.0, 0.022)]
     nose = [(length, 0.7 * y, top + z) for y in (-half, half) for z in (0.006, 0.024)]
-    trigger = (0.5 * length, 0, top), (0.8 * length, 0, top - rng.uniform(0.025, 0.04))
+    trigger = (0.5 * length, 0, top + 0.01), (0.8 * length, 0, top - rng.uniform(0.025, 0.04))
     pieces = (
         *lathe([(0, 0.95 * radius), (0.05 * height, radius), (0.6 * height, radius), (height, neck)], squash=squash),
-        draft.cylinder((0, 0, height), (0, 0, top), neck, part=1),
+        draft.cylinder((0, 0, height), (0, 0, top + 0.006), neck, part=1),
         hull(head, nose, part=1),
         draft.capsule(*trigger, 0.005, part=1),
     )
