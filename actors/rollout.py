@@ -160,9 +160,15 @@ class RolloutWorker:
             self.take_grasps()
 
     def restart(self) -> None:
-        """Fresh episodes in every environment."""
+        """Fresh episodes in every environment.
+
+        They end early, each at a time of its own, so that short rollouts show all phases of the task from then on.
+        """
         self._episode_key, key = _split(self._episode_key)
-        self.begin(self._sample_jit(self._bank, key, self._stationary))
+        conditions = self._sample_jit(self._bank, key, self._stationary)
+        whole = self._task.approach_steps + np.asarray(conditions.hold)
+        share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
+        self.begin(conditions._replace(hold=(conditions.hold - np.floor(share * whole)).astype(np.int32)))
 
     def begin(self, conditions: InitialConditions) -> None:
         """Goes on with these episodes, which are about to begin, one for each environment."""
