@@ -20,7 +20,8 @@ from common.wire.codec import Message
 
 LEAST_OBJECTS = 64
 """Pools from this size on are worth a file."""
-_MOST_FILES = 8  # some 50 MB each
+MOST_FILES = 8
+"""Banks that are kept; that of 800 objects has some 50 MB."""
 _IRRELEVANT = ("reward", "control", "mass_range", "friction_range", "hold_steps", "drop_height", "p_")
 """Beginnings of the names of settings that no bank depends on."""
 
@@ -35,7 +36,7 @@ def kept_bank(
     if (message := read_kept(path)) and message.arrays.keys() == set(ConstraintBank._fields):
         return jax.device_put(ConstraintBank(**message.arrays))
     bank = build()
-    keep(path, Message({name: np.asarray(field) for name, field in bank._asdict().items()}), _MOST_FILES)
+    keep(path, Message({name: np.asarray(field) for name, field in bank._asdict().items()}), MOST_FILES)
     return bank
 
 
