@@ -32,7 +32,8 @@ _DEFINITION = (
     "Actor: policy, observation, physics, reward and reset of whole episodes. Engine alone: for native, mj_step on "
     "the same models, start states and control targets, hence the same contacts, with as many threads; for others, "
     "steps that hold the actor's last targets. mujoco.rollout: the same steps in its own threads, whole episodes at "
-    "once, a call for each object. Ratio: the actor's control steps/s over the engine's."
+    "once, a call for each object. mujoco_warp: its kernels from the episodes' ends on, with the last targets. Ratio: "
+    "the actor's control steps/s over the engine's."
 )
 
 
@@ -41,6 +42,7 @@ def engines() -> list[PhysicsName]:
     return [resolve_physics("auto")] if jax.default_backend() == "cpu" else list(ENGINES)
 
 
+_PEERS = {"native": "mujoco.rollout, no actor", "warp": "mujoco_warp without JAX, no actor"}
 Rolled = Callable[[], np.ndarray]
 
 
@@ -145,7 +147,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
         _collect(worker, policy)
         twin = NativePhysics(hand, config.task, objects, threads) if isinstance(physics, Recorder) else None
         bare: Callable[[], object]
-        actor_seconds, bare_seconds, rolled_seconds = [], [], []
+        actor_seconds, bare_seconds, peer_seconds = [], [], []
         for _ in range(repeats):
             if isinstance(physics, Recorder) and twin is not None:
                 assert worker.state is not None
@@ -156,12 +158,14 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
                 bare = _compiled_loop(worker)
             actor_seconds.append(_timed(functools.partial(_collect, worker, policy)))
             if isinstance(physics, Recorder) and twin is not None:
-                rolled_seconds.append(_timed(rolled(twin, physics.commands, config.task.substeps)))
+                peer_seconds.append(_timed(rolled(twin, physics.commands, config.task.substeps)))
+            if name == "warp":
+                peer_seconds.append(_timed(functools.partial(physics.repeat, environments, _STEPS)))  # type: ignore[attr-defined]
             bare_seconds.append(_timed(bare))
         table.add_row(name, *_row(environments * _STEPS, np.array(actor_seconds), np.array(bare_seconds)))
-        if rolled_seconds:
-            peer = _row(environments * _STEPS, np.array(rolled_seconds), np.array(bare_seconds))
-            table.add_row("mujoco.rollout, no actor", *peer)
+        if peer_seconds:
+            peer = _row(environments * _STEPS, np.array(peer_seconds), np.array(bare_seconds))
+            table.add_row(_PEERS[name], *peer)
         physics.close()
         if twin is not None:
             twin.close()

@@ -7,7 +7,6 @@ import os
 import tempfile
 import threading
 from multiprocessing.connection import Connection
-from typing import Any
 
 import jax
 from rich.console import Console
@@ -76,11 +75,11 @@ def _start(config: RunConfig, physics: PhysicsName, caches: dict[str, str], dead
 def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) -> None:
     """Trains until the first update, and sends what the start consisted of."""
     imported()
-    seconds, programs = collections.Counter[str](), collections.Counter[str]()
+    seconds, programs = collections.defaultdict[str, float](float), collections.Counter[str]()
 
-    def timed(event: str, duration: float, **about: Any) -> None:
+    def timed(event: str, duration_secs: float, **about: str | int) -> None:
         if event in _EVENTS:
-            seconds[_EVENTS[event]] += duration
+            seconds[_EVENTS[event]] += duration_secs
             if event.endswith("backend_compile_duration"):
                 programs[str(about.get("fun_name"))] += 1
 

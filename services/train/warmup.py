@@ -32,6 +32,6 @@ def until_first_update(
 
     with tempfile.TemporaryDirectory() as folder:
         run_dir = pathlib.Path(folder, "run")
-        config = dataclasses.replace(config, updates=2)
+        config = dataclasses.replace(config, updates=1)
         create_run(run_dir, config, None)
         learn(run_dir, config, wire=None, inside=engine_of(physics, False), stop=stop, resume=False, on_update=updated)
