@@ -67,6 +67,8 @@ def _start(config: RunConfig, physics: PhysicsName, caches: dict[str, str], dead
             raise CongraspError(f"There was no first update in {deadline:.0f} s.", "Name a longer --deadline.")
         rows: dict[str, str] = json.loads(here.recv_bytes())
         process.join(_STOPPED_SECONDS)
+    except EOFError:
+        raise CongraspError("The training ended before its first update.", "What it said is above.") from None
     finally:
         process.kill()
     return rows
