@@ -1,4 +1,4 @@
-# quickstart: set up and train a small policy.  test, coverage, lint: check the code.  docs: build the site.  bench: print the benchmark tables.
+# quickstart: set up and train a small policy.  test, coverage, lint: check the code.  docs: build the site.  bench: install its peers, print the benchmark tables.
 # Everything runs in .venv, which the first target makes; another interpreter: make quickstart PYTHON=python3.12
 
 supported := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
@@ -32,9 +32,13 @@ lint: install
 docs: install
 	$(VENV)/bin/python -m sphinx -W --keep-going docs build/docs
 
-bench: install
-	$(VENV)/bin/congrasp bench physics
-	$(VENV)/bin/congrasp bench query
+bench:
+	$(MAKE) install EXTRA=bench
+	timeout 600 $(VENV)/bin/congrasp bench physics
+	timeout 300 $(VENV)/bin/congrasp bench query
+	timeout 300 $(VENV)/bin/congrasp bench transport --seconds 3 --repeats 2 --versions 20
+	timeout 600 $(VENV)/bin/congrasp bench measures --repeats 3
+	timeout 900 $(VENV)/bin/congrasp bench startup --preset quickstart --deadline 400
 
 install: $(VENV)/.$(EXTRA)
 

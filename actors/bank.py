@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from actors.kept_banks import kept_bank
 from common import rotations
 from common.config import TaskConfig
 from common.errors import CongraspError
@@ -46,6 +47,8 @@ _STEEPEST_UP = 0.1
 def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
     """Heading sets by the paper's rules, and procedural reference poses and trajectories, for a pool of objects.
 
+    Those of large pools are kept on disk.
+
     Args:
       hand: the hand.
       task: geometry of the approach.
@@ -56,6 +59,11 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
     grasp_frame(hand)  # kept; inside of a trace, it would be compiled operation by operation
+    return kept_bank(hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed))
+
+
+def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
+    """What `build_bank` returns."""
     count, scale = len(objects), object_scale(hand, task)
     seeds = [(seed, n) for n in range(count)]
     rows = parallel_map(

@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from actors.env import EnvState, episode_fields
@@ -22,6 +23,7 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from common.journal import Journal
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
+from common.stages import stage
 from common.task.bank import ConstraintBank
 from common.task.types import Array, Surface
 from common.transport.base import Transport
@@ -105,19 +107,21 @@ class _Actor:
         self._hand = get_hand(config.task.hand)
         self._number = zlib.crc32(link.actor.encode())
         self._objects, bank = training_set(self._hand, config, self._number)
-        self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
+        with stage("engine"):
+            self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
         self._spec = policy_spec(config.task, config.network)
-        self._worker = RolloutWorker(
-            self._hand,
-            config.task,
-            self._physics,
-            bank,
-            functools.partial(sample_action, self._spec.layout),
-            batch=config.environments,
-            # Another incarnation must not repeat the episodes of the one that it replaces.
-            seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
-            half_precision=config.half_observations,
-        )
+        with stage("first episodes"):
+            self._worker = RolloutWorker(
+                self._hand,
+                config.task,
+                self._physics,
+                bank,
+                functools.partial(sample_action, self._spec.layout),
+                batch=config.environments,
+                # Another incarnation must not repeat the episodes of the one that it replaces.
+                seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
+                half_precision=config.half_observations,
+            )
         self._failures = self._failure_weights(bank)
         self._on_rollout = on_rollout
         self._bundle: PolicyBundle | None = None
@@ -166,12 +170,14 @@ class _Actor:
                 self._link.give_back(ticket)
         assert self._bundle is not None
         self._configure(self._bundle.version)
-        if self._physics.compiled:
-            self._worker.compile(self._bundle.inference_parameters, self._config.rollout_steps)
-            return
-        for _ in range(2):  # the second time, environments have been restarted, which is traced apart
-            self._worker.collect(self._bundle.inference_parameters, self._config.rollout_steps)
-            self._worker.restart()
+        parameters, steps = self._bundle.inference_parameters, self._config.rollout_steps
+        with stage("compile rollout"):
+            if self._physics.compiled:
+                self._worker.compile(parameters, steps)
+                return
+            for _ in range(2):  # the second time, environments have been restarted, which is traced apart
+                self._worker.collect(parameters, steps)
+                self._worker.restart()
 
     def _configure(self, version: int) -> None:
         """Sets the curriculum's weights and phase under the policy of this version."""
@@ -195,7 +201,8 @@ class _Actor:
         began = time.monotonic()
         self._configure(bundle.version)
         started_fresh = before is not None and bool(np.asarray(before.time)[0] == 0)
-        rollout = self._worker.collect(bundle.inference_parameters, config.rollout_steps)
+        with stage("first rollout"):
+            rollout = jax.block_until_ready(self._worker.collect(bundle.inference_parameters, config.rollout_steps))
         steps = config.rollout_steps * config.environments
         taken = {name: getattr(rollout, name) for name in self._arrays}
         episodes, left_out = countable(finished_episodes(rollout, config.task))

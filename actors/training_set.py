@@ -12,6 +12,7 @@ from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.objects.pool import load_pool, scale_objects
 from common.objects.spec import GraspObject
+from common.stages import stage
 from common.task.bank import ConstraintBank, rows_of, stacked
 from common.task.constraint_sets import bank_of, load_for
 from common.wire.codec import Message
@@ -37,8 +38,10 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
     """
     objects, task, seed = config.objects, config.task, config.seed + number
     if not objects.folder:
-        pool = scale_objects(hand, task, load_pool(objects, number))
-        return TrainingSet(pool, build_bank(hand, task, pool, seed))
+        with stage("objects"):
+            pool = scale_objects(hand, task, load_pool(objects, number))
+        with stage("constraint bank"):
+            return TrainingSet(pool, build_bank(hand, task, pool, seed))
     found, sets = load_pool(objects), list[Message]()
     if objects.constraints:
         found, sets = load_for(pathlib.Path(objects.constraints), found)

@@ -15,13 +15,14 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from common.config import RunConfig, to_json
 from common.errors import CongraspError, PhysicsError, TransportError
 from common.files import write_atomically
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
+from common.stages import stage
 from common.transport.base import Transport
 from common.transport.keys import Keys
 from common.wire.codec import Message, encode, finite
@@ -304,7 +305,7 @@ class _Learner:
         mine = summary(messages, self._hub.lag)
         batch = collate([message.arrays for message in messages], self._form.arrays)
         try:
-            with self._ranks.watchdog():
+            with self._ranks.watchdog(), stage("first update"):
                 self._state, metrics = self._algorithm.update(self._state, batch, self._ranks.mesh)
             self._dropped_in_a_row = 0
         except NonFiniteUpdate as error:
@@ -362,8 +363,8 @@ class _Learner:
     def _warm_up(self) -> None:
         """Compiles the update while the actors make the first rollouts."""
         batch = self._form.zeros(self._config.ppo.rollouts_per_update)
-        copy = self._state._replace(optimizer=jax.tree.map(jnp.copy, self._state.optimizer))
-        with self._ranks.watchdog():
+        copy = self._state._replace(optimizer=jax.tree.map(np.array, self._state.optimizer))
+        with self._ranks.watchdog(), stage("compile update"):
             self._algorithm.update(copy, batch, self._ranks.mesh)
 
     def _save(self) -> None:

@@ -153,6 +153,13 @@ class WarpPhysics:
         none = jnp.zeros((batch, self._sensors))
         return physics_state(jnp, self._where, state.qpos, state.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
 
+    def repeat(self, batch: int, steps: int) -> None:
+        """Control steps of a batch that was stepped before, from there and with its targets; no state sees them.
+
+        Nothing but MuJoCo Warp's kernels runs, without JAX: what a benchmark compares with.
+        """
+        self._buffers[batch][1].repeat(steps)
+
     def close(self) -> None:
         """Releases the environments' memory."""
         self._buffers.clear()

@@ -97,14 +97,25 @@ class WarpBuffers:
             wp.copy(mine, given)
         inputs = [*placed, self._objects, self._leaves, self._occupancy]
         wp.launch(place, (data.nworld, self._leaves.geoms.size), inputs, device=self._device)
-        if not self._device.is_cuda:
-            self._substep_all()
-        else:
-            if self._graph is None:
-                self._graph = self._capture()
-            wp.capture_launch(self._graph)
+        self._launch()
         for mine, given in (*state, (data.sensordata, sensordata), (self._occupancy, occupancy)):
             wp.copy(given, mine)
+
+    def repeat(self, steps: int) -> None:
+        """Control steps from where the last one ended, by nothing but Warp, and waits for them; for benchmarks."""
+        with wp.ScopedDevice(self._device):
+            for _ in range(steps):
+                self._launch()
+        wp.synchronize_device(self._device)
+
+    def _launch(self) -> None:
+        """Launches the kernels of one control step."""
+        if not self._device.is_cuda:
+            self._substep_all()
+            return
+        if self._graph is None:
+            self._graph = self._capture()
+        wp.capture_launch(self._graph)
 
     def _capture(self) -> wp.Graph:
         """Records the kernels of one control step as a CUDA graph."""

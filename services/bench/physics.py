@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
+from mujoco import rollout
 from rich.console import Console
 from rich.table import Table
 
@@ -30,13 +31,19 @@ _STEPS = 75
 _DEFINITION = (
     "Actor: policy, observation, physics, reward and reset of whole episodes. Engine alone: for native, mj_step on "
     "the same models, start states and control targets, hence the same contacts, with as many threads; for others, "
-    "steps that hold the actor's last targets. Ratio: the actor's control steps/s over the engine's."
+    "steps that hold the actor's last targets. mujoco.rollout: the same steps in its own threads, whole episodes at "
+    "once, a call for each object. mujoco_warp: its kernels from the episodes' ends on, with the last targets. Ratio: "
+    "the actor's control steps/s over the engine's."
 )
 
 
 def engines() -> list[PhysicsName]:
     """Engines to compare on this machine: all of them, but on a CPU the one that it is best at."""
     return [resolve_physics("auto")] if jax.default_backend() == "cpu" else list(ENGINES)
+
+
+_PEERS = {"native": "mujoco.rollout, no actor", "warp": "mujoco_warp without JAX, no actor"}
+Rolled = Callable[[], np.ndarray]
 
 
 class Recorder(NativePhysics):
@@ -72,6 +79,45 @@ def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarr
             list(pool.map(run, shares, itertools.repeat(targets)))
 
 
+def rolled(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> Rolled:
+    """Recorded control steps as calls of `mujoco.rollout`, laid out before: it has threads and the loop in C.
+
+    One call for each object, because it takes models of one size; so no policy could act between its steps at once in
+    all environments.
+
+    Returns:
+      A function without arguments that makes the calls, and returns the final positions (nq,) of every environment.
+    """
+    given = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_EQ_ACTIVE
+    given |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+    whole = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    first, instances = physics.instances[0].model, physics.instances
+    starts = np.zeros((len(instances), mujoco.mj_stateSize(first, whole)))
+    controls = np.zeros((len(instances), len(commands), mujoco.mj_stateSize(first, given)))
+    for i, instance in enumerate(instances):
+        mujoco.mj_getState(instance.model, instance.data, starts[i], whole)
+    for step, (target, table) in enumerate(commands):
+        physics.place_tables(table)
+        for i, instance in enumerate(instances):
+            instance.ctrl[:] = target[i]
+            mujoco.mj_getState(instance.model, instance.data, controls[i, step], given)
+    controls = np.repeat(controls, substeps, 1)
+    scenes = [id(instance.scene) for instance in instances]
+    groups = [np.flatnonzero(np.array(scenes) == scene) for scene in dict.fromkeys(scenes)]
+    scratch = [[mujoco.MjData(instances[rows[0]].model) for _ in range(physics.threads)] for rows in groups]
+
+    def run() -> np.ndarray:
+        found = np.zeros((len(instances), first.nq))
+        with rollout.Rollout(nthread=physics.threads) as threads:
+            for rows, data in zip(groups, scratch, strict=True):
+                models = [instances[i].model for i in rows]
+                states, _ = threads.rollout(models, data, starts[rows], controls[rows], control_spec=int(given))
+                found[rows] = states[:, -1, 1 : 1 + first.nq]  # the time is first
+        return found
+
+    return run
+
+
 def bench_physics(environments: int, threads: int, repeats: int, names: list[PhysicsName]) -> None:
     """Control steps a second of actors (policy, observation, reward, reset) beside engines that only step."""
     console = Console()
@@ -101,7 +147,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
         _collect(worker, policy)
         twin = NativePhysics(hand, config.task, objects, threads) if isinstance(physics, Recorder) else None
         bare: Callable[[], object]
-        actor_seconds, bare_seconds = [], []
+        actor_seconds, bare_seconds, peer_seconds = [], [], []
         for _ in range(repeats):
             if isinstance(physics, Recorder) and twin is not None:
                 assert worker.state is not None
@@ -111,8 +157,15 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
             else:
                 bare = _compiled_loop(worker)
             actor_seconds.append(_timed(functools.partial(_collect, worker, policy)))
+            if isinstance(physics, Recorder) and twin is not None:
+                peer_seconds.append(_timed(rolled(twin, physics.commands, config.task.substeps)))
+            if name == "warp":
+                peer_seconds.append(_timed(functools.partial(physics.repeat, environments, _STEPS)))  # type: ignore[attr-defined]
             bare_seconds.append(_timed(bare))
         table.add_row(name, *_row(environments * _STEPS, np.array(actor_seconds), np.array(bare_seconds)))
+        if peer_seconds:
+            peer = _row(environments * _STEPS, np.array(peer_seconds), np.array(bare_seconds))
+            table.add_row(_PEERS[name], *peer)
         physics.close()
         if twin is not None:
             twin.close()

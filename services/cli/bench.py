@@ -210,6 +210,37 @@ def scaling(
     return 0
 
 
+def startup(
+    preset: str = "human",
+    environments: int = 0,
+    objects: int = 0,
+    physics: PhysicsName = "auto",
+    deadline: float = 600.0,
+) -> int:
+    """Seconds from the start of a training to its first update, stage by stage: with empty caches, and again with them.
+
+    Learner and actor live in one process, as on a GPU. Warp's kernels have a cache of their own, which is used as it
+    is. The machine's caches are neither used nor changed.
+
+    Args:
+      preset: Named configuration of the run.
+      environments: Environments; 0: those of the preset.
+      objects: Objects in the pool; 0: those of the preset.
+      physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
+      deadline: Seconds that one start may take.
+    """
+    import dataclasses
+
+    from services.bench.startup import bench_startup
+    from services.train.presets import get_preset
+
+    config = get_preset(preset)
+    pool = dataclasses.replace(config.objects, count=objects or config.objects.count)
+    config = dataclasses.replace(config, environments=environments or config.environments, objects=pool)
+    bench_startup(config, physics, deadline)
+    return 0
+
+
 def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int = 0, repeats: int = 5) -> int:
     """Seconds of an evaluation's episodes with measures of plausibility beside the same without them.
 
@@ -241,4 +272,5 @@ COMMANDS = {
     "recovery": recovery,
     "recording": recording,
     "scaling": scaling,
+    "startup": startup,
 }

@@ -21,6 +21,7 @@ from services.ops.shutdown import follow_parent, on_signal
 
 COMMANDS = {
     "train": "train a policy: a learner and its actors on this machine",
+    "warmup": "compile what a training needs, ahead of it",
     "learner": "the learner alone; actors connect to it, from this machine or others",
     "actor": "one actor that works for a learner elsewhere",
     "serve": "answer live queries with a run's newest policy or a policy file",

@@ -30,7 +30,7 @@ def train(
     listen: str | None = None,
     certs: pathlib.Path | None = None,
     insecure: bool = False,
-    evaluation: int = 64,
+    evaluation: int | None = None,
     boards: tuple[MetricWriter, ...] = ("tensorboard",),
     metrics_port: int = 0,
 ) -> int:
@@ -61,7 +61,8 @@ def train(
         default.
       certs: The authority's folder (congrasp certs), for mutual TLS.
       insecure: Listen beyond loopback without certificates.
-      evaluation: Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out.
+      evaluation: Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out. By
+        default 64, and before training for the quickstart preset alone.
       boards: Where the learner's metrics are written, too: tensorboard (files in the run's folder), wandb-offline
         (files there, for `wandb sync`), wandb (needs an account); with no name none.
       metrics_port: Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none.
@@ -80,7 +81,8 @@ def train(
         actors=actors,
         resume=resume,
         initial=initial,
-        evaluation=evaluation,
+        evaluation=64 if evaluation is None else evaluation,
+        compared=evaluation is not None or preset == "quickstart",
         ranks=ranks,
         writers=boards,
         metrics_port=metrics_port,

@@ -21,6 +21,7 @@ from common.parallel import cores
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle, policy_spec
 from common.policy.pretrained import pretrained_file
+from common.stages import imported, since_start, stages
 from common.transport import urls
 from common.transport.ports import LEARNER_URL
 from common.transport.security import CERTIFICATE_FILE, check_exposure
@@ -70,6 +71,7 @@ def run_training(
     actors: int | None,
     resume: bool,
     evaluation: int,
+    compared: bool = True,
     initial: pathlib.Path | None = None,
     writers: Sequence[MetricWriter] = ("tensorboard",),
     metrics_port: int = 0,
@@ -78,7 +80,10 @@ def run_training(
     insecure: bool = False,
     ranks: int = 1,
 ) -> int:
-    """Evaluates, trains, evaluates again and shows the result; `services.cli.train` describes the arguments.
+    """Evaluates, trains, evaluates again and shows the result; `services.cli.train` describes the other arguments.
+
+    Args:
+      compared: whether the evaluation is made before training, too.
 
     Returns:
       The exit code.
@@ -86,12 +91,14 @@ def run_training(
     Raises:
       CongraspError: the arguments contradict each other, the configuration cannot run, or a process failed for good.
     """
+    imported()
     _check_connections(actors, listen, certs, config.name, insecure=insecure)
     plan = _plan(config, actors, ranks, listens=listen is not None or certs is not None)
     _prepare(run_dir, config, initial, resume=resume)
     easier_task = _announce(config, run_dir, plan)
     with on_signal() as stop:
-        before = _evaluate(untrained(config), config, evaluation, "before training") if evaluation else []
+        first = evaluation if compared else 0
+        before = _evaluate(untrained(config), config, first, "before training") if first else []
         began = time.monotonic()
         with _Progress(config, ranks) as progress:
             if plan.in_process:
@@ -255,7 +262,9 @@ class _Progress:
         self._print()
 
     def update(self, values: dict[str, float]) -> None:
-        """Shows the metrics of an update of this process's own learner."""
+        """Shows the metrics of an update of this process's own learner, and after the first what the start took."""
+        if self._first is None:
+            console.print(f"  [dim]{first_update()}[/]", soft_wrap=True)
         self.show({"values": values, "actors": 1, "version": int(values["version"])})
 
     def show(self, status: dict[str, Any]) -> None:
@@ -296,6 +305,12 @@ class _Progress:
         )
 
 
+def first_update() -> str:
+    """What the time until the first update of this process's learner consisted of."""
+    parts = ", ".join(f"{one.name} {one.ended - one.began:.1f}" for one in stages())
+    return f"first update {since_start():.1f} s after the start; of this, side by side in part: {parts}"
+
+
 def _steps_per_update(config: RunConfig) -> int:
     """Environment steps of one update of one rank."""
     return config.rollout_steps * config.environments * config.ppo.rollouts_per_update
@@ -323,14 +338,18 @@ def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, when: str)
 
 
 def _compare(before: list[Row], after: list[Row]) -> None:
-    """Prints metrics before and after, and whether their difference exceeds the noise."""
-    console.print(f"Before and after, mean ± standard deviation over {_SEEDS} draws of episodes:")
+    """Prints metrics before, if they were measured, and after, and whether their difference exceeds the noise."""
+    when = "Before and after" if before else "After"
+    console.print(f"{when}, mean ± standard deviation over {_SEEDS} draws of episodes:")
     for name, label, factor in (
         ("episode_return", "return", 1.0),
         ("links_at_removal", "links in contact at step 50", 1.0),
         ("success", "success, %", 100.0),
     ):
         old, new = (factor * np.array([getattr(row, name) for row in rows]) for rows in (before, after))
+        if not before:
+            console.print(f"  {label:28s} {new.mean():7.2f} ± {new.std(ddof=1):5.2f}", soft_wrap=True)
+            continue
         clear = abs(new.mean() - old.mean()) > old.std(ddof=1) + new.std(ddof=1)
         console.print(
             f"  {label:28s} {old.mean():7.2f} ± {old.std(ddof=1):5.2f}  ->  {new.mean():7.2f} ± {new.std(ddof=1):5.2f}"

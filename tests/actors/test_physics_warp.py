@@ -107,6 +107,23 @@ def test_scanned_objects_agree_with_native(shared_objects):
     _agrees_with_native(objects, _starts(objects))
 
 
+def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(start):
+    """One control step by JAX and three repeats are four control steps with the same targets; and nobody notices."""
+    physics, batch = WarpPhysics(HAND, TASK, OBJECTS), len(OBJECTS)
+    target, table, step = jnp.asarray(grasp(start, 5)), jnp.ones(batch, bool), jax.jit(physics.step)
+    first, _ = step(physics.start(start), target, table)
+    before = jax.tree.map(np.array, first)
+    physics.repeat(batch, 3)
+    repeated = physics._buffers[batch][1]._data.qpos.numpy()
+    _same(before, first)
+    after = first
+    for _ in range(3):
+        after, _ = step(after, target, table)
+    np.testing.assert_allclose(repeated, after.qpos, atol=1e-5)
+    assert np.abs(repeated - before.qpos).max() > 1e-3
+    physics.close()
+
+
 def test_rows_are_what_mujoco_compiles():
     catalogue = Catalogue(HAND, TASK, OBJECTS[0], 8)
     before = {name: getattr(catalogue.model, name).copy() for name in ("geom_dataid", "geom_size", "body_mass")}

@@ -38,6 +38,7 @@ def test_help_names_every_command_and_every_command_exists():
         (["train", "--physics", "abacus"], "'abacus'.*'native'"),
         (["render", "hnad"], "hnad.*--help"),
         (["train", "--preset", "nonsense"], "no preset 'nonsense'"),
+        (["warmup", "--preset", "nonsense"], "no preset 'nonsense'"),
         (["train", "--method", "pd"], "'pd' does not learn.*evaluate --method pd"),
         (["evaluate", "--method", "graspxl"], "is of the method 'ours', not 'graspxl'.*train --method graspxl"),
         (["train", "--task.hand", "paw"], "no hand 'paw'"),

@@ -7,19 +7,19 @@ from actors.physics.native import NativePhysics
 from common.config import TaskConfig
 from common.hands import get_hand
 from common.objects import procedural
-from services.bench.physics import Recorder, replay
+from services.bench.physics import Recorder, replay, rolled
 
 HAND = get_hand("human")
 TASK = TaskConfig()
 WORLDS = 3
 
 
-def test_a_replay_ends_in_the_very_states_of_the_recording():
-    box = procedural.generate(0, "box")
+def test_replays_end_in_the_very_states_of_the_recording():
+    objects = box, _ = [procedural.generate(0, family) for family in ("box", "cylinder")]
     height = float(np.abs(box.points[:, 2]).max())
     one = np.ones((WORLDS, 1))
     reset_state = ResetState(
-        object_index=np.zeros(WORLDS, int),
+        object_index=np.arange(WORLDS) % 2,
         mass_scale=np.linspace(0.5, 1.5, WORLDS),
         friction=np.ones(WORLDS),
         base_position=one * [0.0, -0.05, 0.5],
@@ -29,7 +29,7 @@ def test_a_replay_ends_in_the_very_states_of_the_recording():
         object_quaternion=one * [1.0, 0.0, 0.0, 0.0],
         stationary=np.zeros(WORLDS, bool),
     )
-    recorder, twin = (make(HAND, TASK, [box], 2) for make in (Recorder, NativePhysics))
+    recorder, twin = (make(HAND, TASK, objects, 2) for make in (Recorder, NativePhysics))
     rng = np.random.default_rng(0)
     state, touched = recorder.start(reset_state), False
     for step in range(20):
@@ -37,6 +37,9 @@ def test_a_replay_ends_in_the_very_states_of_the_recording():
         state, seen = recorder.step(state, targets, np.full(WORLDS, step < 10))
         touched |= bool(seen.contact_found.any())
     assert touched
+    twin.start(reset_state)
+    ends = rolled(twin, recorder.commands, TASK.substeps)()
+    np.testing.assert_array_equal(ends, [instance.data.qpos for instance in recorder.instances])
     twin.start(reset_state)
     replay(twin, recorder.commands, TASK.substeps)
     for a, b in zip(recorder.instances, twin.instances, strict=True):

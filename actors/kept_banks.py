@@ -1,0 +1,50 @@
+"""Constraint banks of large pools, kept on disk: they follow from objects, hand and task, and take long to build."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+
+import actors
+import common
+from common.caches import cache_folder, keep, read_kept, source_digest
+from common.config import TaskConfig
+from common.hands.spec import Hand
+from common.objects import store
+from common.objects.spec import GraspObject
+from common.task.bank import ConstraintBank
+from common.wire.codec import Message
+
+LEAST_OBJECTS = 64
+"""Pools from this size on are worth a file."""
+MOST_FILES = 8
+"""Banks that are kept; that of 800 objects has some 50 MB."""
+_IRRELEVANT = ("reward", "control", "mass_range", "friction_range", "hold_steps", "drop_height", "disturbed", "p_")
+"""Beginnings of the names of settings that no bank depends on."""
+
+
+def kept_bank(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, build: Callable[[], ConstraintBank]
+) -> ConstraintBank:
+    """The bank that `build` makes of these arguments (`actors.bank.build_bank`), from disk if it was made before."""
+    if len(objects) < LEAST_OBJECTS:
+        return build()
+    path = cache_folder("banks") / f"{_key(hand, task, objects, seed)}.safetensors"
+    if (message := read_kept(path)) and message.arrays.keys() == set(ConstraintBank._fields):
+        return jax.device_put(ConstraintBank(**message.arrays))
+    bank = build()
+    keep(path, Message({name: np.asarray(field) for name, field in bank._asdict().items()}), MOST_FILES)
+    return bank
+
+
+def _key(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> str:
+    """What a bank depends on, the code and the device's arithmetic included, as a file's name."""
+    code = source_digest(actors, common)
+    settings = {name: value for name, value in dataclasses.asdict(task).items() if not name.startswith(_IRRELEVANT)}
+    device = jax.local_devices()[0].device_kind
+    digests = [store.digest(obj) for obj in objects]
+    text = json.dumps([code, jax.__version__, device, hand.reference, settings, seed, digests])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

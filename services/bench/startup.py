@@ -1,0 +1,98 @@
+"""Seconds from the start of a process to its first update, and what they consist of: with empty caches, and again."""
+
+import collections
+import json
+import multiprocessing
+import os
+import tempfile
+import threading
+from multiprocessing.connection import Connection
+
+import jax
+from rich.console import Console
+from rich.table import Table
+
+from common.config import RunConfig
+from common.engines import PhysicsName
+from common.errors import CongraspError
+from common.stages import imported, since_start, stages
+from services.train.warmup import until_first_update
+
+_STOPPED_SECONDS = 30.0
+_EVENTS = {
+    "/jax/core/compile/jaxpr_trace_duration": "tracing",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lowering",
+    "/jax/core/compile/backend_compile_duration": "compiling or reading",
+}
+
+
+def bench_startup(config: RunConfig, physics: PhysicsName, deadline: float) -> None:
+    """Prints the stages of two starts of a training in one process, the second with the caches of the first.
+
+    Args:
+      config: of the run.
+      physics: engine.
+      deadline: seconds that a start may take.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        caches = {"XDG_CACHE_HOME": folder, "JAX_COMPILATION_CACHE_DIR": f"{folder}/jax"}
+        starts = {name: _start(config, physics, caches, deadline) for name in ("empty caches", "warm")}
+    names = list(dict.fromkeys(name for found in starts.values() for name in found))
+    table = Table(title=f"{config.name}: {config.environments} environments, {config.objects.count} objects, {physics}")
+    table.add_column("seconds")
+    for name in starts:
+        table.add_column(name, justify="right")
+    for name in names:
+        table.add_row(name, *(found.get(name, "") for found in starts.values()))
+    console = Console()
+    console.print(table)
+    console.print(
+        "Stages overlap where threads do. Warp's kernels are in a cache of their own, which is used as it is; "
+        "'congrasp warmup' fills it."
+    )
+
+
+def _start(config: RunConfig, physics: PhysicsName, caches: dict[str, str], deadline: float) -> dict[str, str]:
+    """The rows of one start, in a process of its own."""
+    here, there = multiprocessing.Pipe()
+    before = {name: os.environ.get(name) for name in caches}
+    os.environ.update(caches)
+    process = multiprocessing.get_context("spawn").Process(target=_first_update, args=(config, physics, there))
+    process.start()
+    for name, value in before.items():
+        os.environ.pop(name) if value is None else os.environ.update({name: value})
+    try:
+        there.close()
+        if not here.poll(deadline):
+            raise CongraspError(f"There was no first update in {deadline:.0f} s.", "Name a longer --deadline.")
+        rows: dict[str, str] = json.loads(here.recv_bytes())
+        process.join(_STOPPED_SECONDS)
+    except EOFError:
+        raise CongraspError("The training ended before its first update.", "What it said is above.") from None
+    finally:
+        process.kill()
+    return rows
+
+
+def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) -> None:
+    """Trains until the first update, and sends what the start consisted of."""
+    imported()
+    seconds, programs = collections.defaultdict[str, float](float), collections.Counter[str]()
+
+    def timed(event: str, duration_secs: float, **about: str | int) -> None:
+        if event in _EVENTS:
+            seconds[_EVENTS[event]] += duration_secs
+            if event.endswith("backend_compile_duration"):
+                programs[str(about.get("fun_name"))] += 1
+
+    jax.monitoring.register_event_duration_secs_listener(timed)
+
+    def report() -> None:
+        rows = {one.name: f"{one.ended - one.began:.2f} (at {one.began:.1f})" for one in stages()}
+        rows |= {f"{name}, all threads": f"{total:.2f}" for name, total in seconds.items()}
+        rows["compiled programs"] = str(programs.total())
+        rows["of these more than once"] = ", ".join(f"{name} {n}" for name, n in programs.items() if n > 1)
+        rows["first update"] = f"{since_start():.2f}"
+        results.send_bytes(json.dumps(rows).encode())
+
+    until_first_update(config, physics, threading.Event(), report)

@@ -1,0 +1,53 @@
+"""`congrasp warmup`: compiled programs ahead of time."""
+
+import dataclasses
+
+import actors.physics  # noqa: F401 - registers the engines that --physics offers
+from common.engines import PhysicsName
+
+
+def warmup(
+    preset: str = "human",
+    hand: str | None = None,
+    physics: PhysicsName = "auto",
+    environments: int = 0,
+    rollout_steps: int = 0,
+) -> int:
+    """Compiles what `congrasp train` needs on this machine, and keeps it: kernels, programs, the constraint bank.
+
+    Makes the first update of such a training and throws it away. What it leaves are the caches in
+    JAX_COMPILATION_CACHE_DIR (compiled programs; by default congrasp/jax in the user's cache folder), WARP_CACHE_PATH
+    (GPU kernels; warp there) and congrasp/banks in the user's cache folder (XDG_CACHE_HOME). They may be made where a
+    container image is built, and copied to machines with the same kind of GPU and the same versions. Other numbers of
+    environments or steps are other programs. On several GPUs, run it before `congrasp train --ranks`: otherwise each
+    rank compiles.
+
+    Args:
+      preset: Named configuration that will be trained.
+      hand: The hand, by its name or its file; by default the preset's.
+      physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
+      environments: Environments of an actor; 0: those of the preset.
+      rollout_steps: Control steps of a rollout; 0: those of the preset.
+    """
+    from rich.console import Console
+
+    from common.stages import imported
+    from services.ops.shutdown import on_signal
+    from services.train.command import first_update
+    from services.train.presets import get_preset, with_hand
+    from services.train.warmup import until_first_update
+
+    imported()
+    console = Console(highlight=False)
+    config = with_hand(get_preset(preset), hand)
+    config = dataclasses.replace(
+        config,
+        environments=environments or config.environments,
+        rollout_steps=rollout_steps or config.rollout_steps,
+    )
+    with on_signal() as stop, console.status("compiling"):
+        until_first_update(config, physics, stop, lambda: console.print(first_update(), soft_wrap=True))
+    return stop.exit_code
+
+
+COMMAND = warmup

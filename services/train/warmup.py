@@ -1,0 +1,37 @@
+"""A training that ends with its first update: afterwards everything that one compiles or builds is in the caches."""
+
+import dataclasses
+import pathlib
+import tempfile
+import threading
+from collections.abc import Callable
+
+from common.config import RunConfig
+from common.engines import PhysicsName
+from learner.run_directory import create_run
+from services.train.learn import learn
+from services.train.processes import engine_of
+
+
+def until_first_update(
+    config: RunConfig, physics: PhysicsName, stop: threading.Event, report: Callable[[], None]
+) -> None:
+    """Starts a training in this process, in a folder that is then removed, and ends it after its first update.
+
+    Args:
+      config: of the run.
+      physics: engine; `auto` takes this machine's.
+      stop: ends it earlier.
+      report: called after the first update, before anything is taken down.
+    """
+
+    def updated(values: dict[str, float]) -> None:
+        if not stop.is_set():
+            report()
+            stop.set()
+
+    with tempfile.TemporaryDirectory() as folder:
+        run_dir = pathlib.Path(folder, "run")
+        config = dataclasses.replace(config, updates=1)
+        create_run(run_dir, config, None)
+        learn(run_dir, config, wire=None, inside=engine_of(physics, False), stop=stop, resume=False, on_update=updated)

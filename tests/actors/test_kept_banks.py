@@ -1,0 +1,94 @@
+"""Constraint banks that are kept on disk."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from actors import kept_banks
+from actors.kept_banks import kept_bank
+from common.config import RewardWeights, TaskConfig
+from common.hands import get_hand
+from common.objects import procedural
+from common.task.bank import ConstraintBank
+
+HAND = get_hand("human")
+TASK = TaskConfig()
+OBJECTS = [procedural.generate(seed, "box") for seed in range(2)]
+
+
+@pytest.fixture(autouse=True)
+def _small_pools_in_a_cache_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(kept_banks, "LEAST_OBJECTS", 2)
+
+
+class Builder:
+    """Makes banks of random numbers, and counts how often it was asked."""
+
+    def __init__(self):
+        self.built = 0
+
+    def __call__(self) -> ConstraintBank:
+        self.built += 1
+        rng = np.random.default_rng(self.built)
+        fields = {name: rng.normal(size=(2, 3)).astype(np.float32) for name in ConstraintBank._fields}
+        fields["avoid"] = rng.random((2, 3)) > 0.5
+        return ConstraintBank(**fields)
+
+
+def test_a_bank_is_built_once_and_found_again_as_it_was():
+    build = Builder()
+    first = kept_bank(HAND, TASK, OBJECTS, 0, build)
+    again = kept_bank(HAND, TASK, OBJECTS, 0, build)
+    assert build.built == 1
+    for a, b in zip(first, again, strict=True):
+        assert isinstance(b, jax.Array) and a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("hand", "task", "objects", "seed"),
+    [
+        (HAND, TASK, OBJECTS, 1),
+        (HAND, TASK, OBJECTS[::-1], 0),
+        (HAND, dataclasses.replace(TASK, headings="above"), OBJECTS, 0),
+        (HAND, dataclasses.replace(TASK, trajectory_points=20), OBJECTS, 0),
+        (get_hand("allegro"), TASK, OBJECTS, 0),
+    ],
+    ids=["seed", "objects", "headings", "waypoints", "hand"],
+)
+def test_whatever_a_bank_depends_on_makes_another(hand, task, objects, seed):
+    build = Builder()
+    kept_bank(HAND, TASK, OBJECTS, 0, build)
+    kept_bank(hand, task, objects, seed, build)
+    assert build.built == 2
+
+
+def test_what_no_bank_depends_on_does_not():
+    build = Builder()
+    kept_bank(HAND, TASK, OBJECTS, 0, build)
+    kept_bank(HAND, dataclasses.replace(TASK, reward=RewardWeights(force=7.0), p_pose=0.1), OBJECTS, 0, build)
+    assert build.built == 1
+
+
+def test_a_damaged_file_is_made_anew(tmp_path):
+    build = Builder()
+    kept_bank(HAND, TASK, OBJECTS, 0, build)
+    (file,) = (tmp_path / "congrasp" / "banks").iterdir()
+    data = bytearray(file.read_bytes())
+    data[-1] ^= 1
+    file.write_bytes(data)
+    kept_bank(HAND, TASK, OBJECTS, 0, build)
+    kept_bank(HAND, TASK, OBJECTS, 0, build)
+    assert build.built == 2
+
+
+def test_only_the_banks_used_last_are_kept(tmp_path):
+    build = Builder()
+    for seed in range(kept_banks.MOST_FILES + 2):
+        kept_bank(HAND, TASK, OBJECTS, seed, build)
+    assert len(list((tmp_path / "congrasp" / "banks").iterdir())) == kept_banks.MOST_FILES
+    kept_bank(HAND, TASK, OBJECTS, kept_banks.MOST_FILES + 1, build)
+    assert build.built == kept_banks.MOST_FILES + 2

@@ -1,0 +1,37 @@
+"""What is compiled ahead of a training."""
+
+import pathlib
+import threading
+
+from common.config import RunConfig
+from services.train import warmup
+
+
+def test_it_ends_with_the_first_update_and_leaves_no_run_behind(monkeypatch):
+    seen, events = {}, []
+
+    def learn(run_dir, config, *, wire, inside, stop, resume, on_update):
+        seen.update(run_dir=run_dir, config=config, inside=inside, stop=stop)
+        assert pathlib.Path(run_dir, "config.json").exists()
+        for update in range(2):
+            events.append(f"update {update}")
+            on_update({})
+
+    monkeypatch.setattr(warmup, "learn", learn)
+    stop = threading.Event()
+    warmup.until_first_update(RunConfig(), "native", stop, lambda: events.append("reported"))
+    assert events == ["update 0", "reported", "update 1"]
+    assert stop.is_set() and seen["stop"] is stop
+    assert seen["inside"] == "native" and seen["config"].updates == 1
+    assert not seen["run_dir"].exists()
+
+
+def test_nothing_is_reported_of_a_start_that_was_stopped(monkeypatch):
+    def learn(run_dir, config, *, stop, on_update, **rest):
+        stop.set()
+        on_update({})
+
+    reported = []
+    monkeypatch.setattr(warmup, "learn", learn)
+    warmup.until_first_update(RunConfig(), "native", threading.Event(), lambda: reported.append(1))
+    assert not reported
