@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.cli.report import curves_of
 from services.evaluate.paper import paper_row
-from services.evaluate.report import Commands, Picture, count_causes, write_report
+from services.evaluate.report import Commands, Picture, count_causes, curves_of, write_report
 from services.evaluate.scores import Row
 from services.record.channels import JsonChannels
 from services.record.writer import LogWriter
