@@ -146,14 +146,17 @@ def evaluate_objects(
         running: Episodes | None = None
         measured = pools.size * number <= MEASURED
         for pool in stack.enter_context(_one_ahead(_prepared(hand, task, pools, seed, todo, measured))):
-            done = sum(len(result.sample.values["success"]) for result in found.values())
-            if running is not None:
-                running.replace_objects(pool.objects, pool.field)
+            done = sum(result.episodes for result in found.values())
+            if pool.bank is None:
+                result = _nothing(pool.left_out)
             else:
-                running = stack.enter_context(Episodes(bundle, task, pool.objects, field=pool.field, **settings))
-            advance = functools.partial(lambda before, n: progress(before + n), done)
-            result = _simulated(running, hand, task, pool, each, seed, advance, max(0, STRESSED - done))
-            if len(found):
+                if running is None:
+                    running = stack.enter_context(Episodes(bundle, task, pool.objects, field=pool.field, **settings))
+                else:
+                    running.replace_objects(pool.objects, pool.field)
+                advance = functools.partial(lambda before, n: progress(before + n), done)
+                result = _simulated(running, hand, task, pool, each, seed, advance, max(0, STRESSED - done))
+            if done:
                 result = result._replace(sample=_without_forces(result.sample))
             if keep:
                 _write(_file(keep, pool.number), result, about)
@@ -167,7 +170,8 @@ class _Pool(NamedTuple):
     number: int
     objects: list[GraspObject]
     """In the hand's size; those from `real` on repeat others, so that all pools have one size."""
-    bank: ConstraintBank
+    bank: ConstraintBank | None
+    """None where no object is left."""
     field: DistanceField | None
     real: int
     left_out: list[str]
@@ -182,6 +186,16 @@ class _Result(NamedTuple):
     """(N, 2) side and mass."""
     families: list[str]
     left_out: list[str]
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.sample.values.get("success", ()))
+
+
+def _nothing(left_out: list[str]) -> _Result:
+    """The result of a pool of which no object is left."""
+    return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], np.zeros((0, 2)), [], left_out)
 
 
 def _divided(count: int, most: int) -> tuple[int, int]:
@@ -207,15 +221,15 @@ def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
 def _prepared(
     hand: Hand, task: TaskConfig, pools: Pools, seed: int, wanted: Sequence[int], measured: bool
 ) -> Iterator[_Pool]:
-    """Pools with their constraints; a pool of which nothing is left is none."""
+    """Pools with their constraints."""
     for number in wanted:
         loaded, left_out = pools.make[number]()
         objects = scale_objects(hand, task, loaded)
         kept, bank = _with_bank(hand, task, objects, pools.size, seed + number)
         left_out = [*left_out, *(obj.name for obj in objects if all(obj is not other for other in kept))]
-        if bank is not None:
-            filled = _filled(kept, pools.size)
-            yield _Pool(number, filled, bank, distance_field(filled) if measured else None, len(kept), left_out)
+        filled = _filled(kept, pools.size)
+        field = distance_field(filled) if measured and kept else None
+        yield _Pool(number, filled, bank, field, len(kept), left_out)
 
 
 def _filled(objects: Sequence[GraspObject], size: int) -> list[GraspObject]:
@@ -262,6 +276,7 @@ def _simulated(
     stressed: int,
 ) -> _Result:
     """The episodes of a pool."""
+    assert pool.bank is not None
     plan = plan_row(task, pool.bank, pool.objects, _ROW, each * len(pool.objects))
     conditions = batches(hand, task, pool.bank, plan, seed, running.batch)
     sample = simulate(running, conditions, plan.total, progress, stressed=stressed)
@@ -278,6 +293,8 @@ def _without_forces(sample: Sample) -> Sample:
 
 def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
     """All objects, then groups of them."""
+    left_out = [name for result in results for name in result.left_out]
+    results = [result for result in results if result.episodes]
     if not results:
         raise CongraspError("None of the objects can be approached.", "Scale them to the hand, or name others.")
     firsts = np.cumsum([0, *(len(result.names) for result in results)])
@@ -286,7 +303,7 @@ def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
     whole = joined([result.sample for result in results])
     index = whole.values["object_index"].astype(int)
     names = [name for result in results for name in result.names]
-    names += [name for result in results for name in result.left_out]
+    names += left_out
     sizes, masses = np.concatenate([result.traits for result in results]).T
     families = np.array([family for result in results for family in result.families])
     row = functools.partial(summarise, _ROW, hand.name, held_2s=True, objects=names, method=method, paper="objects")

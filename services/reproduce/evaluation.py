@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import shutil
 import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ OBJECTS, CONSTRAINTS = "objects", "constraints"
 _CAPTURED_TABLES = {"cross": ("cross",), "captured": ("single", "composed"), "": ("single", "composed")}
 _SOURCES = {"objects": "objects", "noise": ""}
 _PICTURED = 2
+_POOLS = ".pools"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +96,7 @@ def evaluate_part(part: Part, entrant: Entrant, numbers: Numbers, out: pathlib.P
         "seconds": round(time.monotonic() - began, 1),
     }
     write_json(found.rows, file, about)
+    shutil.rmtree(file.with_suffix(_POOLS), ignore_errors=True)
     return Result(part, about["source"], found.rows, about, True)
 
 
@@ -130,7 +133,7 @@ def _evaluate(
         pool=0 if many else numbers.pool,
         seed=numbers.seed,
         friction=numbers.friction,
-        keep=file.with_suffix(".pools") if many else None,
+        keep=file.with_suffix(_POOLS) if many else None,
     )
     tables: tuple[str, ...] = (part.table,)
     if data:

@@ -4,7 +4,7 @@ import collections
 import dataclasses
 import json
 import pathlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from common.files import write_atomically
@@ -30,7 +30,7 @@ class Account(NamedTuple):
     """Each policy, and which file it is or why there is none."""
     failures: list[str]
     conditions: str
-    """A sentence on objects, engine, seed and time."""
+    """A sentence on objects, engine and seed."""
     command: str
     """The command line that makes it again."""
     curves: list[Picture]
@@ -55,7 +55,7 @@ def write(account: Account, out: pathlib.Path) -> None:
     text = page().render(
         title="The paper's tables",
         summary=summary(account.cells),
-        conditions=account.conditions,
+        conditions=f"{account.conditions} {_times(account.seconds)}",
         command=account.command,
         columns=COLUMNS,
         tables=shown,
@@ -103,6 +103,12 @@ def summary(cells: Sequence[Cell]) -> str:
         f"It is at or above the paper's in {above}; the whole 95 % interval is above it in {verdicts['better']}, "
         f"and below it in {verdicts['worse']}."
     )
+
+
+def _times(seconds: Mapping[str, float]) -> str:
+    """Such as "Evaluation took 12.3 min."."""
+    took = [f"{what} took {amount / 60:.1f} min" for what, amount in seconds.items() if amount]
+    return f"{', '.join(took).capitalize()}." if took else ""
 
 
 class _Details(NamedTuple):

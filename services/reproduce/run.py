@@ -176,8 +176,7 @@ def _account(
     ]
     conditions = (
         f"{numbers.episodes} episodes a row on {numbers.pool} held-out procedural objects, {numbers.many} on many "
-        f"objects, engine {numbers.physics}, friction {numbers.friction:g}, seed {numbers.seed}. "
-        f"Training took {seconds['training'] / 60:.1f} min, evaluation {seconds['evaluation'] / 60:.1f} min."
+        f"objects, engine {numbers.physics}, friction {numbers.friction:g}, seed {numbers.seed}."
     )
     cells = compare(results, found.absent, request.hands)
     return Account(list(results), cells, where, list(failures), conditions, request.command, curves, seconds)
