@@ -88,10 +88,10 @@ def evaluate(
     lineup = line_up(table, read_entrants(policy, method), hand, method)
     engine = resolve_physics(physics)
     settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
-    chunks = json.with_name(f"{json.name}.pools") if json else None
-    setup = Setup(episodes, pool=pool, folder=objects, keep=chunks, **settings)
+    setup = Setup(episodes, pool=pool, folder=objects, **settings)
+    pools = json and json.with_name(f"{json.name}.pools")
     with tracked() as track:
-        if objects and set(table) != {"objects"}:
+        if objects and (constraints or set(table) != {"objects"}):
             setup = dataclasses.replace(setup, given=objects_of(objects, track=track))
         if constraints is not None:
             if not objects:
@@ -99,15 +99,15 @@ def evaluate(
             sets = captured(constraints, split, setup.given)
             _check_hand(sets.hand, [one.hand for one, _ in lineup.entrants])
             setup = dataclasses.replace(setup, given=sets.objects, bank=sets.bank, paper=sets.paper)
-        results = [
-            evaluate_tables(one.policy, tables, setup, track, keep=pictures is not None)
-            for one, tables in lineup.entrants
-        ]
+        results = []
+        for one, tables in lineup.entrants:
+            own = dataclasses.replace(setup, keep=pools and pools / f"{one.hand}-{one.method}")
+            results.append(evaluate_tables(one.policy, tables, own, track, keep=pictures is not None))
     _show(results, lineup, f"{_who(lineup)}, on {_source(lineup, objects)}, {engine}, friction {friction:g}", by)
-    if json is not None:
+    if json and pools:
         about = _about(lineup, objects, constraints, split) | settings
         write_json([row for found in results for row in found.rows], json, about)
-        shutil.rmtree(f"{json}.pools", ignore_errors=True)
+        shutil.rmtree(pools, ignore_errors=True)
     if pictures is not None:
         for (one, _), found in zip(lineup.entrants, results, strict=True):
             folder = pictures if len(results) == 1 else pictures / f"{one.hand}-{one.method}"

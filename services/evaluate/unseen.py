@@ -1,14 +1,15 @@
 """The test on unseen geometry: the heading constraint over as many different objects as there is time for.
 
 Objects come in pools of equal size. While the episodes of one are simulated the next is made or imported, with its
-constraints; nothing is compiled anew, and no more than two pools are in memory. What stays of a pool is a few numbers
-an episode, which can be kept on disk, so that a stopped evaluation goes on with the pool that it had come to.
+constraints; no program is compiled for it, and only these two are in memory. What stays of a pool is a few numbers an
+episode, which can be kept on disk, so that a stopped evaluation goes on with the pool that it had come to.
 """
 
 import concurrent.futures
 import contextlib
 import dataclasses
 import functools
+import gc
 import itertools
 import json
 import logging
@@ -42,7 +43,7 @@ from services.evaluate.protocol import protocol, two_seconds
 from services.evaluate.scores import Row, Sample, joined, object_groups, summarise
 
 _ROW = "heading"
-_MOST = {True: 4096, False: 256}
+_MOST = {True: 4096, False: 128}
 """Objects of a pool, for engines on a device and for others; each has a compiled scene in the latter."""
 _MESHES = 512
 """Objects of a pool of a folder, whose surfaces may be large."""
@@ -132,12 +133,9 @@ def evaluate_objects(
     hold, hand, number = two_seconds(bundle.task), get_hand(bundle.spec.hand), len(pools.make)
     task = protocol(bundle.task, hold, friction)
     each = -(-episodes // (pools.size * number))
-    about: dict[str, Any] = {
-        "policy": content_hash(encode(bundle.to_message())),
-        "task": repr(task),
-        "source": pools.source,
-    }
-    about |= {"size": pools.size, "each": each, "physics": physics, "seed": seed}
+    policy = content_hash(encode(bundle.to_message()))
+    about = {"policy": policy, "task": repr(task), "source": pools.source, "physics": physics, "seed": seed}
+    about |= {"size": pools.size, "each": each}
     found = {n: kept for n in range(number) if keep and (kept := _read(_file(keep, n), about))}
     todo = sorted(set(range(number)) - set(found))
     settings: dict[str, Any] = {"hold": hold, "physics": physics, "threads": threads}
@@ -154,6 +152,7 @@ def evaluate_objects(
                     running = stack.enter_context(Episodes(bundle, task, pool.objects, field=pool.field, **settings))
                 else:
                     running.replace_objects(pool.objects, pool.field)
+                    gc.collect()  # scenes and instances refer to each other, with memory that Python does not count
                 advance = functools.partial(lambda before, n: progress(before + n), done)
                 result = _simulated(running, hand, task, pool, each, seed, advance, max(0, STRESSED - done))
             if done:
