@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from services.reproduce.layout import COLUMNS, NONE, Table
+from services.reproduce.layout import NONE, Table
 
 _ESCAPED = {
     "\\": r"\textbackslash{}",
@@ -20,7 +20,6 @@ _ESCAPED = {
     "<": r"$<$",
     ">": r"$>$",
 }
-_ALIGNMENT = "lllll" + "r" * (len(COLUMNS) - 5)
 
 
 def escape(text: str) -> str:
@@ -45,9 +44,9 @@ def _table(table: Table, conditions: str) -> str:
         rf"  \caption{{{escape(table.title)}. {escape(conditions)}}}",
         r"  \centering",
         r"  \resizebox{\linewidth}{!}{%",
-        rf"  \begin{{tabular}}{{{_ALIGNMENT}}}",
+        rf"  \begin{{tabular}}{{{'l' * len(table.columns)}}}",
         r"    \toprule",
-        f"    {_row(COLUMNS)}",
+        f"    {_row([name for name, _ in table.columns])}",
     ]
     constraint = ""
     for line in table.lines:

@@ -7,18 +7,30 @@ from services.evaluate.paper import TABLES
 from services.reproduce.comparison import SUCCESS, UNITS, Cell
 
 COLUMNS = (
-    "constraint", "hand", "method", "objects", "episodes",
-    "success, %", "paper", "difference", "error", "paper", "difference",
-)  # fmt: skip
+    ("constraint", ""),
+    ("hand", ""),
+    ("method", ""),
+    ("objects", ""),
+    ("episodes", ""),
+    ("success, %", "verdict"),
+    ("paper", "paper"),
+    ("difference", ""),
+    ("error", "errors"),
+    ("paper", "errors paper"),
+    ("difference", "errors"),
+)
+"""Names of columns, and of their styles."""
 NONE = "\N{EN DASH}"
 """Where there is no figure."""
+_OBJECTS, _ERRORS = slice(3, 4), slice(8, 11)
+"""Columns that some tables do not need."""
 
 
 class Line(NamedTuple):
     """Figures of one line of the paper."""
 
     cells: tuple[str, ...]
-    """By `COLUMNS`."""
+    """By the table's columns."""
     verdict: str
     """Of success: better, worse or nothing."""
 
@@ -27,12 +39,21 @@ class Table(NamedTuple):
     """One of the paper's tables."""
 
     title: str
+    columns: list[tuple[str, str]]
+    """Those of `COLUMNS` in which some line or the paper has something."""
     lines: list[Line]
 
 
 def tables(cells: Sequence[Cell]) -> list[Table]:
     """The paper's tables; none is missing, and none of their lines."""
-    return [Table(title, _lines([cell for cell in cells if cell.table == name])) for name, title in TABLES.items()]
+    found = []
+    for name, title in TABLES.items():
+        lines = _lines([cell for cell in cells if cell.table == name])
+        without = [columns for columns in (_OBJECTS, _ERRORS) if not _has(lines, columns)]
+        shown = [i for i in range(len(COLUMNS)) if not any(i in range(len(COLUMNS))[columns] for columns in without)]
+        lines = [Line(tuple(line.cells[i] for i in shown), line.verdict) for line in lines]
+        found.append(Table(title, [COLUMNS[i] for i in shown], lines))
+    return found
 
 
 def not_comparable(cells: Sequence[Cell]) -> list[tuple[str, str, str]]:
@@ -47,6 +68,11 @@ def not_comparable(cells: Sequence[Cell]) -> list[tuple[str, str, str]]:
         for cell in cells
         if cell.ours is None and cell.quantity == SUCCESS
     ]
+
+
+def _has(lines: Sequence[Line], columns: slice) -> bool:
+    """Whether anything stands in these columns."""
+    return any(cell != NONE for line in lines for cell in line.cells[columns])
 
 
 def _lines(cells: Sequence[Cell]) -> list[Line]:

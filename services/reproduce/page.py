@@ -14,7 +14,7 @@ from services.evaluate.scores import PLAUSIBILITY, RATES, Row, plausibility_cell
 from services.reproduce.comparison import CONDITIONS, SUCCESS, Cell, unmatched
 from services.reproduce.evaluation import Result
 from services.reproduce.latex import latex
-from services.reproduce.layout import COLUMNS, not_comparable, tables
+from services.reproduce.layout import not_comparable, tables
 from services.reproduce.plan import Policy
 
 PAGE, JSON, LATEX = "reproduction.html", "reproduction.json", "tables.tex"
@@ -57,7 +57,6 @@ def write(account: Account, out: pathlib.Path) -> None:
         summary=summary(account.cells),
         conditions=f"{account.conditions} {_times(account.seconds)}",
         command=account.command,
-        columns=COLUMNS,
         tables=shown,
         everywhere=CONDITIONS,
         absent=absent,
@@ -125,7 +124,7 @@ def _details(results: Sequence[Result]) -> list[_Details]:
     rates, of_rate = RATES[:-1], _of(lambda row: rate_cells(row)[:-1])
     all_rows = [(result, row) for result in results for row in result.rows]
     return [
-        _Details("Rows that the paper does not have", (*own, *rates), [of_rate(*pair) for pair in unmatched(results)]),
+        _Details("Rows beside none of the paper's", (*own, *rates), [of_rate(*pair) for pair in unmatched(results)]),
         _Details(
             "Held for two seconds, and plausibility",
             (*own, "constraint", "held 2 s", *PLAUSIBILITY[1:]),
