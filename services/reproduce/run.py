@@ -77,18 +77,20 @@ def reproduce(
       CongraspError: nothing could be evaluated, or the result cannot be written.
     """
     page()  # fails before anything else if a package is missing
-    shown: dict[Policy, Callable[[int], None]] = {}
+    shown: set[Policy] = set()
 
-    def training_says(policy: Policy, line: str) -> None:
+    def show(policy: Policy, line: str) -> None:
+        """A bar for each training; what it prints is in its log."""
         if policy not in shown:
-            shown[policy] = track(f"Training {policy.name} (log: {request.out / RUNS / policy.name}.log)", None)
+            shown.add(policy)
+            track(f"Training {policy.name} (log: {request.out / RUNS / policy.name}.log)", None)
 
     failed = training.train_all(
         request.out / RUNS,
         to_train(request),
         options=request.options,
         patience=request.patience,
-        progress=training_says,
+        progress=show,
     )
     for text in failed.values():
         note(text)
@@ -96,8 +98,8 @@ def reproduce(
     results: list[Result] = []
     failures = list(failed.values())
     amounts = numbers()
-    needed = [policy for policy in policies(request.hands, request.methods) if policy in found.entrants]
-    wanted = parts(needed, request.captured, noise=not request.quick) if needed else []
+    whole = parts(policies(request.hands, request.methods), request.captured, noise=not request.quick)
+    wanted = [part for part in whole if part.policy in found.entrants]
     advance = track("Parts", len(wanted))
     for done, part in enumerate(wanted, 1):
         try:
