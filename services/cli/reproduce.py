@@ -2,6 +2,7 @@
 
 import pathlib
 import shlex
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from actors.physics import PhysicsName
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from services.evaluate.lineup import Entrant
     from services.reproduce.plan import Policy
 
+_OUT = "reproduction"
 _QUICK, _FULL = (48, 24), (1000, 64)
 """Episodes of a row, and procedural objects."""
 _MANY = {True: 2, False: 50}
@@ -18,7 +20,7 @@ _MANY = {True: 2, False: 50}
 
 
 def reproduce(
-    out: pathlib.Path = pathlib.Path("reproduction"),
+    out: pathlib.Path = pathlib.Path(_OUT),
     quick: bool = False,
     hands: tuple[str, ...] = (),
     methods: tuple[str, ...] = (),
@@ -58,7 +60,6 @@ def reproduce(
       training: Further options of every 'congrasp train', as one text.
       patience: Minutes after which a training is ended, to be resumed by the next 'congrasp reproduce'.
     """
-    from actors.physics import resolve_physics
     from common.policy.pretrained import pretrained_hands
     from services.cli.console import at_least, tracked
     from services.evaluate.protocol import NOMINAL_FRICTION
@@ -71,10 +72,11 @@ def reproduce(
     at_least(1, patience=patience)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder.")
-    chosen = hands or tuple(pretrained_hands())
-    compared = methods or BASELINES
-    if unknown := set(compared) - set(BASELINES):
-        raise CongraspError(f"There is no method '{min(unknown)}'.", f"Choose from: {', '.join(BASELINES)}.")
+    options: dict[str, Any] = {"quick": quick, "hands": hands, "methods": methods, "policy": policy}
+    options |= {"captured": captured, "episodes": episodes, "pool": pool, "seed": seed, "training": training}
+    options |= {"physics": "" if physics == "auto" else physics, "out": "" if str(out) == _OUT else out}
+    chosen, compared = tuple(dict.fromkeys(hands)) or tuple(pretrained_hands()), methods or BASELINES
+    _check_names(chosen, compared)
     request = Request(
         out=out,
         hands=chosen,
@@ -84,35 +86,30 @@ def reproduce(
         quick=quick,
         options=tuple(shlex.split(training)),
         patience=60.0 * patience,
-        command=_command(
-            {
-                "quick": quick,
-                "hands": hands,
-                "methods": methods,
-                "policy": policy,
-                "captured": captured,
-                "episodes": episodes,
-                "pool": pool,
-                "physics": "" if physics == "auto" else physics,
-                "seed": seed,
-                "training": training,
-                "out": "" if out == pathlib.Path("reproduction") else out,
-            }
-        ),
+        command=_command(options),
     )
     _check_device([one.name for one in to_train(request)])
     usual_episodes, usual_pool = _QUICK if quick else _FULL
     episodes, pool = episodes or usual_episodes, pool or usual_pool
 
-    def numbers() -> Numbers:
-        engine = resolve_physics(physics)
-        return Numbers(episodes, pool, _MANY[quick] * episodes, engine, seed, NOMINAL_FRICTION)
-
     with tracked() as track:
+        numbers = Numbers(episodes, pool, _MANY[quick] * episodes, physics, seed, NOMINAL_FRICTION)
         account = reproduce(request, numbers, track, lambda text: print(text, flush=True))
     print(summary(account.cells))
     print(f"The page is {out / PAGE}; beside it are {JSON} and {LATEX}.")
     return 1 if account.failures else 0
+
+
+def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
+    """Raises a CongraspError for a hand or a method that is not there."""
+    from common.hands import get_hand
+    from services.reproduce.plan import BASELINES
+
+    for name in hands:
+        if get_hand(name).name != name:
+            raise CongraspError(f"'{name[:60]}' is no hand's name.", "Choose from 'congrasp hands list'.")
+    if unknown := set(methods) - set(BASELINES):
+        raise CongraspError(f"There is no method '{min(unknown)}'.", f"Choose from: {', '.join(BASELINES)}.")
 
 
 def _given(texts: tuple[str, ...], needed: "list[Policy]") -> "dict[Policy, Entrant]":

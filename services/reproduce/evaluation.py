@@ -41,7 +41,7 @@ class Numbers:
     many: int
     """Episodes, and most objects, of the table of many objects."""
     physics: PhysicsName
-    """Not `auto`."""
+    """`auto` only until it is resolved."""
     seed: int
     friction: float
 

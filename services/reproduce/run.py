@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+from actors.physics import resolve_physics
 from common.errors import CongraspError
 from common.policy.pretrained import pretrained_file
 from common.task.methods import get_method
@@ -61,7 +62,7 @@ def to_train(request: Request) -> list[Policy]:
 
 def reproduce(
     request: Request,
-    numbers: Callable[[], Numbers],
+    numbers: Numbers,
     track: Track,
     note: Callable[[str], None] = lambda text: None,
 ) -> Account:
@@ -69,7 +70,7 @@ def reproduce(
 
     Args:
       request: what is wanted.
-      numbers: how much is evaluated; asked for once trainings have left the device.
+      numbers: how much is evaluated; the engine may be `auto`.
       track: shows progress.
       note: is given what is worth a line.
 
@@ -97,13 +98,14 @@ def reproduce(
     found = _policies(request, failed)
     results: list[Result] = []
     failures = list(failed.values())
-    amounts = numbers()
+    # Not before: trainings have the device's memory for themselves until this process looks for its engine.
+    numbers = dataclasses.replace(numbers, physics=resolve_physics(numbers.physics))
     whole = parts(policies(request.hands, request.methods), request.captured, noise=not request.quick)
     wanted = [part for part in whole if part.policy in found.entrants]
     advance = track("Parts", len(wanted))
     for done, part in enumerate(wanted, 1):
         try:
-            result = evaluate_part(part, found.entrants[part.policy], amounts, request.out, track)
+            result = evaluate_part(part, found.entrants[part.policy], numbers, request.out, track)
         except CongraspError as error:
             failures.append(f"{part.name}: {error}")
             note(failures[-1])
@@ -113,7 +115,7 @@ def reproduce(
         advance(done)
     if not results:
         raise CongraspError("Nothing could be evaluated.", failures[0] if failures else "Name a hand with a policy.")
-    account = _account(request, amounts, found, results, failures)
+    account = _account(request, numbers, found, results, failures)
     write(account, request.out)
     return account
 

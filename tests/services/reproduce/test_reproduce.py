@@ -87,7 +87,7 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, 
         captured=(), quick=False, options=(), patience=1.0, command="congrasp reproduce",
     )  # fmt: skip
     numbers = Numbers(3, 3, 6, "native", 0, 1.0)
-    account = run.reproduce(request, lambda: numbers, lambda text, total: lambda done: None)
+    account = run.reproduce(request, numbers, lambda text, total: lambda done: None)
     what = {one.name: text for one, text in account.policies}
     assert asked[:2] == [Policy("allegro", "ours"), Policy("human", "graspxl")]
     assert asked[2:6] == ["human-ours-single", "human-pd-single", "human-ours-composed", "human-ours-noise"]
