@@ -27,6 +27,7 @@ COMMANDS = {
     "serve": "answer live queries with a run's newest policy or a policy file",
     "grasp": "a grasp motion for an object of your own, under constraints",
     "evaluate": "measure a policy by the paper's protocol",
+    "reproduce": "the paper's tables: train what is missing, evaluate, compare",
     "query": "ask a policy server for one action, or measure its latency",
     "objects": "generate, import, list and show objects",
     "hands": "list and draw hands, and bring one of your own",

@@ -1,16 +1,12 @@
 """`congrasp report`: a policy's report and model card."""
 
 import pathlib
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from actors.physics import PhysicsName
 from common.errors import CongraspError
-
-if TYPE_CHECKING:
-    from services.evaluate.report import Picture
 
 _POOL = 64
 _PICTURED = 4
@@ -54,7 +50,7 @@ def report(
     from services.evaluate.evaluator import Evaluator
     from services.evaluate.failures import failure_sheets
     from services.evaluate.protocol import objects_label, two_seconds
-    from services.evaluate.report import Commands, Picture, count_causes, template, write_report
+    from services.evaluate.report import Commands, Picture, count_causes, curves_of, template, write_report
     from services.evaluate.scores import TABLES, known_rows
     from services.viz.sheets import png_of
 
@@ -102,18 +98,6 @@ def _policy_of_run(run_dir: pathlib.Path) -> pathlib.Path:
     if not (run_dir / POLICY_FILE).is_file():
         raise CongraspError(f"The folder {run_dir} holds no {POLICY_FILE}.", "Name a run's folder, or a policy file.")
     return run_dir / POLICY_FILE
-
-
-def curves_of(run_dir: pathlib.Path) -> "Iterator[Picture]":
-    """Figures of a run's recordings, if it has any."""
-    from services.evaluate.report import Picture
-    from services.record.reader import read_metrics
-    from services.viz.plots import draw, encoded, figures
-
-    if any(run_dir.rglob("*.mcap")):
-        series = read_metrics(run_dir)
-        for title, panels in figures(series).values():
-            yield Picture(title, encoded(draw(title, panels, series)))
 
 
 COMMAND = report

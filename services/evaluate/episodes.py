@@ -19,7 +19,7 @@ from actors.rollout import RolloutWorker, Trace, finished_episodes
 from common.config import TaskConfig
 from common.engines import PhysicsName
 from common.hands import get_hand
-from common.objects.distance import distance_field
+from common.objects.distance import DistanceField
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle, act_by_mean
 from common.task import plausibility
@@ -50,7 +50,7 @@ class Episodes:
         batch: int,
         physics: PhysicsName,
         threads: int,
-        measured: bool = True,
+        field: DistanceField | None = None,
         traced: bool = False,
     ):
         """Starts the engine.
@@ -63,10 +63,11 @@ class Episodes:
           batch: B.
           physics: engine; not `auto`.
           threads: threads of the `native` engine.
-          measured: whether plausibility is measured at every step (`common.task.plausibility`).
+          field: grids of the objects' surfaces, with which plausibility is measured at every step
+            (`common.task.plausibility`); without them it is not.
           traced: whether every step of every episode is kept, for recordings.
         """
-        self._bundle, self._task, self._hold, self._measured = bundle, task, hold, measured
+        self._bundle, self._task, self._hold, self._measured = bundle, task, hold, field is not None
         self._hand, self.batch = get_hand(bundle.spec.hand), batch
         self._worker = RolloutWorker(
             self._hand,
@@ -77,12 +78,12 @@ class Episodes:
             batch=batch,
             seed=0,
             half_precision=False,
-            probe=plausibility.sample if measured else _effort,
+            probe=plausibility.sample if self._measured else _effort,
             traced=slice(None) if traced else slice(0),
         )
-        self.stressable = measured and hold == two_seconds(task)
+        self.stressable = self._measured and hold == two_seconds(task)
         """Whether episodes can go on after the hold: what they survive is asked after two seconds."""
-        self._measure(objects)
+        self._measure(objects, field)
 
     def __enter__(self) -> "Episodes":
         return self
@@ -90,10 +91,10 @@ class Episodes:
     def __exit__(self, *error: object) -> None:
         self._worker.physics.close()
 
-    def replace_objects(self, objects: Sequence[GraspObject]) -> None:
-        """Other objects, as many as before; nothing is compiled anew."""
+    def replace_objects(self, objects: Sequence[GraspObject], field: DistanceField | None) -> None:
+        """Other objects, as many as before, with grids if the first ones had some; nothing is compiled anew."""
         self._worker.replace_objects(objects, None)
-        self._measure(objects)
+        self._measure(objects, field)
 
     def run(self, conditions: InitialConditions, *, stressed: bool = False) -> Batch:
         """Simulates B episodes.
@@ -144,12 +145,12 @@ class Episodes:
         self._worker.state = self._worker.state._replace(after=jnp.full_like(conditions.hold, after))
         return self._worker.state
 
-    def _measure(self, objects: Sequence[GraspObject]) -> None:
+    def _measure(self, objects: Sequence[GraspObject], field: DistanceField | None) -> None:
         """Measures against these objects; episodes that go on after their hold are under `protocols.stress`."""
         self._objects = objects
         if self._measured:
             stress = protocols.stress(self._task, objects, self._hold) if self.stressable else None
-            self._worker.adjust(protocol=stress, probe_data=distance_field(objects))
+            self._worker.adjust(protocol=stress, probe_data=field)
 
     def _message(self, begun: EnvState, trace: Trace, metrics: dict[str, float], episode: int) -> Message:
         """One episode, from how all of them began and what was recorded of it."""

@@ -3,23 +3,25 @@
 import functools
 import itertools
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import numpy as np
 
 from actors.bank import build_bank
+from actors.initial import InitialConditions
 from common.config import TaskConfig
 from common.engines import ENGINES, PhysicsName
 from common.errors import CongraspError
 from common.hands import get_hand
+from common.objects.distance import DistanceField, distance_field
 from common.objects.pool import scale_objects
 from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle
 from common.task.bank import ConstraintBank
 from common.wire.codec import Message
 from services.evaluate import references
-from services.evaluate.episodes import Episodes
+from services.evaluate.episodes import Batch, Episodes
 from services.evaluate.noise import LEVELS, Noise, with_noise
 from services.evaluate.plan import RowPlan, batches, from_references, plan_row
 from services.evaluate.protocol import NOMINAL_FRICTION, protocol, two_seconds
@@ -30,7 +32,7 @@ STRESSED = 200
 """Episodes of a row that go on after the hold, lifted and pushed."""
 _KEPT = 8
 """Episodes of a row that can be looked at afterwards: so many that hold the object to the end, and so many others."""
-_MEASURED = 512
+MEASURED = 512
 """Objects beyond which their surfaces' distance fields are left out, and plausibility with them."""
 
 
@@ -81,6 +83,7 @@ class Evaluator:
         self._bank = bank or build_bank(self._hand, self.task, self.objects, seed)
         self._given = bank is not None
         self._references: References | None = None
+        self._field: DistanceField | None = None
         self._kept: dict[str, dict[bool, list[Message]]] = {}
 
     def references(self, progress: Callable[[int, int], None] = lambda done, of: None) -> References | None:
@@ -145,29 +148,6 @@ class Evaluator:
                 advance = functools.partial(lambda before, n: progress(before + n), done)
                 found[name] = self._run(running, name, plan, self.bank_for(name), advance, keep)
         return found
-
-    def samples_of_pools(
-        self,
-        name: str,
-        pools: Iterable[Sequence[GraspObject]],
-        episodes: int,
-        progress: Callable[[int], None] = lambda done: None,
-    ) -> Iterator[Sample]:
-        """Episodes on this evaluator's objects, then on each of further pools, with nothing compiled anew.
-
-        Args:
-          name: of a row without references.
-          pools: as many objects each as this evaluator has; primitive ones where the engine is compiled.
-          episodes: on each pool, at least.
-          progress: is told how many episodes of the present pool there are.
-        """
-        with self._episodes(episodes) as running:
-            yield self._run(running, name, self.plan(name, episodes), self._bank, progress)
-            for number, objects in enumerate(pools, 1):
-                self.objects = scale_objects(self._hand, self.task, objects)
-                self._bank = build_bank(self._hand, self.task, self.objects, self._seed + number)
-                running.replace_objects(self.objects)
-                yield self._run(running, name, self.plan(name, episodes), self._bank, progress)
 
     def allowed(self, names: Sequence[str]) -> tuple[list[str], list[CongraspError]]:
         """The rows that some object allows, and why others are left out; captured objects may have no labelled parts.
@@ -275,15 +255,17 @@ class Evaluator:
 
     def _episodes(self, episodes: int, traced: bool = False) -> Episodes:
         """What simulates rows of so many episodes; its batch depends on nothing else, so that rows do not either."""
+        if self._field is None and len(self.objects) <= MEASURED:
+            self._field = distance_field(self.objects)
         return Episodes(
             self.bundle,
             self.task,
             self.objects,
             hold=self._hold,
-            batch=min(self._batch, 1 << (episodes - 1).bit_length()),
+            batch=batch_of(episodes, self._batch),
             physics=self._physics,
             threads=self._threads,
-            measured=len(self.objects) <= _MEASURED,
+            field=self._field,
             traced=traced,
         )
 
@@ -296,19 +278,49 @@ class Evaluator:
         progress: Callable[[int], None] = lambda done: None,
         keep: bool = False,
     ) -> Sample:
-        """The episodes of a plan, of which some are kept under a name; the first ones go on after the hold."""
-        found: list[Sample] = []
-        done = 0
-        most = min(plan.total, STRESSED) if running.stressable else 0
+        """The episodes of a plan, of which some are kept under a name."""
         if keep:
             self._kept[name] = {False: [], True: []}
-        for conditions, count in batches(self._hand, self.task, bank, plan, self._seed, running.batch):
-            batch = running.run(conditions, stressed=done < most)
-            for i in range(count) if keep else ():
+
+        def visit(batch: Batch, count: int) -> None:
+            for i in range(count):
                 kept = self._kept[name][bool(batch.sample.values["held"][i] > 0)]
                 if len(kept) < _KEPT:
                     kept.append(batch.message(i))
-            found.append(batch.sample.first(count))
-            done += count
-            progress(done)
-        return joined(found)
+
+        conditions = batches(self._hand, self.task, bank, plan, self._seed, running.batch)
+        return simulate(running, conditions, plan.total, progress, visit if keep else lambda batch, count: None)
+
+
+def batch_of(episodes: int, most: int) -> int:
+    """Environments side by side for rows of so many episodes: a power of two, or `most`."""
+    return min(most, 1 << (episodes - 1).bit_length())
+
+
+def simulate(
+    running: Episodes,
+    conditions: Iterable[tuple[InitialConditions, int]],
+    total: int,
+    progress: Callable[[int], None] = lambda done: None,
+    visit: Callable[[Batch, int], None] = lambda batch, count: None,
+    stressed: int = STRESSED,
+) -> Sample:
+    """The episodes of a row; the first ones go on after the hold, lifted and pushed.
+
+    Args:
+      running: what simulates them.
+      conditions: see `services.evaluate.plan.batches`.
+      total: number of episodes.
+      progress: is told how many there are.
+      visit: is given each batch, and how many of its episodes count.
+      stressed: how many go on, at least; batches go on as a whole.
+    """
+    found: list[Sample] = []
+    done, most = 0, min(total, stressed) if running.stressable else 0
+    for begun, count in conditions:
+        batch = running.run(begun, stressed=done < most)
+        visit(batch, count)
+        found.append(batch.sample.first(count))
+        done += count
+        progress(done)
+    return joined(found)

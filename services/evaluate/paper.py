@@ -1,6 +1,7 @@
 """The paper's tables, each for rows that are made as it is: of the same hand, method and source of constraints."""
 
 import dataclasses
+from typing import NamedTuple
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,3 +112,54 @@ def paper_row(source: str, hand: str, method: str, constraint: str, group: str =
     if source == "objects" and constraint == "heading" and (success := _OBJECTS.get(method, {}).get(word)):
         return PaperRow(success)
     return None
+
+
+class PaperLine(NamedTuple):
+    """A line of one of the paper's tables."""
+
+    table: str
+    """One of `TABLES`."""
+    source: str
+    """What its episodes are drawn from, one of `SOURCES`."""
+    constraint: str
+    """Constraints with `+` between them."""
+    hand: str
+    method: str
+    group: str
+    """Size of the objects; empty for all."""
+    figures: PaperRow
+
+
+TABLES = {
+    "single": "Single constraints",
+    "composed": "Composed constraints",
+    "cross": "Cross-dataset generalization",
+    "objects": "Large-scale objects",
+    "hands": "Hand morphology",
+    "ablation": "Ablation",
+}
+"""The paper's tables with figures."""
+_ABLATION = ("ours", "no-dynamic-center", "no-feedforward")
+
+
+def paper_lines() -> list[PaperLine]:
+    """Every line of the paper's tables, in its order."""
+    constraints = tuple(_HANDS["human"])
+    lines = []
+    for method in ("graspxl", "dgrasp", "pd", "ours"):
+        of_method = {name: _CAPTURED[method][name] for name in constraints if name in _CAPTURED[method]}
+        lines += [PaperLine("single", "captured", name, "human", method, "", row) for name, row in of_method.items()]
+    lines.sort(key=lambda line: constraints.index(line.constraint))
+    for name in ("pose+trajectory", "trajectory+affordance"):
+        lines.append(PaperLine("composed", "captured", name, "human", "ours", "", _CAPTURED["ours"][name]))
+    lines += [PaperLine("cross", "cross", name, "human", "ours", "", row) for name, row in _CROSS.items()]
+    for method in ("graspxl", "ours", "no-dynamic-center"):
+        for group, success in _OBJECTS[method].items():
+            lines.append(PaperLine("objects", "objects", "heading", "human", method, group, PaperRow(success)))
+    for name in constraints:
+        lines += [PaperLine("hands", "hands", name, hand, "ours", "", rows[name]) for hand, rows in _HANDS.items()]
+    for name in constraints:
+        for method in _ABLATION:
+            if name in _CAPTURED[method]:
+                lines.append(PaperLine("ablation", "captured", name, "human", method, "", _CAPTURED[method][name]))
+    return lines

@@ -56,18 +56,20 @@ def cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     shown = [name for name in _TITLES if any(row.get(name) is not None for row in rows)]
     head = ["constraint", "episodes", "success, %", "paper", "held 2 s, %"]
     table = [[*head, *(word for name in shown for word in (f"{_TITLES[name][0]}, {_TITLES[name][1]}", "paper"))]]
-    for row in rows:
+    for row, label in zip(rows, _labels(rows), strict=True):
         paper = row["paper"] or {"success": None, "errors": {}}
         interval = f"{_percent(row['success'])} ({_percent(row['success_low'])}-{_percent(row['success_high'])})"
-        line = [_name(row), str(row["episodes"]), interval, _percent(paper["success"]), _percent(row["held_2s"])]
+        line = [label, str(row["episodes"]), interval, _percent(paper["success"]), _percent(row["held_2s"])]
         line += [word for name in shown for word in (_figure(row.get(name)), _figure(paper["errors"].get(name)))]
         table.append(line)
     return table
 
 
-def _name(row: Mapping[str, Any]) -> str:
-    """Constraint and group."""
-    return f"{row['constraint']}, {row['group']}" if row["group"] else str(row["constraint"])
+def _labels(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Constraint and group of each row; its hand and method, where there are several."""
+    several = len({(row["hand"], row["method"]) for row in rows}) > 1
+    keys = ("constraint", "group", "hand", "method") if several else ("constraint", "group")
+    return [", ".join(row[key] for key in keys if row[key]) for row in rows]
 
 
 def _percent(rate: float | None) -> str:
@@ -121,7 +123,7 @@ def _success(rows: Sequence[Mapping[str, Any]]) -> Any:
     paper = [(row["paper"]["success"], height) for row, height in zip(rows, y, strict=True) if row["paper"]]
     if paper:
         axes.plot(*zip(*paper, strict=True), "D", color=COLOURS[1], markersize=5, label="paper")
-    axes.set_yticks(y, [_name(row) for row in rows])
+    axes.set_yticks(y, _labels(rows))
     style(axes, "", "share of episodes", "")
     axes.set_xlim(right=1.005)
     axes.legend(fontsize=8, frameon=False, labelcolor=QUIET, loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -137,15 +139,15 @@ def _errors(rows: Sequence[Mapping[str, Any]]) -> Any:
     grid = figure.subplots(lines, columns, squeeze=False)
     for axes in grid.flat[len(shown) :]:
         axes.set_axis_off()
-    labels = [_name(row) for row in rows]
+    labels = _labels(rows)
     for axes, name in zip(grid.flat, shown, strict=False):
         title, unit = _TITLES[name]
-        for row in rows:
+        for i, row in enumerate(rows):
             found = row.get("quantiles", {}).get(name)
             if not found:
                 continue
-            colour = COLOURS[labels.index(_name(row)) % len(COLOURS)]
-            axes.plot(found, np.linspace(0, 1, len(found)), color=colour, linewidth=1.6, label=_name(row))
+            colour = COLOURS[i % len(COLOURS)]
+            axes.plot(found, np.linspace(0, 1, len(found)), color=colour, linewidth=1.6, label=labels[i])
             paper = (row["paper"] or {"errors": {}})["errors"].get(name)
             if paper is not None:
                 axes.axvline(paper, color=colour, linewidth=1.0, linestyle=":")

@@ -125,9 +125,7 @@ def _grasp(
     regions = [initial.allowing(own, bank, asked) for asked in ((), ("affordance",))]
     most = POSES * sum(int(allowed.any(1).sum()) for allowed in regions)
     size = min(ENGINES[physics].batch, 1 << (most - 1).bit_length())
-    with Episodes(
-        policy, own, objects, hold=own.hold_steps, batch=size, physics=physics, threads=threads, measured=False
-    ) as episodes:
+    with Episodes(policy, own, objects, hold=own.hold_steps, batch=size, physics=physics, threads=threads) as episodes:
         for region, constraint in enumerate(("heading", "affordance")):
             rests = [np.flatnonzero(row) for row in regions[region]]
             tried = np.zeros(len(objects), int)

@@ -5,7 +5,7 @@ import collections
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from common.config import TaskConfig
@@ -15,7 +15,10 @@ from common.policy.bundle import PolicyBundle, content_hash
 from common.task.constraints import optional
 from common.wire.codec import encode
 from services.evaluate.scores import FORCES, Row, force_cells, paper_cells, rate_cells
+from services.record.reader import read_metrics
+from services.viz.plots import draw, encoded, figures
 
+_REPORT = pathlib.Path(__file__).with_suffix(".html")
 _LIMITS = (
     "What it is for: grasps in simulation, of rigid objects that fit the hand, under its constraints in any "
     "combination. It observes exact poses and contacts.",
@@ -74,9 +77,9 @@ def write_report(
         rates=[{"cells": _compared(row), "verdict": _verdict(row)} for row in rows],
         forces={"columns": FORCES, "rows": [force_cells(row) for row in rows]},
         command=commands.table,
-        sheets=[_embedded(sheet) for sheet in sheets],
+        sheets=[embedded(sheet) for sheet in sheets],
         pictures_command=commands.pictures,
-        curves=[_embedded(curve) for curve in curves],
+        curves=[embedded(curve) for curve in curves],
         curves_command=commands.curves,
         facts=_facts(policy, name),
         limits=_LIMITS,
@@ -85,14 +88,23 @@ def write_report(
 
 
 @functools.cache
-def template() -> Any:
-    """The page that reports fill; a CongraspError if jinja2 is absent."""
+def template(path: pathlib.Path = _REPORT) -> Any:
+    """A page that reports fill, which may extend `base.html`; a CongraspError if jinja2 is absent."""
     try:
         import jinja2
     except ImportError:
         raise CongraspError("Reports need the package 'jinja2'.", "Run: pip install 'congrasp[viz]'") from None
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    return environment.from_string(pathlib.Path(__file__).with_suffix(".html").read_text(encoding="utf-8"))
+    loader = jinja2.FileSystemLoader([path.parent, _REPORT.parent])
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, loader=loader)
+    return environment.get_template(path.name)
+
+
+def curves_of(run_dir: pathlib.Path) -> Iterator[Picture]:
+    """Figures of a run's recordings, if it has any."""
+    if any(run_dir.rglob("*.mcap")):
+        series = read_metrics(run_dir)
+        for title, panels in figures(series).values():
+            yield Picture(title, encoded(draw(title, panels, series)))
 
 
 def count_causes(causes: Sequence[str]) -> str:
@@ -126,7 +138,7 @@ def _verdict(row: Row) -> str:
     return "better" if row.success_low > row.paper.success else "worse"
 
 
-def _embedded(picture: Picture) -> Mapping[str, Any]:
+def embedded(picture: Picture) -> Mapping[str, Any]:
     """A picture for the template."""
     return {"title": picture.title, "caption": picture.caption, "image": base64.b64encode(picture.png).decode()}
 

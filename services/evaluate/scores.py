@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,8 @@ ERRORS = {c.name: {spec.name: spec.column or spec.name for spec in c.errors} for
 _UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
 PROBED_EPISODES = 2000
 """Forces are read from this many episodes of a row at most."""
+_FORCES = ("link_force", "force_sum", "torque_share")
+_NORMAL_95 = 1.959964
 _HUNDREDTHS = np.linspace(0, 1, 101)
 _SIZES = ("small", "medium", "large")
 
@@ -98,6 +100,8 @@ class Row:
     paper: PaperRow | None
     plausibility: dict[str, float | None] = dataclasses.field(default_factory=dict)
     """Over all episodes: means of the measures, `_p95` of the deepest penetrations, and rates (`actors.protocols`)."""
+    margins: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Of each error with two successful episodes: half of the 95 % interval of its mean, 1.96 standard errors."""
     quantiles: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     """Of each error in successful episodes: least, every further hundredth, and greatest; 101 numbers."""
     objects: list[dict[str, Any]] = dataclasses.field(default_factory=list)
@@ -109,6 +113,21 @@ class Row:
         errors, forces, total = row.pop("errors"), row.pop("forces"), row.pop("episode_return")
         return {**row, **errors, **forces, **row.pop("plausibility"), "return": total}
 
+    @classmethod
+    def from_json(cls, row: Mapping[str, Any]) -> "Row":
+        """The row that `to_json` made this of.
+
+        Raises:
+          LookupError, TypeError: it did not.
+        """
+        own = {field.name: row[field.name] for field in dataclasses.fields(cls) if field.name in row}
+        errors = {name: row[name] for names in ERRORS.values() for name in names.values()}
+        forces = {f"{name}_{of}": row[f"{name}_{of}"] for name in _FORCES for of in ("mean", "p95")}
+        known = {*own, *errors, *forces, "return"}
+        measured = {name: value for name, value in row.items() if name not in known}
+        own |= {"paper": PaperRow(**row["paper"]) if row["paper"] else None, "plausibility": measured}
+        return cls(**own, errors=errors, forces=forces, episode_return=row["return"])
+
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
     """95 % Wilson score interval of a rate."""
@@ -118,6 +137,11 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 
     interval = binomtest(successes, count).proportion_ci(method="wilson")
     return float(interval.low), float(interval.high)
+
+
+def standard_error(values: np.ndarray) -> float:
+    """Of the mean of independent values (E,), at least two."""
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def known_rows(tables: Iterable[str], task: TaskConfig) -> list[str]:
@@ -155,13 +179,9 @@ def summarise(
     success, held = values["success"] > 0, values["held"] > 0
     low, high = wilson(int(success.sum()), len(success))
     held_low, held_high = wilson(int(held.sum()), len(held)) if held_2s else (None, None)
-    quantiles: dict[str, list[float]] = {}
-    errors: dict[str, float | None] = {name: None for names in ERRORS.values() for name in names.values()}
-    for part in constraint.split("+"):
-        for source, name in ERRORS[part].items():
-            errors[name] = float(values[source][success].mean()) if success.any() else None
-            if success.any():
-                quantiles[name] = np.quantile(values[source][success], _HUNDREDTHS).round(6).tolist()
+    found = {name: values[source][success] for part in constraint.split("+") for source, name in ERRORS[part].items()}
+    reached = {name: error for name, error in found.items() if len(error)}
+    means = {name: float(error.mean()) for name, error in reached.items()}
     return Row(
         constraint=constraint,
         hand=hand,
@@ -176,32 +196,34 @@ def summarise(
         held_2s=float(held.mean()) if held_2s else None,
         held_2s_low=held_low,
         held_2s_high=held_high,
-        errors=errors,
+        errors={name: means.get(name) for names in ERRORS.values() for name in names.values()},
         forces=_forces(sample.where(success)),
         episode_return=float(values["return"].mean()),
         links_at_removal=float(values["links_at_removal"].mean()),
         diverged=float((values["bad"] > 0).mean()),
         paper=paper_row(paper, hand, method, constraint, group),
         plausibility=_plausibility(values, held_2s),
-        quantiles=quantiles,
+        margins={name: _NORMAL_95 * standard_error(error) for name, error in reached.items() if len(error) > 1},
+        quantiles={name: np.quantile(error, _HUNDREDTHS).round(6).tolist() for name, error in reached.items()},
         objects=_by_object(values, objects, held_2s),
     )
 
 
 def _by_object(values: dict[str, np.ndarray], objects: Sequence[str], held_2s: bool) -> list[dict[str, Any]]:
     """Rates of each object that has episodes, in the pool's order."""
-    rows = []
-    for index in np.unique(values["object_index"]).astype(int):
-        own = values["object_index"] == index
-        rates = {"success": values["success"][own] > 0}
-        if held_2s:
-            rates["held_2s"] = values["held"][own] > 0
-            if "clean" in values:
-                rates["clean"] = values["clean"][own] > 0
-        rows.append(
-            {"name": objects[index], "episodes": int(own.sum())} | {key: float(x.mean()) for key, x in rates.items()}
-        )
-    return rows
+    index = values["object_index"].astype(int)
+    counts = np.bincount(index, minlength=len(objects))
+    columns = {"success": values["success"] > 0}
+    if held_2s:
+        columns["held_2s"] = values["held"] > 0
+        if "clean" in values:
+            columns["clean"] = values["clean"] > 0
+    of_each = {name: np.bincount(index, column, len(objects)) for name, column in columns.items()}
+    return [
+        {"name": objects[i], "episodes": int(counts[i])}
+        | {name: float(total[i] / counts[i]) for name, total in of_each.items()}
+        for i in np.flatnonzero(counts).tolist()
+    ]
 
 
 def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, float | None]:
@@ -220,13 +242,9 @@ def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, flo
 def _forces(sample: Sample) -> dict[str, float | None]:
     """Mean and 95th percentile: force of a touching link, sum over the links, and finger torque over its limit."""
     links = np.asarray(sample.link_force, np.float32)
-    samples = {
-        "link_force": links[links > 0],
-        "force_sum": links.sum(-1).ravel(),
-        "torque_share": np.asarray(sample.torque, np.float32).ravel(),
-    }
+    samples = links[links > 0], links.sum(-1).ravel(), np.asarray(sample.torque, np.float32).ravel()
     row: dict[str, float | None] = {}
-    for name, found in samples.items():
+    for name, found in zip(_FORCES, samples, strict=True):
         row[f"{name}_mean"] = float(found.mean()) if found.size else None
         row[f"{name}_p95"] = float(np.percentile(found, 95)) if found.size else None
     return row
@@ -328,10 +346,19 @@ def plausibility_cells(row: Row) -> tuple[str, ...]:
     )
 
 
-def tables_of(rows: Sequence[Row], title: str) -> list[Any]:
-    """Rows as rich tables: rates and errors beside the paper's, plausibility, then forces."""
+def tables_of(rows: Sequence[Row], title: str, missing: Sequence[tuple[str, str, str]] = ()) -> list[Any]:
+    """Rows as rich tables: rates and errors beside the paper's, plausibility, then forces.
+
+    Args:
+      rows: of one policy, or of several, which are then named and stand beside one another for each constraint.
+      title: of the first table.
+      missing: hands and methods that have no row, and why.
+    """
     from rich.table import Table
 
+    several = bool(missing) or len({(row.hand, row.method) for row in rows}) > 1
+    order = {name: i for i, name in enumerate(dict.fromkeys(map(_name, rows)))}
+    rows = sorted(rows, key=lambda row: order[_name(row)])
     tables = []
     for heading, columns, cells in (
         (title, RATES, rate_cells),
@@ -339,10 +366,13 @@ def tables_of(rows: Sequence[Row], title: str) -> list[Any]:
         ("Forces after the removal: mean, 95th percentile", FORCES, force_cells),
     ):
         table = Table(title=heading, title_justify="left")
-        for column in columns:
-            table.add_column(column, no_wrap=column in ("constraint", "success", "held 2 s"))
+        for column in (*columns[:1], *(("hand", "method") if several else ()), *columns[1:]):
+            table.add_column(column, no_wrap=column in ("constraint", "method", "success", "held 2 s"))
         for row in rows:
-            table.add_row(*cells(row))
+            name, *others = cells(row)
+            table.add_row(name, *((row.hand, row.method) if several else ()), *others)
+        for hand, method, reason in missing if heading == title else ():
+            table.add_row(reason, hand, method)
         tables.append(table)
     return tables
 
@@ -354,8 +384,9 @@ def object_table(rows: Sequence[Row]) -> Any:
     table = Table(title="By object: success, held 2 s", title_justify="left")
     table.add_column("object", no_wrap=True)
     found = [{of["name"]: of for of in row.objects} for row in rows]
+    several = len({(row.hand, row.method) for row in rows}) > 1
     for row in rows:
-        table.add_column(_name(row))
+        table.add_column(f"{_name(row)}, {row.hand}, {row.method}" if several else _name(row))
     for name in dict.fromkeys(name for of in found for name in of):
         cells = []
         for of in found:

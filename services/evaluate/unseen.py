@@ -1,48 +1,108 @@
-"""The test on unseen geometry: the heading constraint over as many different objects as there is time for."""
+"""The test on unseen geometry: the heading constraint over as many different objects as there is time for.
+
+Objects come in pools of equal size. While the episodes of one are simulated the next is made or imported, with its
+constraints; no program is compiled for it, and only these two are in memory. What stays of a pool is a few numbers an
+episode, which can be kept on disk, so that a stopped evaluation goes on with the pool that it had come to.
+"""
 
 import concurrent.futures
+import contextlib
+import dataclasses
+import functools
+import gc
+import itertools
+import json
+import logging
+import pathlib
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from common.engines import PhysicsName
+from actors.bank import build_bank, headings_of
+from common.config import TaskConfig
+from common.engines import ENGINES, PhysicsName
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.hands import get_hand
+from common.hands.spec import Hand
+from common.inputs import read_file
 from common.objects import procedural
+from common.objects.distance import DistanceField, distance_field
+from common.objects.pool import HELD_OUT_SEED, object_scale, scale_objects
 from common.objects.spec import GraspObject
 from common.parallel import parallel_map
-from common.policy.bundle import PolicyBundle
-from services.evaluate.evaluator import Evaluator
-from services.evaluate.protocol import two_seconds
-from services.evaluate.scores import Row, Sample, joined, object_groups
+from common.policy.bundle import PolicyBundle, content_hash
+from common.task.bank import ConstraintBank
+from common.wire.codec import MAX_MESSAGE, Message, decode, encode
+from services.assets.objects.named import ObjectAt, load_each, objects_at
+from services.evaluate.episodes import Episodes
+from services.evaluate.evaluator import MEASURED, STRESSED, batch_of, simulate
+from services.evaluate.plan import batches, plan_row
+from services.evaluate.protocol import protocol, two_seconds
+from services.evaluate.scores import Row, Sample, joined, object_groups, summarise
 
-POOL = 4096
-"""Most objects that the worlds draw from at a time; then others take their place."""
+_ROW = "heading"
+_MOST = {True: 4096, False: 128}
+"""Objects of a pool, for engines on a device and for others; each has a compiled scene in the latter."""
+_MESHES = 512
+"""Objects of a pool of a folder, whose surfaces may be large."""
+_log = logging.getLogger(__name__)
+_Item = TypeVar("_Item")
 
 
-def procedural_pools(count: int, seed: int, largest: int = POOL) -> Iterator[list[GraspObject]]:
-    """Pools of equal size, at most `largest`, of at least `count` procedural objects of the seeds from `seed`.
+class Loaded(NamedTuple):
+    """Objects of a pool, and names of those that could not be imported."""
 
-    Each pool is made while the one before it is in use.
-    """
-    number = -(-count // largest)
-    size = -(-count // number)
+    objects: list[GraspObject]
+    left_out: list[str]
+
+
+class Pools(NamedTuple):
+    """Objects that are made pool by pool."""
+
+    source: str
+    """What they are, as far as results depend on it."""
+    size: int
+    """Objects of a pool; the last pools may have one less."""
+    make: list[Callable[[], Loaded]]
+
+
+def procedural_pools(count: int, physics: PhysicsName, seed: int = HELD_OUT_SEED) -> Pools:
+    """At least `count` procedural objects of the seeds from `seed`, in pools of one size."""
+    number, size = _divided(count, _MOST[ENGINES[physics].on_device])
     families = procedural.family_turns(number * size, seed)
-    with concurrent.futures.ThreadPoolExecutor(1) as background:
 
-        def make(start: int) -> list[GraspObject]:
-            """One pool."""
-            return parallel_map(procedural.generate, range(seed + start, seed + start + size), families[start:][:size])
+    def make(start: int) -> Loaded:
+        seeds = range(seed + start, seed + start + size)
+        return Loaded(parallel_map(procedural.generate, seeds, families[start:][:size]), [])
 
-        coming = background.submit(make, 0)
-        for start in range(size, number * size + size, size):
-            pool = coming.result()
-            if start < number * size:
-                coming = background.submit(make, start)
-            yield pool
+    starts = range(0, number * size, size)
+    return Pools(f"procedural {seed}", size, [functools.partial(make, start) for start in starts])
+
+
+def folder_pools(path: pathlib.Path, physics: PhysicsName) -> Pools:
+    """The objects of a path; meshes are imported when their turn comes, and those that cannot be are left out."""
+    found = objects_at(path)
+    number, size = _divided(len(found), min(_MOST[ENGINES[physics].on_device], _MESHES))
+
+    def make(part: list[ObjectAt]) -> Loaded:
+        left_out: list[str] = []
+
+        def leave_out(one: ObjectAt, error: CongraspError) -> None:
+            _log.warning("%s is left out: %s", one.name, error)
+            left_out.append(one.name)
+
+        return Loaded(load_each(part, on_error=leave_out), left_out)
+
+    parts = [[found[i] for i in part] for part in np.array_split(np.arange(len(found)), number)]
+    names = ",".join(one.name for one in found)
+    return Pools(f"{path} {names}", size, [functools.partial(make, part) for part in parts])
 
 
 def evaluate_objects(
     bundle: PolicyBundle,
-    pools: Iterator[Sequence[GraspObject]],
+    pools: Pools,
     episodes: int,
     *,
     physics: PhysicsName,
@@ -50,56 +110,232 @@ def evaluate_objects(
     threads: int,
     seed: int,
     friction: float,
+    keep: pathlib.Path | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Row]:
     """Rows of the heading constraint: all objects, then by size, mass and family.
 
     Args:
       bundle: the policy.
-      pools: the objects; see `Evaluator.samples_of_pools`.
-      episodes: on each pool.
+      pools: the objects.
+      episodes: in all, at least; every object has the same number of them.
       physics: engine; not `auto`.
       batch: worlds that run side by side; 0 chooses by the engine.
       threads: threads of the `native` engine.
       seed: seed of constraints and episodes.
       friction: sliding friction between hand and object.
+      keep: folder for results of pools, from which an evaluation with the same arguments goes on; None keeps none.
       progress: is told how many episodes there are.
+
+    Raises:
+      CongraspError: no object is left that the hand can approach.
     """
-    evaluator = Evaluator(
-        bundle,
-        next(pools),
-        physics=physics,
-        batch=batch,
-        threads=threads,
-        seed=seed,
-        friction=friction,
-        hold_steps=two_seconds(bundle.task),
-        paper="objects",
-    )
-    samples: list[Sample] = []
-    traits: list[tuple[float, float, str]] = []
-    names: list[str] = []
+    hold, hand, number = two_seconds(bundle.task), get_hand(bundle.spec.hand), len(pools.make)
+    task = protocol(bundle.task, hold, friction)
+    each = -(-episodes // (pools.size * number))
+    policy = content_hash(encode(bundle.to_message()))
+    about = {"policy": policy, "task": repr(task), "source": pools.source, "physics": physics, "seed": seed}
+    about |= {"size": pools.size, "each": each}
+    found = {n: kept for n in range(number) if keep and (kept := _read(_file(keep, n), about))}
+    todo = sorted(set(range(number)) - set(found))
+    settings: dict[str, Any] = {"hold": hold, "physics": physics, "threads": threads}
+    settings["batch"] = batch_of(each * pools.size, batch or ENGINES[physics].batch)
+    with contextlib.ExitStack() as stack:
+        running: Episodes | None = None
+        measured = pools.size * number <= MEASURED
+        for pool in stack.enter_context(_one_ahead(_prepared(hand, task, pools, seed, todo, measured))):
+            done = sum(result.episodes for result in found.values())
+            if pool.bank is None:
+                result = _nothing(pool.left_out)
+            else:
+                if running is None:
+                    running = stack.enter_context(Episodes(bundle, task, pool.objects, field=pool.field, **settings))
+                else:
+                    running.replace_objects(pool.objects, pool.field)
+                    gc.collect()  # scenes and instances refer to each other, with memory that Python does not count
+                advance = functools.partial(lambda before, n: progress(before + n), done)
+                result = _simulated(running, hand, task, pool, each, seed, advance, max(0, STRESSED - done))
+            if done:
+                result = result._replace(sample=_without_forces(result.sample))
+            if keep:
+                _write(_file(keep, pool.number), result, about)
+            found[pool.number] = result
+    return _rows([found[n] for n in sorted(found)], hand, task.method)
 
-    def report(done: int) -> None:
-        """Adds the episodes of earlier pools."""
-        progress(len(samples) * episodes + done)
 
-    for sample in evaluator.samples_of_pools("heading", pools, episodes, report):
-        sample.values["object_index"] = sample.values["object_index"] + len(traits)
-        samples.append(sample)
-        traits += [_traits(obj) for obj in evaluator.objects]
-        names += [obj.name for obj in evaluator.objects]
-    whole = joined(samples)
+class _Pool(NamedTuple):
+    """A pool that is ready to be simulated."""
+
+    number: int
+    objects: list[GraspObject]
+    """In the hand's size; those from `real` on repeat others, so that all pools have one size."""
+    bank: ConstraintBank | None
+    """None where no object is left."""
+    field: DistanceField | None
+    real: int
+    left_out: list[str]
+
+
+class _Result(NamedTuple):
+    """What is kept of a pool: its episodes, and of each object its name, largest side (m), mass (kg) and family."""
+
+    sample: Sample
+    names: list[str]
+    traits: np.ndarray
+    """(N, 2) side and mass."""
+    families: list[str]
+    left_out: list[str]
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.sample.values.get("success", ()))
+
+
+def _nothing(left_out: list[str]) -> _Result:
+    """The result of a pool of which no object is left."""
+    return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], np.zeros((0, 2)), [], left_out)
+
+
+def _divided(count: int, most: int) -> tuple[int, int]:
+    """Number of pools and their size, for so many objects, of which a pool has at most `most`."""
+    number = -(-count // most)
+    return number, -(-count // number)
+
+
+@contextlib.contextmanager
+def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
+    """The same items, each made in a thread while the one before it is in use."""
+    with concurrent.futures.ThreadPoolExecutor(1) as background:
+
+        def taken() -> Iterator[_Item]:
+            coming = background.submit(next, items, None)
+            while (item := coming.result()) is not None:
+                coming = background.submit(next, items, None)
+                yield item
+
+        yield taken()
+
+
+def _prepared(
+    hand: Hand, task: TaskConfig, pools: Pools, seed: int, wanted: Sequence[int], measured: bool
+) -> Iterator[_Pool]:
+    """Pools with their constraints."""
+    for number in wanted:
+        loaded, left_out = pools.make[number]()
+        objects = scale_objects(hand, task, loaded)
+        kept, bank = _with_bank(hand, task, objects, pools.size, seed + number)
+        left_out = [*left_out, *(obj.name for obj in objects if all(obj is not other for other in kept))]
+        filled = _filled(kept, pools.size)
+        field = distance_field(filled) if measured and kept else None
+        yield _Pool(number, filled, bank, field, len(kept), left_out)
+
+
+def _filled(objects: Sequence[GraspObject], size: int) -> list[GraspObject]:
+    """So many objects, the first ones again where there are fewer."""
+    return list(itertools.islice(itertools.cycle(objects), size))
+
+
+def _with_bank(
+    hand: Hand, task: TaskConfig, objects: list[GraspObject], size: int, seed: int
+) -> tuple[list[GraspObject], ConstraintBank | None]:
+    """Those objects that the hand can approach in some resting pose, and the bank of `size` of them (`_filled`)."""
+    while objects:
+        filled = _filled(objects, size)
+        try:
+            return objects, build_bank(hand, task, filled, seed)
+        except CongraspError as error:
+            scale, seeds = object_scale(hand, task), [(seed, n) for n in range(size)]
+            fine = parallel_map(_approachable, [task] * size, filled, seeds, [scale] * size)
+            if all(fine):
+                raise
+            _log.warning("%s", error)
+            lost = {id(obj) for obj, good in zip(filled, fine, strict=True) if not good}
+            objects = [obj for obj in objects if id(obj) not in lost]
+    return [], None
+
+
+def _approachable(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float) -> bool:
+    """Whether an object has a heading."""
+    try:
+        headings_of(task, obj, seed, None, scale)
+    except CongraspError:
+        return False
+    return True
+
+
+def _simulated(
+    running: Episodes,
+    hand: Hand,
+    task: TaskConfig,
+    pool: _Pool,
+    each: int,
+    seed: int,
+    progress: Callable[[int], None],
+    stressed: int,
+) -> _Result:
+    """The episodes of a pool."""
+    assert pool.bank is not None
+    plan = plan_row(task, pool.bank, pool.objects, _ROW, each * len(pool.objects))
+    conditions = batches(hand, task, pool.bank, plan, seed, running.batch)
+    sample = simulate(running, conditions, plan.total, progress, stressed=stressed)
+    objects = pool.objects[: pool.real]
+    traits = np.array([(np.ptp(obj.visual_vertices, axis=0).max(), obj.mass) for obj in objects])
+    sample = sample.where(sample.values["object_index"] < pool.real)
+    return _Result(sample, [obj.name for obj in objects], traits, [obj.family for obj in objects], pool.left_out)
+
+
+def _without_forces(sample: Sample) -> Sample:
+    """Only the metrics: forces are read from the first pool."""
+    return dataclasses.replace(sample, link_force=sample.link_force[:0], torque=sample.torque[:0])
+
+
+def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
+    """All objects, then groups of them."""
+    left_out = [name for result in results for name in result.left_out]
+    results = [result for result in results if result.episodes]
+    if not results:
+        raise CongraspError("None of the objects can be approached.", "Scale them to the hand, or name others.")
+    firsts = np.cumsum([0, *(len(result.names) for result in results)])
+    for result, first in zip(results, firsts, strict=False):
+        result.sample.values["object_index"] = result.sample.values["object_index"] + first
+    whole = joined([result.sample for result in results])
     index = whole.values["object_index"].astype(int)
-    sizes, masses, families = (np.array(column) for column in zip(*traits, strict=True))
-    rows = [evaluator.row("heading", whole, objects=names)]
+    names = [name for result in results for name in result.names]
+    names += left_out
+    sizes, masses = np.concatenate([result.traits for result in results]).T
+    families = np.array([family for result in results for family in result.families])
+    row = functools.partial(summarise, _ROW, hand.name, held_2s=True, objects=names, method=method, paper="objects")
+    rows = [row(sample=whole)]
     for label, members in object_groups(sizes, masses, families):
         chosen = members[index]
         if chosen.any():
-            rows.append(evaluator.row("heading", whole.where(chosen), label, names))
+            rows.append(row(sample=whole.where(chosen), group=label))
     return rows
 
 
-def _traits(obj: GraspObject) -> tuple[float, float, str]:
-    """Largest side (m), mass (kg) and family."""
-    return float(np.ptp(obj.visual_vertices, axis=0).max()), obj.mass, obj.family
+def _file(folder: pathlib.Path, number: int) -> pathlib.Path:
+    """Where the result of a pool is kept."""
+    return folder / f"pool-{number:05d}.safetensors"
+
+
+def _write(path: pathlib.Path, result: _Result, about: dict[str, Any]) -> None:
+    """Keeps a result beside what it depends on."""
+    arrays = {f"values/{name}": column for name, column in result.sample.values.items()}
+    arrays |= {"link_force": result.sample.link_force, "torque": result.sample.torque, "traits": result.traits}
+    lists = {"names": result.names, "families": result.families, "left_out": result.left_out}
+    write_atomically(path, encode(Message(arrays, {**lists, "about": json.dumps(about)})))
+
+
+def _read(path: pathlib.Path, about: dict[str, Any]) -> _Result | None:
+    """A kept result of the same arguments, if there is one and it is whole."""
+    try:
+        message = decode(read_file(path, MAX_MESSAGE))
+        if message.meta["about"] != json.dumps(about):
+            return None
+        arrays, meta = message.arrays, message.meta
+        values = {name.removeprefix("values/"): x for name, x in arrays.items() if name.startswith("values/")}
+        sample = Sample(values, arrays["link_force"], arrays["torque"])
+        return _Result(sample, meta["names"], arrays["traits"], meta["families"], meta["left_out"])
+    except (OSError, LookupError, CongraspError):
+        return None

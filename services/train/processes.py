@@ -166,10 +166,25 @@ def _actors(
 def leave_gpus_to(ranks: int) -> bool:
     """Whether each rank has a GPU of its own; this process then does without, so that the memory of all is theirs.
 
+    Raises:
+      CongraspError: there are GPUs, but not one for each rank.
+    """
+    backend, count = accelerators()
+    if backend == "cpu":
+        return False
+    if count < ranks:
+        raise CongraspError(f"{ranks} ranks need {ranks} GPUs, and JAX sees {count}.", "Name fewer with --ranks.")
+    jax.config.update("jax_platforms", "cpu")
+    return True
+
+
+def accelerators() -> tuple[str, int]:
+    """JAX's name of this machine's hardware, and how many devices there are.
+
     A process of its own looks, since one that has seen a GPU holds memory of it.
 
     Raises:
-      CongraspError: there are GPUs, but not one for each rank.
+      CongraspError: JAX does not start.
     """
     code = "import jax; print(jax.default_backend(), jax.local_device_count())"
     environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
@@ -180,12 +195,7 @@ def leave_gpus_to(ranks: int) -> bool:
         backend, count = seen.stdout.split()
     except (subprocess.TimeoutExpired, ValueError):
         raise CongraspError("JAX does not start here.", "Look at 'congrasp doctor'.") from None
-    if backend == "cpu":
-        return False
-    if int(count) < ranks:
-        raise CongraspError(f"{ranks} ranks need {ranks} GPUs, and JAX sees {count}.", "Name fewer with --ranks.")
-    jax.config.update("jax_platforms", "cpu")
-    return True
+    return backend, int(count)
 
 
 def engine_of(name: PhysicsName, gpus: bool) -> PhysicsName:

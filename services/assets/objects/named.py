@@ -2,7 +2,7 @@
 
 import logging
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from common.errors import CongraspError
@@ -69,19 +69,46 @@ def objects_of(
       CongraspError: there is nothing of the kind, or it cannot be read or imported.
     """
     found = objects_at(path)
-    sources = [one.source for one in found if one.source]
-    if not sources:
-        return [one.load(options) for one in found]
-    advance = track("Importing objects", len(found)) if track else lambda done: None
-    objects: dict[int, GraspObject] = {}
-    for i, obj in import_sources(sources, options):
+    if track is None or not any(one.source for one in found):
+        return load_each(found, options)
+    return load_each(found, options, progress=track("Importing objects", len(found)))
+
+
+def _refuse(one: ObjectAt, error: CongraspError) -> None:
+    raise error
+
+
+def load_each(
+    found: Sequence[ObjectAt],
+    options: ImportOptions = _METRES_OR_ASK,
+    *,
+    on_error: Callable[[ObjectAt, CongraspError], None] = _refuse,
+    progress: Callable[[int], None] = lambda done: None,
+) -> list[GraspObject]:
+    """Objects in the order given; meshes are imported side by side, and what an import has to say goes to the log.
+
+    Args:
+      found: see `objects_at`.
+      options: how meshes become objects.
+      on_error: is given what cannot be read or imported, and why; such an object is left out unless this raises.
+      progress: is told how many meshes are done.
+    """
+    sources = {i: one.source for i, one in enumerate(found) if one.source}
+    indices, objects = list(sources), dict[int, GraspObject]()
+    for done, (n, obj) in enumerate(import_sources(list(sources.values()), options) if sources else (), 1):
         if isinstance(obj, CongraspError):
-            raise obj
+            on_error(found[indices[n]], obj)
+            continue
         for note in obj.notes:
             _log.warning("%s: %s", obj.name, note)
-        objects[i] = obj
-        advance(len(objects))
-    return [objects[i] for i in range(len(objects))]
+        objects[indices[n]] = obj
+        progress(done)
+    for i in sorted(set(range(len(found))) - set(sources)):
+        try:
+            objects[i] = found[i].load(options)
+        except CongraspError as error:
+            on_error(found[i], error)
+    return [objects[i] for i in sorted(objects)]
 
 
 def one_object(path: pathlib.Path, options: ImportOptions = _METRES_OR_ASK) -> GraspObject:

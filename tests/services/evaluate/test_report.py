@@ -3,57 +3,27 @@
 import base64
 import dataclasses
 import html
-import html.parser
 import io
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from services.cli.report import curves_of
-from services.evaluate.paper import paper_row
-from services.evaluate.report import Commands, Picture, count_causes, write_report
-from services.evaluate.scores import Row
+from services.evaluate.report import Commands, Picture, count_causes, curves_of, write_report
 from services.record.channels import JsonChannels
 from services.record.writer import LogWriter
 from services.train.command import untrained
 from services.train.presets import get_preset
 from services.viz.sheets import save_png
+from tests.pages import Reader
+from tests.rows import row as made_row
 
-
-class Reader(html.parser.HTMLParser):
-    """Cells with their class, sources of pictures, and that every element is closed."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.cells, self.sources, self.links, self.open = [], [], [], []
-        self.feed(text)
-        assert not self.open
-
-    def handle_starttag(self, tag, attributes):
-        attributes = dict(attributes)
-        if tag == "img":
-            self.sources.append(attributes["src"])
-        elif tag not in ("meta", "link", "br"):
-            self.open.append(tag)
-        self.links += [attributes[name] for name in ("href", "action") if name in attributes]
-        if tag == "td":
-            self.cells.append([attributes.get("class", ""), ""])
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] == "td":
-            self.cells[-1][1] += data
+ERRORS = {"heading_rad": 0.07, "heading_m": 0.013}
 
 
 def row(constraint, success, low, high):
-    errors = {"heading_rad": 0.07, "heading_m": 0.013}
-    forces = {f"{name}_{of}": 1.0 for name in ("link_force", "force_sum", "torque_share") for of in ("mean", "p95")}
-    paper = paper_row("hands" if constraint == "pose" else "captured", "human", "ours", constraint)
-    return Row(constraint, "human", "ours", "", 100, 8, 8, success, low, high, None, None, None, errors, forces,
-               0.0, 5.0, 0.0, paper)  # fmt: skip
+    source = "hands" if constraint == "pose" else "captured"
+    return made_row(constraint, success, low, high, source=source, errors=ERRORS)
 
 
 @pytest.fixture

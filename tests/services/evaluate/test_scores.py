@@ -20,6 +20,7 @@ from services.evaluate.scores import (
     wilson,
     write_json,
 )
+from tests.rows import row as made_row
 
 TASK = TaskConfig()
 BLOCKS = blocks(TASK)
@@ -148,3 +149,23 @@ def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
         assert set(REQUIRED) <= set(row) and row["method"] == "ours"
     assert read["rows"][0]["pose_rad"] is None and read["rows"][0]["heading_rad"] == 0.0
     assert all(table.row_count == 9 for table in tables_of(rows, "title"))
+
+
+def test_rows_of_several_policies_stand_together_and_missing_ones_are_named():
+    rows = [made_row(name, 0.9, 0.8, 0.95, method=method) for method in ("ours", "pd") for name in ("heading", "pose")]
+    rates, *_ = tables_of(rows, "title", [("human", "graspxl", "not trained")])
+    columns = [list(column.cells) for column in rates.columns]
+    assert [column.header for column in rates.columns][:3] == ["constraint", "hand", "method"]
+    assert columns[0] == ["heading", "heading", "pose", "pose", "not trained"]
+    assert columns[2] == ["ours", "pd", "ours", "pd", "graspxl"]
+    alone, *_ = tables_of(rows[:2], "title")
+    assert [column.header for column in alone.columns][:2] == ["constraint", "episodes"]
+
+
+def test_the_margin_of_a_mean_error_is_1_96_standard_errors():
+    sample = _sample([1, 1, 1, 0], [0, 0, 0, 0], heading_rad=[0.1, 0.2, 0.3, 9.0], heading_m=[0.5, 0.5, 0.5, 9.0])
+    found = summarise("heading", "human", sample, held_2s=True, objects=["box"])
+    # Standard deviation 0.1 of three values: 1.96 x 0.1 / sqrt(3).
+    assert found.margins == pytest.approx({"heading_rad": 0.113161, "heading_m": 0.0}, abs=1e-5)
+    only = summarise("heading", "human", sample.first(1), held_2s=True, objects=["box"])
+    assert only.margins == {} and only.errors["heading_rad"] == pytest.approx(0.1)

@@ -52,6 +52,14 @@ def test_the_table_has_every_row_beside_the_papers(tmp_path: pathlib.Path) -> No
     assert fingers[at : at + 2] == ["0.250", ""]
 
 
+def test_rows_of_several_policies_are_told_apart(tmp_path: pathlib.Path) -> None:
+    heading, *_ = evaluation(tmp_path / "e.json")
+    assert [line[0] for line in cells([heading, {**heading, "method": "pd", "group": "small"}])[1:]] == [
+        "heading, human, ours",
+        "heading, small, human, pd",
+    ]
+
+
 def test_an_evaluation_becomes_png_and_pdf(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     evaluation(tmp_path / "e.json")
     assert plot(tmp_path / "e.json") == 0

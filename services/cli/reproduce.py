@@ -1,0 +1,151 @@
+"""`congrasp reproduce`: from nothing to the paper's tables."""
+
+import pathlib
+import shlex
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from actors.physics import PhysicsName
+from common.errors import CongraspError
+
+if TYPE_CHECKING:
+    from services.evaluate.lineup import Entrant
+    from services.reproduce.plan import Policy
+
+_OUT = "reproduction"
+_QUICK, _FULL = (48, 24), (1000, 64)
+"""Episodes of a row, and procedural objects."""
+_MANY = {True: 2, False: 50}
+"""Episodes of the table of many objects for each episode of a row: quick, and in full."""
+
+
+def reproduce(
+    out: pathlib.Path = pathlib.Path(_OUT),
+    quick: bool = False,
+    hands: tuple[str, ...] = (),
+    methods: tuple[str, ...] = (),
+    policy: tuple[str, ...] = (),
+    captured: tuple[pathlib.Path, ...] = (),
+    episodes: int = 0,
+    pool: int = 0,
+    physics: PhysicsName = "auto",
+    seed: int = 0,
+    training: str = "",
+    patience: int = 240,
+) -> int:
+    """From nothing to the paper's tables: trains what is missing, evaluates, and writes a page, JSON and LaTeX.
+
+    On a GPU it trains the full system for each hand, then the baselines and ablations that learn, each as
+    'congrasp train' in a run of its own below OUT/policies; one that fails does not stop the rest. Then it evaluates
+    all tables. Every figure stands beside the paper's with its interval and the difference, and what is not comparable
+    is listed with the reason. The same command goes on where it was stopped: trainings from their last checkpoint,
+    tables that are done are not made again unless policy or numbers changed.
+
+    Examples: congrasp reproduce --quick; congrasp reproduce --captured grab oakink dexycb
+
+    Args:
+      out: Folder for reproduction.html, reproduction.json and tables.tex, and for runs, rows and pictures.
+      quick: Take the pretrained policies, train nothing, and evaluate 48 episodes a row: minutes on two CPU cores.
+      hands: Whose full system is evaluated, the first one's under everything else too; by default all with a
+        pretrained policy.
+      methods: Which methods stand beside it: pd, graspxl, dgrasp, no-dynamic-center, no-feedforward, two-phase,
+        single-stage; by default all.
+      policy: Policies that need no training, as 'congrasp evaluate' takes them.
+      captured: Folders of captured data sets, each with the folders 'objects' and 'constraints' that
+        'congrasp constraints import' makes; most of the paper's tables are of such.
+      episodes: Episodes of a row; 0 takes 1,000, with --quick 48.
+      pool: Procedural objects of a row; 0 takes 64, with --quick 24.
+      physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
+      seed: Seed of constraints and episodes.
+      training: Further options of every 'congrasp train', as one text.
+      patience: Minutes after which a training is ended, to be resumed by the next 'congrasp reproduce'.
+    """
+    from common.policy.pretrained import pretrained_hands
+    from services.cli.console import at_least, tracked
+    from services.evaluate.protocol import NOMINAL_FRICTION
+    from services.reproduce.evaluation import Numbers
+    from services.reproduce.page import JSON, LATEX, PAGE, summary
+    from services.reproduce.plan import BASELINES, policies
+    from services.reproduce.run import Request, reproduce, to_train
+
+    at_least(0, episodes=episodes, pool=pool, seed=seed)
+    at_least(1, patience=patience)
+    if out.exists() and not out.is_dir():
+        raise CongraspError(f"--out is the file {out}.", "Name a folder.")
+    options: dict[str, Any] = {"quick": quick, "hands": hands, "methods": methods, "policy": policy}
+    options |= {"captured": captured, "episodes": episodes, "pool": pool, "seed": seed, "training": training}
+    options |= {"physics": "" if physics == "auto" else physics, "out": "" if str(out) == _OUT else out}
+    chosen, compared = tuple(dict.fromkeys(hands)) or tuple(pretrained_hands()), methods or BASELINES
+    _check_names(chosen, compared)
+    request = Request(
+        out=out,
+        hands=chosen,
+        methods=compared,
+        given=_given(policy, policies(chosen, compared)),
+        captured=captured,
+        quick=quick,
+        options=tuple(shlex.split(training)),
+        patience=60.0 * patience,
+        command=_command(options),
+    )
+    _check_device([one.name for one in to_train(request)])
+    usual_episodes, usual_pool = _QUICK if quick else _FULL
+    episodes, pool = episodes or usual_episodes, pool or usual_pool
+
+    with tracked() as track:
+        numbers = Numbers(episodes, pool, _MANY[quick] * episodes, physics, seed, NOMINAL_FRICTION)
+        account = reproduce(request, numbers, track, lambda text: print(text, flush=True))
+    print(summary(account.cells))
+    print(f"The page is {out / PAGE}; beside it are {JSON} and {LATEX}.")
+    return 1 if account.failures else 0
+
+
+def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
+    """Raises a CongraspError for a hand or a method that is not there."""
+    from common.hands import get_hand
+    from services.reproduce.plan import BASELINES
+
+    for name in hands:
+        if get_hand(name).name != name:
+            raise CongraspError(f"'{name[:60]}' is no hand's name.", "Choose from 'congrasp hands list'.")
+    if unknown := set(methods) - set(BASELINES):
+        raise CongraspError(f"There is no method '{min(unknown)}'.", f"Choose from: {', '.join(BASELINES)}.")
+
+
+def _given(texts: tuple[str, ...], needed: "list[Policy]") -> "dict[Policy, Entrant]":
+    """Policies by what they are; a CongraspError for one that nothing needs."""
+    from services.evaluate.lineup import read_entrants
+    from services.reproduce.plan import Policy
+
+    found = {Policy(one.hand, one.method): one for one in read_entrants(texts)}
+    for policy, one in found.items():
+        if policy not in needed:
+            raise CongraspError(
+                f"The policy {one.file.name} is of the hand '{policy.hand}' and the method '{policy.method}'.",
+                "Name that hand with --hands, the first one for methods, or leave the policy out.",
+            )
+    return found
+
+
+def _check_device(wanted: list[str]) -> None:
+    """Raises a CongraspError if something has to be trained where there is no GPU."""
+    from services.train.processes import accelerators
+
+    if wanted and accelerators()[0] == "cpu":
+        raise CongraspError(
+            f"{', '.join(wanted)} must be trained first, and this machine has no GPU.",
+            "Use --quick, which takes the pretrained policies, or name policies with --policy.",
+        )
+
+
+def _command(options: dict[str, Any]) -> str:
+    """The command line, with what is not empty."""
+    words = ["congrasp", "reproduce"]
+    for name, value in options.items():
+        if value:
+            values = value if isinstance(value, tuple) else () if value is True else (value,)
+            words += [f"--{name}", *map(str, values)]
+    return shlex.join(words)
+
+
+COMMAND = reproduce

@@ -1,0 +1,141 @@
+"""Which policies the tables of an evaluation compare: those given, pretrained ones, and methods without a policy."""
+
+import dataclasses
+import pathlib
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, NamedTuple
+
+from common.errors import CongraspError
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle
+from common.policy.pretrained import policy_file, pretrained_hands
+from common.task.methods import evaluated_as
+
+Table = Literal["single", "composed", "cross", "hands", "ablation", "objects", "noise", "all"]
+ABLATION = ("ours", "no-dynamic-center", "no-feedforward", "single-stage", "two-phase")
+"""Methods of the table `ablation`."""
+_POLICY = "policy.safetensors"
+
+
+class Entrant(NamedTuple):
+    """A policy as a method; its task is that of the method."""
+
+    policy: PolicyBundle
+    file: pathlib.Path
+
+    @property
+    def hand(self) -> str:
+        """Name of its hand."""
+        return self.policy.spec.hand_name
+
+    @property
+    def method(self) -> str:
+        """`common.task.methods`."""
+        return self.policy.task.method
+
+
+class Missing(NamedTuple):
+    """A method of a table that has no policy."""
+
+    hand: str
+    method: str
+    reason: str
+
+
+class Lineup(NamedTuple):
+    """Who is evaluated, on which tables of rows."""
+
+    entrants: list[tuple[Entrant, tuple[Table, ...]]]
+    missing: list[Missing]
+
+
+def read_entrant(file: pathlib.Path, method: str | None = None) -> Entrant:
+    """A policy file, under its own method or as a given one.
+
+    Raises:
+      CongraspError: it cannot be read, or the policy is of another method that learns.
+    """
+    policy = bundles.load(file)
+    if method is not None:
+        policy = dataclasses.replace(policy, task=evaluated_as(policy.task, method, file.name))
+    return Entrant(policy, file)
+
+
+def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entrant]:
+    """Policies that a user names: FILE, METHOD=FILE, or a folder of runs (or one run), of which each has a policy.
+
+    Args:
+      texts: what the user wrote.
+      method: of policies that are named without one; by default the policy says.
+
+    Raises:
+      CongraspError: one cannot be read or is of another method, a folder holds none, or two are alike.
+    """
+    found: list[Entrant] = []
+    for text in texts:
+        path, own = pathlib.Path(text), method
+        if not path.exists() and "=" in text:
+            own, _, rest = text.partition("=")
+            path = pathlib.Path(rest)
+        files = [path]
+        if path.is_dir():
+            files = sorted({*path.glob(_POLICY), *path.glob(f"*/{_POLICY}")})
+            if not files:
+                raise CongraspError(f"The folder {path} holds no {_POLICY}.", "Name a run's folder, or a policy file.")
+        found += [read_entrant(file, own) for file in files]
+    for i, one in enumerate(found):
+        if any((one.hand, one.method) == (other.hand, other.method) for other in found[:i]):
+            raise CongraspError(
+                f"Two policies are of the hand '{one.hand}' and the method '{one.method}'.", "Evaluate one at a time."
+            )
+    return found
+
+
+def line_up(tables: Sequence[Table], given: Sequence[Entrant], hand: str, method: str | None = None) -> Lineup:
+    """Who is evaluated for some tables.
+
+    `hands` compares full systems: those given, or else the pretrained ones. `ablation` compares the methods of
+    `ABLATION` for the hand of the first policy; where none is given for the full system the pretrained one stands in.
+    Every other table is of each policy given, or else of the pretrained one of a hand.
+
+    Args:
+      tables: what is wanted.
+      given: policies that the user named.
+      hand: whose pretrained policy stands in for none.
+      method: as which method.
+
+    Raises:
+      CongraspError: there is no policy for the hand.
+    """
+    first = list(given) or [read_entrant(policy_file(None, hand), method)]
+    own = first[0].hand
+    tables_of: dict[tuple[str, str], list[Table]] = {}
+    known = {(one.hand, one.method): one for one in first}
+    missing: list[Missing] = []
+    for table in dict.fromkeys(tables):
+        if table == "hands" and not given:
+            for name in pretrained_hands():
+                known.setdefault((name, "ours"), read_entrant(policy_file(None, name)))
+        if table == "ablation" and (own, "ours") not in known and own in pretrained_hands():
+            known[own, "ours"] = read_entrant(policy_file(None, own))
+        chosen = {
+            "hands": [key for key in known if key[1] == "ours"],
+            "ablation": [(own, name) for name in ABLATION],
+        }.get(table, [(one.hand, one.method) for one in first])
+        for key in chosen:
+            if key in known:
+                tables_of.setdefault(key, []).append("single" if table in ("hands", "ablation") else table)
+            else:
+                missing.append(Missing(*key, "not trained"))
+    return Lineup([(known[key], tuple(dict.fromkeys(tables))) for key, tables in tables_of.items()], missing)
+
+
+def facts(one: Entrant) -> dict[str, Any]:
+    """What JSON files say about a policy."""
+    return {
+        "hand": one.hand,
+        "method": one.method,
+        "file": one.file.name,
+        "version": one.policy.version,
+        "transitions": one.policy.transitions,
+    }

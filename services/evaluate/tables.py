@@ -1,0 +1,195 @@
+"""The rows of an evaluation's tables, for one policy."""
+
+import dataclasses
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from common.config import ObjectsConfig, Split
+from common.engines import PhysicsName
+from common.errors import CongraspError
+from common.objects.pool import HELD_OUT_SEED, load_pool
+from common.objects.spec import GraspObject
+from common.parallel import cores
+from common.policy.bundle import PolicyBundle
+from common.task.bank import ConstraintBank
+from common.task.constraint_sets import bank_of, load_for
+from common.task.methods import takes
+from services.evaluate.evaluator import Evaluator
+from services.evaluate.noise import LEVELS
+from services.evaluate.paper import CAPTURED_SETS
+from services.evaluate.plan import from_references
+from services.evaluate.protocol import NOMINAL_FRICTION, two_seconds
+from services.evaluate.references import reference_policy
+from services.evaluate.scores import TABLES, Row, known_rows
+from services.evaluate.unseen import evaluate_objects, folder_pools, procedural_pools
+
+POOL = 64
+"""Procedural objects of rows."""
+MANY = 50_000
+"""Most procedural objects of the table `objects`, where their number is not given."""
+Track = Callable[[str, int | None], Callable[[int], None]]
+"""(what is done, its total if known) -> what to call with the amount done."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """How policies are evaluated, and on what."""
+
+    episodes: int
+    """Of each row; of the table `objects` in all."""
+    physics: PhysicsName
+    """Not `auto`."""
+    pool: int = 0
+    """Procedural objects; 0 takes `POOL`, for the table `objects` one an episode, at most `MANY`."""
+    batch: int = 0
+    """Worlds side by side; 0 chooses by the engine."""
+    seed: int = 0
+    friction: float = NOMINAL_FRICTION
+    given: Sequence[GraspObject] = ()
+    """Objects of rows by constraint; procedural ones if there are none."""
+    bank: ConstraintBank | None = None
+    """Their constraints, where those are given too."""
+    paper: str = "hands"
+    """Which of the paper's tables rows stand beside (`services.evaluate.paper`)."""
+    folder: pathlib.Path | None = None
+    """Objects of the table `objects`; procedural ones if there is none."""
+    keep: pathlib.Path | None = None
+    """Where results of its pools are kept, to go on from."""
+
+
+class Found(NamedTuple):
+    """Results for one policy."""
+
+    evaluator: Evaluator | None
+    """Of the rows by constraint; None if there are none."""
+    names: list[str]
+    """Rows by constraint that were evaluated."""
+    left_out: list[CongraspError]
+    """Why others were not."""
+    noisy: list[Row]
+    """Rows under noise."""
+    rows: list[Row]
+    """All rows."""
+    references: str
+    """Where reference poses and trajectories come from; empty if no row has any."""
+
+
+def evaluate_tables(
+    policy: PolicyBundle, tables: Sequence[str], setup: Setup, track: Track, *, keep: bool = False
+) -> Found:
+    """The rows of some tables.
+
+    Args:
+      policy: as the method that its task names.
+      tables: keys of `TABLES`, `objects`, `noise`, or `all` for all of these.
+      setup: objects, engine and numbers.
+      track: shows progress.
+      keep: keep episodes for `Evaluator.examples`.
+
+    Raises:
+      CongraspError: the policy's method has no row in these tables, or no object allows one.
+    """
+    method, wanted = policy.task.method, {*TABLES, "noise", "objects"} if "all" in tables else set(tables)
+    names = [name for name in known_rows((key for key in TABLES if key in wanted), policy.task) if takes(method, name)]
+    if not takes(method, "heading"):
+        wanted -= {"objects"}
+    if not names and not wanted & {"noise", "objects"}:
+        raise CongraspError(f"The method '{method}' has no row in these tables.", "Name another --table.")
+    rows: list[Row] = []
+    noisy: list[Row] = []
+    many: list[Row] = []
+    left_out: list[CongraspError] = []
+    evaluator: Evaluator | None = None
+    source = ""
+    if names or "noise" in wanted:
+        evaluator = _evaluator(policy, setup, track)
+        if "noise" in wanted or any(from_references(name) for name in names):
+            source = _references(evaluator, track)
+        if names:
+            names, left_out = evaluator.allowed(names)
+            advance = track("Episodes", len(names) * setup.episodes)
+            rows = evaluator.rows(names, setup.episodes, advance, keep=keep)
+        if "noise" in wanted:
+            advance = track("Episodes under noise", len(LEVELS) * setup.episodes)
+            noisy = evaluator.rows_under_noise(advance, setup.episodes)
+    if "objects" in wanted:
+        many = _object_rows(policy, setup, track)
+    return Found(evaluator, names, left_out, noisy, [*rows, *noisy, *many], source)
+
+
+def _evaluator(policy: PolicyBundle, setup: Setup, track: Track) -> Evaluator:
+    """An evaluator of given objects, or of held-out procedural ones."""
+    track("Making constraints", None)
+    return Evaluator(
+        policy,
+        setup.given or load_pool(ObjectsConfig(count=setup.pool or POOL, seed=HELD_OUT_SEED)),
+        physics=setup.physics,
+        batch=setup.batch,
+        threads=cores(),
+        seed=setup.seed,
+        friction=setup.friction,
+        hold_steps=two_seconds(policy.task),
+        bank=setup.bank,
+        paper=setup.paper,
+    )
+
+
+def _references(evaluator: Evaluator, track: Track) -> str:
+    """Makes the references, where none were given, and says where they come from."""
+    advance = track("Reference grasps", None)
+    made = evaluator.references(lambda done, of: advance(done))
+    if made is None:
+        return "References are those of the constraint sets."
+    _, who = reference_policy(evaluator.bundle)
+    whole = made.grasps[:, 0]
+    closed = [obj.name for obj, count in zip(evaluator.objects, whole, strict=True) if not count]
+    text = f"References: grasps of {who}, {np.median(whole):.0f} an object (median), the last fifth held out."
+    return text + (f" The hand closed around the object where it holds none: {', '.join(closed)}." if closed else "")
+
+
+def _object_rows(policy: PolicyBundle, setup: Setup, track: Track) -> list[Row]:
+    """Rows of the heading on many objects."""
+    if setup.folder:
+        pools = folder_pools(setup.folder, setup.physics)
+    else:
+        pools = procedural_pools(setup.pool or min(setup.episodes, MANY), setup.physics)
+    return evaluate_objects(
+        policy,
+        pools,
+        setup.episodes,
+        physics=setup.physics,
+        batch=setup.batch,
+        threads=cores(),
+        seed=setup.seed,
+        friction=setup.friction,
+        keep=setup.keep,
+        progress=track("Episodes on many objects", setup.episodes),
+    )
+
+
+class Captured(NamedTuple):
+    """Objects and the constraint sets that are evaluated on them."""
+
+    objects: list[GraspObject]
+    bank: ConstraintBank
+    hand: str
+    """For which the sets were made."""
+    paper: str
+    """The paper's table of their data set (`services.evaluate.paper`); empty for none."""
+
+
+def captured(folder: pathlib.Path, split: Split, objects: Sequence[GraspObject]) -> Captured:
+    """The objects that have a constraint set in a folder, and the sets.
+
+    Raises:
+      CongraspError: none has one, or a set is not for its object.
+    """
+    chosen, sets = load_for(folder, objects)
+    if not sets:
+        raise CongraspError(f"{folder} holds no constraint set of these objects.", "Name folders that belong together.")
+    sources = {made.meta.get("source", "") for made in sets}
+    paper = CAPTURED_SETS.get(sources.pop(), "") if len(sources) == 1 else ""
+    return Captured(chosen, bank_of(sets, split), sets[0].meta["hand"], paper)

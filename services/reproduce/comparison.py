@@ -1,0 +1,139 @@
+"""Every figure of the paper beside what was measured here, or why nothing that was measured is comparable."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+
+from common.task.constraints import CONSTRAINTS
+from services.evaluate.paper import PaperLine, paper_lines
+from services.evaluate.scores import Row
+from services.reproduce.evaluation import Result
+from services.reproduce.plan import Policy
+
+SUCCESS = "success"
+UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
+"""Of errors, by their names in rows."""
+CAPTURED_DATA = {"captured": "GRAB and OakInk", "cross": "DexYCB"}
+CONDITIONS = (
+    "MuJoCo stands in for the paper's simulator; contacts, friction, servos and the hands' models differ.",
+    "The human hand stands in for MANO. It has 20 anatomical joints; the paper's has MANO's.",
+    "Procedural objects that training never sees stand in for the objects of the paper's table of hands, and for "
+    "Objaverse in its table of large-scale objects. Sizes there are terciles of the objects here; the paper gives no "
+    "bounds.",
+    "References of the table of hands are grasps of this project's own reference policies, made as the paper makes its "
+    "own.",
+    "Success is the paper's: the object has not fallen a quarter of a second after the table is removed. Whether it is "
+    "held for two seconds, and whether fingers pass through anything meanwhile, the paper does not report.",
+)
+"""What is different in every table."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A figure of the paper, and ours if there is a comparable one."""
+
+    table: str
+    """`services.evaluate.paper.TABLES`."""
+    constraint: str
+    hand: str
+    method: str
+    group: str
+    """Size of the objects; empty for all."""
+    quantity: str
+    """`success`, or the name of an error."""
+    paper: float
+    data: str = ""
+    """Captured data set of ours; empty for procedural constraints."""
+    episodes: int = 0
+    ours: float | None = None
+    low: float | None = None
+    high: float | None = None
+    """95 % interval: Wilson's of a rate, 1.96 standard errors around a mean error."""
+    difference: float | None = None
+    """Ours less the paper's."""
+    nearest: float | None = None
+    """What is not comparable: the same hand, method and constraint with procedural references."""
+    reason: str = ""
+    """Why nothing is comparable."""
+
+    @property
+    def verdict(self) -> str:
+        """better or worse where the whole interval is, else empty."""
+        if self.low is None or self.high is None or self.low <= self.paper <= self.high:
+            return ""
+        return "better" if (self.low > self.paper) == (self.quantity == SUCCESS) else "worse"
+
+
+def compare(results: Sequence[Result], absent: Mapping[Policy, str], hands: Sequence[str]) -> list[Cell]:
+    """A cell for every figure of the paper and every result that is comparable with it.
+
+    Args:
+      results: of all parts.
+      absent: why there is no policy.
+      hands: those that were asked for.
+    """
+    cells: list[Cell] = []
+    for line in paper_lines():
+        matching = [found for result in results if result.source == line.source for found in _rows(result, line)]
+        near = [row for result in results if result.source == "hands" for _, row in _rows(result, line)]
+        reason = "" if matching else _reason(line, results, absent, hands)
+        for quantity, paper in {SUCCESS: line.figures.success, **line.figures.errors}.items():
+            cell = Cell(line.table, line.constraint, line.hand, line.method, line.group, quantity, paper)
+            if not matching:
+                nearest = _figure(near[0], quantity) if near else None
+                cells.append(dataclasses.replace(cell, nearest=nearest, reason=reason))
+            cells += [_filled(cell, data, row) for data, row in matching]
+    return cells
+
+
+def unmatched(results: Sequence[Result]) -> list[tuple[Result, Row]]:
+    """Our rows that stand beside none of the paper's."""
+    lines = paper_lines()
+    return [
+        (result, row)
+        for result in results
+        for row in result.rows
+        if not any(line.source == result.source and _is_of(row, line) for line in lines)
+    ]
+
+
+def _rows(result: Result, line: PaperLine) -> Iterator[tuple[str, Row]]:
+    """A result's rows that are of a line's hand, method, constraint and group, and the data set."""
+    for row in result.rows:
+        if _is_of(row, line):
+            yield result.part.data.resolve().name if result.part.data else "", row
+
+
+def _is_of(row: Row, line: PaperLine) -> bool:
+    """Whether a row is of a line's hand, method, constraint and group."""
+    same = (row.hand, row.method, row.constraint) == (line.hand, line.method, line.constraint)
+    return same and row.group.split(" ")[0] == line.group
+
+
+def _figure(row: Row, quantity: str) -> float | None:
+    """A row's success or error."""
+    return row.success if quantity == SUCCESS else row.errors[quantity]
+
+
+def _filled(cell: Cell, data: str, row: Row) -> Cell:
+    """The cell with our figure; without a successful episode there is no error to compare."""
+    cell = dataclasses.replace(cell, data=data, episodes=row.episodes)
+    if (ours := _figure(row, cell.quantity)) is None:
+        return dataclasses.replace(cell, reason="no episode succeeded")
+    low, high = (row.success_low, row.success_high) if cell.quantity == SUCCESS else (None, None)
+    if (margin := row.margins.get(cell.quantity)) is not None:
+        low, high = ours - margin, ours + margin
+    return dataclasses.replace(cell, ours=ours, low=low, high=high, difference=ours - cell.paper)
+
+
+def _reason(line: PaperLine, results: Sequence[Result], absent: Mapping[Policy, str], hands: Sequence[str]) -> str:
+    """Why no result is comparable with a line."""
+    if line.hand not in hands:
+        return f"the hand '{line.hand}' was not asked for"
+    if reason := absent.get(Policy(line.hand, line.method)):
+        return f"no policy of the method '{line.method}': {reason}"
+    if line.source in CAPTURED_DATA and not any(result.source == line.source for result in results):
+        return (
+            f"of captured constraints of {CAPTURED_DATA[line.source]}, which nobody may hand on; --captured takes your "
+            "own copy"
+        )
+    return "not evaluated"

@@ -1,0 +1,161 @@
+"""Evaluates the parts of a reproduction, each once: its rows are kept as `congrasp evaluate --json` writes them."""
+
+import dataclasses
+import pathlib
+import shutil
+import time
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from common.engines import PhysicsName
+from common.errors import CongraspError
+from common.inputs import read_json
+from common.policy.bundle import content_hash
+from common.wire.codec import encode
+from services.assets.objects.named import objects_of
+from services.evaluate.failures import failure_sheets
+from services.evaluate.lineup import Entrant, facts
+from services.evaluate.report import count_causes
+from services.evaluate.scores import Row, write_json
+from services.evaluate.tables import Captured, Found, Setup, Track, captured, evaluate_tables
+from services.reproduce.plan import Part
+from services.viz.sheets import save_png
+
+_LARGEST = 1 << 28
+OBJECTS, CONSTRAINTS = "objects", "constraints"
+"""Folders of a captured data set, as `congrasp constraints import` makes them by default."""
+_CAPTURED_TABLES = {"cross": ("cross",), "captured": ("single", "composed"), "": ("single", "composed")}
+_SOURCES = {"objects": "objects", "noise": ""}
+_PICTURED = 2
+_POOLS = ".pools"
+
+
+@dataclasses.dataclass(frozen=True)
+class Numbers:
+    """How much is evaluated, and how."""
+
+    episodes: int
+    """Of a row."""
+    pool: int
+    """Procedural objects of rows."""
+    many: int
+    """Episodes, and most objects, of the table of many objects."""
+    physics: PhysicsName
+    """`auto` only until it is resolved."""
+    seed: int
+    friction: float
+
+
+class Result(NamedTuple):
+    """What a part came to."""
+
+    part: Part
+    source: str
+    """What its episodes are drawn from (`services.evaluate.paper`)."""
+    rows: list[Row]
+    about: Mapping[str, Any]
+    """What else its JSON file says: policy, settings, pictures, references, rows left out, seconds."""
+    fresh: bool
+    """Whether it was evaluated now."""
+
+
+def evaluate_part(part: Part, entrant: Entrant, numbers: Numbers, out: pathlib.Path, track: Track) -> Result:
+    """The rows of a part, from its file if that was made with the same policy and numbers.
+
+    Args:
+      part: what is evaluated.
+      entrant: its policy.
+      numbers: how much, and how.
+      out: folder of `tables/` and `pictures/`.
+      track: shows progress.
+
+    Raises:
+      CongraspError: the part cannot be evaluated.
+    """
+    file = out / "tables" / f"{part.name}.json"
+    settings = dataclasses.asdict(numbers) | {
+        "table": part.table,
+        "data": str(part.data or ""),
+        "content": content_hash(encode(entrant.policy.to_message())),
+    }
+    if (kept := _read(file, part, settings)) is not None:
+        return kept
+    began = time.monotonic()
+    data = _captured(part, track) if part.data else None
+    if data and data.hand != entrant.hand:
+        raise CongraspError(f"The constraint sets in {part.data} are for the hand '{data.hand}', not '{entrant.hand}'.")
+    found = _evaluate(part, entrant, numbers, data, file, track)
+    pictures = _draw(part, entrant, found, out / "pictures" / part.name)
+    about: dict[str, Any] = {
+        "policy": facts(entrant),
+        "settings": settings,
+        "source": data.paper if data else _SOURCES.get(part.table, "hands"),
+        "pictures": pictures,
+        "references": found.references,
+        "left_out": [str(error) for error in found.left_out],
+        "seconds": round(time.monotonic() - began, 1),
+    }
+    write_json(found.rows, file, about)
+    shutil.rmtree(file.with_suffix(_POOLS), ignore_errors=True)
+    return Result(part, about["source"], found.rows, about, True)
+
+
+def _read(file: pathlib.Path, part: Part, settings: Mapping[str, Any]) -> Result | None:
+    """A part's file, if it is whole and of these settings."""
+    try:
+        about = read_json(file, _LARGEST)
+        rows = [Row.from_json(row) for row in about.pop("rows")]
+        same = about["settings"] == settings and about.keys() >= {"pictures", "seconds", "references", "left_out"}
+        return Result(part, about["source"], rows, about, False) if same else None
+    except (OSError, LookupError, TypeError, AttributeError, CongraspError):
+        return None
+
+
+def _captured(part: Part, track: Track) -> Captured:
+    """The constraint sets of a captured data set, all of them: no policy of a reproduction was trained with any."""
+    assert part.data is not None
+    for name in (OBJECTS, CONSTRAINTS):
+        if not (part.data / name).is_dir():
+            raise CongraspError(
+                f"{part.data} has no folder '{name}'.", "Run 'congrasp constraints import' in it, or name another."
+            )
+    return captured(part.data / CONSTRAINTS, "all", objects_of(part.data / OBJECTS, track=track))
+
+
+def _evaluate(
+    part: Part, entrant: Entrant, numbers: Numbers, data: Captured | None, file: pathlib.Path, track: Track
+) -> Found:
+    """The part's rows."""
+    many = part.table == "objects"
+    setup = Setup(
+        numbers.many if many else numbers.episodes,
+        physics=numbers.physics,
+        pool=0 if many else numbers.pool,
+        seed=numbers.seed,
+        friction=numbers.friction,
+        keep=file.with_suffix(_POOLS) if many else None,
+    )
+    tables: tuple[str, ...] = (part.table,)
+    if data:
+        setup = dataclasses.replace(setup, given=data.objects, bank=data.bank, paper=data.paper)
+        tables = _CAPTURED_TABLES[data.paper]
+    return evaluate_tables(entrant.policy, tables, setup, track, keep=_is_pictured(part))
+
+
+def _is_pictured(part: Part) -> bool:
+    """Whether episodes are drawn: those of the full system, under constraints without noise."""
+    return part.policy.method == "ours" and part.table not in ("objects", "noise")
+
+
+def _draw(part: Part, entrant: Entrant, found: Found, folder: pathlib.Path) -> list[dict[str, str]]:
+    """Draws failures and successes of every row; the title, caption and file of each picture."""
+    if found.evaluator is None or not _is_pictured(part):
+        return []
+    pictures = list[dict[str, str]]()
+    sheets = failure_sheets(found.evaluator, entrant.policy, found.names, _PICTURED, _PICTURED)
+    for name, sheet, causes in sheets:
+        file = folder / f"{name.replace(':', '-')}.png"
+        save_png(file, sheet)
+        title = f"{part.policy.hand}, {name.replace(':', ', ')}"
+        pictures.append({"title": title, "caption": count_causes(causes), "file": str(file)})
+    return pictures

@@ -1,0 +1,154 @@
+"""The page, the JSON file and the LaTeX tables of a reproduction."""
+
+import collections
+import dataclasses
+import json
+import pathlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from common.files import write_atomically
+from common.inputs import read_file
+from services.evaluate.report import Picture, embedded, template
+from services.evaluate.scores import PLAUSIBILITY, RATES, Row, plausibility_cells, rate_cells
+from services.reproduce.comparison import CONDITIONS, SUCCESS, Cell, unmatched
+from services.reproduce.evaluation import Result
+from services.reproduce.latex import latex
+from services.reproduce.layout import not_comparable, tables
+from services.reproduce.plan import Policy
+
+PAGE, JSON, LATEX = "reproduction.html", "reproduction.json", "tables.tex"
+_LARGEST_PICTURE = 32 << 20
+
+
+class Account(NamedTuple):
+    """All that a reproduction came to."""
+
+    results: list[Result]
+    cells: list[Cell]
+    policies: list[tuple[Policy, str]]
+    """Each policy, and which file it is or why there is none."""
+    failures: list[str]
+    conditions: str
+    """A sentence on objects, engine and seed."""
+    command: str
+    """The command line that makes it again."""
+    curves: list[Picture]
+    """Of trainings."""
+    seconds: dict[str, float]
+    """Of trainings and of evaluations, those of earlier sessions too."""
+
+
+def page() -> Any:
+    """The page's template; a CongraspError if jinja2 is absent."""
+    return template(pathlib.Path(__file__).with_suffix(".html"))
+
+
+def write(account: Account, out: pathlib.Path) -> None:
+    """Writes page, JSON and LaTeX into a folder, each whole or not at all.
+
+    Raises:
+      CongraspError: one cannot be written, or jinja2 is absent.
+    """
+    shown = tables(account.cells)
+    absent = not_comparable(account.cells)
+    text = page().render(
+        title="The paper's tables",
+        summary=summary(account.cells),
+        conditions=f"{account.conditions} {_times(account.seconds)}",
+        command=account.command,
+        tables=shown,
+        everywhere=CONDITIONS,
+        absent=absent,
+        details=_details(account.results),
+        pictures=[embedded(picture) for picture in [*_pictures(account.results), *account.curves]],
+        policies=[(policy.hand, policy.method, what) for policy, what in account.policies],
+        failures=account.failures,
+    )
+    write_atomically(out / PAGE, text.encode())
+    write_atomically(out / LATEX, latex(shown, account.conditions).encode())
+    write_atomically(out / JSON, json.dumps(to_json(account), indent=2).encode())
+
+
+def to_json(account: Account) -> dict[str, Any]:
+    """What the JSON file holds."""
+    return {
+        "conditions": account.conditions,
+        "command": account.command,
+        "seconds": account.seconds,
+        "policies": [policy._asdict() | {"what": what} for policy, what in account.policies],
+        "cells": [dataclasses.asdict(cell) for cell in account.cells],
+        "not_comparable": [
+            {"line": what, "reason": why, "nearest": nearest} for what, why, nearest in not_comparable(account.cells)
+        ],
+        "different_everywhere": list(CONDITIONS),
+        "failures": account.failures,
+        "parts": [
+            {"name": result.part.name, "source": result.source, **result.about}
+            | {"rows": [row.to_json() for row in result.rows]}
+            for result in account.results
+        ],
+    }
+
+
+def summary(cells: Sequence[Cell]) -> str:
+    """How many of the paper's figures have one beside them, and where those lie."""
+    rates = [cell for cell in cells if cell.quantity == SUCCESS]
+    compared = [cell for cell in rates if cell.ours is not None]
+    above = sum(cell.ours >= cell.paper for cell in compared if cell.ours is not None)
+    verdicts = collections.Counter(cell.verdict for cell in compared)
+    return (
+        f"{len(compared)} of the paper's {len(rates)} success rates have a comparable one beside them. "
+        f"It is at or above the paper's in {above}; the whole 95 % interval is above it in {verdicts['better']}, "
+        f"and below it in {verdicts['worse']}."
+    )
+
+
+def _times(seconds: Mapping[str, float]) -> str:
+    """Such as "Evaluation took 12.3 min."."""
+    took = [f"{what} took {amount / 60:.1f} min" for what, amount in seconds.items() if amount]
+    return f"{', '.join(took).capitalize()}." if took else ""
+
+
+class _Details(NamedTuple):
+    """A table of our own rows."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+
+def _details(results: Sequence[Result]) -> list[_Details]:
+    """Rates of rows that the paper does not have, and the plausibility of all."""
+    own = ("table", "hand", "method")
+    rates, of_rate = RATES[:-1], _of(lambda row: rate_cells(row)[:-1])
+    all_rows = [(result, row) for result in results for row in result.rows]
+    return [
+        _Details("Rows beside none of the paper's", (*own, *rates), [of_rate(*pair) for pair in unmatched(results)]),
+        _Details(
+            "Held for two seconds, and plausibility",
+            (*own, "constraint", "held 2 s", *PLAUSIBILITY[1:]),
+            [_of(_plausible)(*pair) for pair in all_rows if pair[1].plausibility.get("hand_hand_mm") is not None],
+        ),
+    ]
+
+
+def _of(cells: Callable[[Row], tuple[str, ...]]) -> Callable[[Result, Row], tuple[str, ...]]:
+    """A row's cells behind its table, hand and method."""
+    return lambda result, row: (result.part.name.removeprefix(f"{result.part.policy.name}-"), row.hand, row.method,
+                                *cells(row))  # fmt: skip
+
+
+def _plausible(row: Row) -> tuple[str, ...]:
+    """Rate of grasps held for two seconds, and plausibility."""
+    name, *cells = plausibility_cells(row)
+    return name, rate_cells(row)[RATES.index("held 2 s")], *cells
+
+
+def _pictures(results: Sequence[Result]) -> Iterator[Picture]:
+    """Episodes that were drawn, of files that are still there."""
+    for result in results:
+        for found in result.about["pictures"]:
+            path = pathlib.Path(found["file"])
+            if path.is_file():
+                yield Picture(found["title"], read_file(path, _LARGEST_PICTURE), found["caption"])

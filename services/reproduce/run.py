@@ -1,0 +1,186 @@
+"""The flow of `congrasp reproduce`: train what is missing, evaluate every part, write the result."""
+
+import dataclasses
+import itertools
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+from actors.physics import resolve_physics
+from common.errors import CongraspError
+from common.policy.pretrained import pretrained_file
+from common.task.methods import get_method
+from services.evaluate.lineup import Entrant, read_entrant
+from services.evaluate.report import curves_of
+from services.evaluate.tables import Track
+from services.reproduce import training
+from services.reproduce.comparison import compare
+from services.reproduce.evaluation import Numbers, Result, evaluate_part
+from services.reproduce.page import Account, page, write
+from services.reproduce.plan import BASELINES, Policy, parts, policies
+
+RUNS = "policies"
+"""Folder of trainings below the output folder."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What is reproduced, and with what."""
+
+    out: pathlib.Path
+    hands: tuple[str, ...]
+    """The first is the one of all tables but that of hands."""
+    methods: tuple[str, ...]
+    given: Mapping[Policy, Entrant]
+    """Policies that need no training."""
+    captured: tuple[pathlib.Path, ...]
+    quick: bool
+    """Pretrained policies stand in for trained ones."""
+    options: tuple[str, ...]
+    """Further options of trainings."""
+    patience: float
+    """Seconds of each training."""
+    command: str
+    """The command line."""
+
+
+class _Policies(NamedTuple):
+    """What there is to evaluate."""
+
+    entrants: dict[Policy, Entrant]
+    absent: dict[Policy, str]
+    """Why there is no policy."""
+
+
+def to_train(request: Request) -> list[Policy]:
+    """Policies that the request would have to train."""
+    if request.quick:
+        return []
+    found = policies(request.hands, request.methods)
+    return [policy for policy in found if get_method(policy.method).learns and _file(request, policy) is None]
+
+
+def reproduce(
+    request: Request,
+    numbers: Numbers,
+    track: Track,
+    note: Callable[[str], None] = lambda text: None,
+) -> Account:
+    """Trains, evaluates and writes; one that fails does not stop the rest.
+
+    Args:
+      request: what is wanted.
+      numbers: how much is evaluated; the engine may be `auto`.
+      track: shows progress.
+      note: is given what is worth a line.
+
+    Raises:
+      CongraspError: nothing could be evaluated, or the result cannot be written.
+    """
+    page()  # fails before anything else if a package is missing
+    shown: set[Policy] = set()
+
+    def show(policy: Policy, line: str) -> None:
+        """A bar for each training; what it prints is in its log."""
+        if policy not in shown:
+            shown.add(policy)
+            track(f"Training {policy.name} (log: {request.out / RUNS / policy.name}.log)", None)
+
+    failed = training.train_all(
+        request.out / RUNS,
+        to_train(request),
+        options=request.options,
+        patience=request.patience,
+        progress=show,
+    )
+    for text in failed.values():
+        note(text)
+    found = _policies(request, failed)
+    results: list[Result] = []
+    failures = list(failed.values())
+    # Not before: trainings have the device's memory for themselves until this process looks for its engine.
+    numbers = dataclasses.replace(numbers, physics=resolve_physics(numbers.physics))
+    whole = parts(policies(request.hands, request.methods), request.captured, noise=not request.quick)
+    wanted = [part for part in whole if part.policy in found.entrants]
+    advance = track("Parts", len(wanted))
+    for done, part in enumerate(wanted, 1):
+        try:
+            result = evaluate_part(part, found.entrants[part.policy], numbers, request.out, track)
+        except CongraspError as error:
+            failures.append(f"{part.name}: {error}")
+            note(failures[-1])
+        else:
+            results.append(result)
+            note(f"{part.name}: {_outcome(result)}")
+        advance(done)
+    if not results:
+        raise CongraspError("Nothing could be evaluated.", failures[0] if failures else "Name a hand with a policy.")
+    account = _account(request, numbers, found, results, failures)
+    write(account, request.out)
+    return account
+
+
+def _outcome(result: Result) -> str:
+    """One line about a part."""
+    if not result.fresh:
+        return "done before"
+    rates = ", ".join(f"{row.constraint} {100 * row.success:.1f} %" for row in result.rows if not row.group)
+    return f"{rates} ({result.about['seconds']:.0f} s)"
+
+
+def _file(request: Request, policy: Policy) -> pathlib.Path | None:
+    """A policy's file, if there is one."""
+    if policy in request.given:
+        return request.given[policy].file
+    if request.quick and policy.method == "ours":
+        return pretrained_file(policy.hand)
+    return training.trained(request.out / RUNS, policy)
+
+
+def _policies(request: Request, failed: Mapping[Policy, str]) -> _Policies:
+    """Reads what there is; methods that do not learn take the full system's hand and geometry."""
+    found = _Policies({}, {})
+    for policy in policies(request.hands, request.methods):
+        learns = get_method(policy.method).learns
+        file = _file(request, policy if learns else Policy(policy.hand, "ours"))
+        if policy in request.given:
+            found.entrants[policy] = request.given[policy]
+        elif file is not None:
+            found.entrants[policy] = read_entrant(file, policy.method)
+        elif policy in failed:
+            found.absent[policy] = failed[policy]
+        else:
+            found.absent[policy] = "--quick trains none" if request.quick else "it was not trained"
+    for method in set(BASELINES) - set(request.methods):
+        found.absent[Policy(request.hands[0], method)] = "it was not asked for"
+    return found
+
+
+def _account(
+    request: Request, numbers: Numbers, found: _Policies, results: Sequence[Result], failures: Sequence[str]
+) -> Account:
+    """Everything for the page."""
+    runs = request.out / RUNS
+    trainings = {policy: training.seconds(runs, policy) or 0.0 for policy in found.entrants}
+    seconds = {
+        "training": sum(trainings.values()),
+        "evaluation": sum(result.about["seconds"] for result in results),
+    }
+    where = []
+    for policy, one in found.entrants.items():
+        took = f", trained in {trainings[policy] / 60:.0f} min" if trainings[policy] else ""
+        version = f"{one.file.name}, version {one.policy.version}, {one.policy.transitions:,} environment steps"
+        where.append((policy, version + took if get_method(policy.method).learns else "needs none"))
+    where += [(policy, f"none: {reason}") for policy, reason in found.absent.items()]
+    curves = [
+        dataclasses.replace(curve, title=f"Training of {policy.name}: {curve.title}")
+        for policy in found.entrants
+        if trainings[policy]
+        for curve in itertools.islice(curves_of(runs / policy.name), 1)
+    ]
+    conditions = (
+        f"{numbers.episodes} episodes a row on {numbers.pool} held-out procedural objects, {numbers.many} on many "
+        f"objects, engine {numbers.physics}, friction {numbers.friction:g}, seed {numbers.seed}."
+    )
+    cells = compare(results, found.absent, request.hands)
+    return Account(list(results), cells, where, list(failures), conditions, request.command, curves, seconds)

@@ -1,0 +1,84 @@
+"""Which policies the tables of several compare."""
+
+import dataclasses
+
+import pytest
+
+from common.config import NetworkConfig, RunConfig
+from common.errors import CongraspError
+from common.policy import bundle as bundles
+from common.policy.pretrained import pretrained_hands
+from common.task.methods import with_method
+from services.evaluate.lineup import ABLATION, line_up, read_entrants
+from services.train.command import untrained
+
+CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """Saves an untrained policy of a method, and returns its file."""
+
+    def save(method, hand="human", folder=""):
+        config = CONFIG if method == "ours" else with_method(CONFIG, method)
+        config = dataclasses.replace(config, task=dataclasses.replace(config.task, hand=hand))
+        path = tmp_path / (folder or f"{hand}-{method}") / "policy.safetensors"
+        bundles.save(untrained(config), path)
+        return path
+
+    return save
+
+
+def who(lineup):
+    return [(one.hand, one.method, tables) for one, tables in lineup.entrants]
+
+
+def test_hands_are_those_with_a_pretrained_policy_unless_policies_are_named(saved):
+    everyone = [(hand, "ours", ("single",)) for hand in pretrained_hands()]
+    assert who(line_up(["hands"], [], "human")) == everyone and len(everyone) == 3
+    named = read_entrants([str(saved("ours")), str(saved("ours", "allegro"))])
+    assert who(line_up(["hands"], named, "human")) == [("human", "ours", ("single",)), ("allegro", "ours", ("single",))]
+
+
+def test_a_method_without_a_policy_is_named_and_no_error(saved):
+    given = read_entrants([f"no-feedforward={saved('no-feedforward')}"])
+    found = line_up(["ablation"], given, "human")
+    assert who(found) == [("human", "ours", ("single",)), ("human", "no-feedforward", ("single",))]
+    absent = [(one.hand, one.method, one.reason) for one in found.missing]
+    assert absent == [("human", name, "not trained") for name in ABLATION if name not in ("ours", "no-feedforward")]
+
+
+def test_a_policy_is_evaluated_once_for_all_its_tables(saved):
+    given = read_entrants([str(saved("ours"))])
+    found = line_up(["single", "composed", "hands", "ablation", "single"], given, "human")
+    assert who(found) == [("human", "ours", ("single", "composed"))]
+    assert who(line_up(["composed"], [], "allegro")) == [("allegro", "ours", ("composed",))]
+
+
+def test_a_folder_stands_for_the_policies_of_its_runs(saved, tmp_path):
+    for method in ("ours", "two-phase"):
+        saved(method)
+    assert [one.method for one in read_entrants([str(tmp_path)])] == ["ours", "two-phase"]
+    assert [one.method for one in read_entrants([str(tmp_path / "human-ours")])] == ["ours"]
+
+
+def test_a_method_that_does_not_learn_takes_any_policys_hand(saved):
+    (one,) = read_entrants([f"pd={saved('ours')}"])
+    assert one.method == "pd" and one.policy.task.control.finger_scale == 0.0
+
+
+@pytest.mark.parametrize(
+    ("texts", "words"),
+    [
+        (["graspxl={ours}"], "is of the method 'ours', not 'graspxl'"),
+        (["levitate={ours}"], "no method 'levitate'"),
+        (["{ours}", "{other}"], "Two policies are of the hand 'human' and the method 'ours'"),
+        (["{empty}"], "holds no policy.safetensors"),
+        (["/nonexistent/policy.safetensors"], "cannot be read"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(saved, tmp_path, texts, words):
+    (tmp_path / "empty").mkdir()
+    names = {"ours": saved("ours"), "other": saved("ours", folder="other"), "empty": tmp_path / "empty"}
+    with pytest.raises(CongraspError, match=words):
+        read_entrants([text.format(**names) for text in texts])

@@ -1,0 +1,172 @@
+"""Objects in pools: each gets its share, what cannot be used is counted, and a stopped evaluation goes on."""
+
+import types
+
+import numpy as np
+import pytest
+
+from actors.env import metric_names
+from common.config import NetworkConfig, RunConfig
+from common.errors import CongraspError
+from common.objects import procedural
+from common.objects.store import Catalogue
+from services.evaluate import unseen
+from services.evaluate.scores import Sample
+from services.evaluate.unseen import Loaded, Pools, evaluate_objects, folder_pools, procedural_pools
+from services.train.command import untrained
+
+CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
+POLICY = untrained(CONFIG)
+OBJECTS = procedural.generate_many(5, 1_000_000)
+SETTINGS = {"physics": "native", "batch": 0, "threads": 1, "seed": 0, "friction": 1.0}
+
+
+class Running:
+    """In place of `Episodes`: of every pool that it gets, whether all the rest was made for the same one."""
+
+    batch = 4
+
+    def __init__(self, bundle, task, objects, *, field, **settings):
+        self.pools = [objects]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
+
+    def replace_objects(self, objects, field):
+        self.pools.append(objects)
+
+
+@pytest.fixture
+def simulated(monkeypatch):
+    """Stands in for engine and constraints; lists the pools that were simulated."""
+    done = []
+
+    def plan_row(task, bank, objects, name, episodes):
+        assert bank == [obj.name for obj in objects] and name == "heading"
+        index = np.tile(np.arange(len(objects)), episodes // len(objects))
+        return types.SimpleNamespace(episodes=index, total=len(index))
+
+    def simulate(running, index, total, progress, stressed):
+        done.append(([obj.name for obj in running.pools[-1]], stressed))
+        progress(total)
+        values = {name: np.ones(total, np.float32) for name in metric_names(CONFIG.task)}
+        values |= {"object_index": index.astype(np.float32), "clean": np.zeros(total, np.float32)}
+        return Sample(values, np.ones((total, 1, 2), np.float16), np.ones((total, 1, 3), np.float16))
+
+    monkeypatch.setattr(unseen, "Episodes", Running)
+    monkeypatch.setattr(unseen, "build_bank", lambda hand, task, objects, seed: [obj.name for obj in objects])
+    monkeypatch.setattr(unseen, "plan_row", plan_row)
+    monkeypatch.setattr(unseen, "batches", lambda hand, task, bank, plan, seed, size: plan.episodes)
+    monkeypatch.setattr(unseen, "simulate", simulate)
+    return done
+
+
+def pools_of(*groups, left_out=()):
+    """Pools of these objects; `left_out` belongs to the first."""
+    makes = [lambda i=i, group=group: Loaded(group, [] if i else list(left_out)) for i, group in enumerate(groups)]
+    return Pools("test", max(map(len, groups)), makes)
+
+
+def test_every_object_has_the_same_episodes_whichever_pool_it_is_in(simulated):
+    told = []
+    pools = pools_of(OBJECTS[:3], OBJECTS[3:], left_out=["broken"])
+    whole, *groups = evaluate_objects(POLICY, pools, 11, **SETTINGS, progress=told.append)
+    assert {obj["episodes"] for obj in whole.objects} == {2}
+    assert [obj["name"] for obj in whole.objects] == [obj.name for obj in OBJECTS]
+    assert (whole.episodes, whole.covered, whole.pool, whole.success) == (10, 5, 6, 1.0)
+    assert told == [6, 12]  # the second pool is filled up, and what fills it does not count
+    by_size = [row for row in groups if row.group.split(" ")[0] in ("small", "medium", "large")]
+    assert sum(row.episodes for row in by_size) == 10
+    assert sum(row.episodes for row in groups if row.group.startswith("family")) == 10
+    assert whole.paper.success == 0.927
+    assert [stressed for _, stressed in simulated] == [200, 194]
+
+
+def test_sizes_masses_and_families_are_those_of_the_objects(simulated):
+    _, *groups = evaluate_objects(POLICY, pools_of(OBJECTS[:2], OBJECTS[2:4]), 4, **SETTINGS)
+    for row in groups:
+        if row.group.startswith("family"):
+            names = {obj["name"] for obj in row.objects}
+            assert names == {obj.name for obj in OBJECTS[:4] if f"family {obj.family}" == row.group}
+    heaviest = max(OBJECTS[:4], key=lambda obj: obj.mass).name
+    (heavy,) = [row for row in groups if row.group.startswith("heavy")]
+    assert heaviest in {obj["name"] for obj in heavy.objects}
+
+
+def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
+    whole = evaluate_objects(POLICY, pools_of(OBJECTS[:2], OBJECTS[2:4]), 8, **SETTINGS)
+    simulated.clear()
+
+    def stop():
+        raise KeyboardInterrupt
+
+    first = pools_of(OBJECTS[:2], OBJECTS[2:4])
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_objects(POLICY, first._replace(make=[first.make[0], stop]), 8, **SETTINGS, keep=tmp_path)
+    assert len(simulated) == 1
+    again = first._replace(make=[stop, first.make[1]])  # the first is not even made
+    rows = evaluate_objects(POLICY, again, 8, **SETTINGS, keep=tmp_path)
+    assert [row.to_json() for row in rows] == [row.to_json() for row in whole]
+    assert [names for names, _ in simulated] == [[o.name for o in OBJECTS[:2]], [o.name for o in OBJECTS[2:4]]]
+    evaluate_objects(POLICY, first, 8, **{**SETTINGS, "seed": 1}, keep=tmp_path)
+    assert len(simulated) == 4  # other settings: both anew
+    (tmp_path / "pool-00001.safetensors").write_bytes(b"cut off")
+    evaluate_objects(POLICY, first, 8, **{**SETTINGS, "seed": 1}, keep=tmp_path)
+    assert len(simulated) == 5
+
+
+def test_no_more_than_the_next_pool_is_made_ahead(simulated):
+    made, ahead = [], []
+
+    def make(i):
+        made.append(i)
+        return Loaded(OBJECTS[:1], [])
+
+    pools = Pools("test", 1, [lambda i=i: make(i) for i in range(5)])
+    evaluate_objects(POLICY, pools, 5, **SETTINGS, progress=lambda done: ahead.append(len(made) - len(simulated)))
+    assert made == [0, 1, 2, 3, 4] and max(ahead) <= 1
+
+
+def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(simulated, monkeypatch, caplog):
+    lost = OBJECTS[1].name
+
+    def build_bank(hand, task, objects, seed):
+        names = [obj.name for obj in objects]
+        if lost in names:
+            raise CongraspError(f"The object '{lost}' cannot be approached.")
+        return names
+
+    def headings_of(task, obj, seed, given, scale):
+        if obj.name == lost:
+            raise CongraspError("no heading")
+
+    monkeypatch.setattr(unseen, "build_bank", build_bank)
+    monkeypatch.setattr(unseen, "headings_of", headings_of)
+    whole, *_ = evaluate_objects(POLICY, pools_of(OBJECTS[:3], OBJECTS[1:2]), 6, **SETTINGS)
+    assert [obj["name"] for obj in whole.objects] == [OBJECTS[0].name, OBJECTS[2].name]
+    assert (whole.covered, whole.pool) == (2, 4) and lost in caplog.text
+    with pytest.raises(CongraspError, match="None of the objects can be approached"):
+        evaluate_objects(POLICY, pools_of(OBJECTS[1:2]), 6, **SETTINGS)
+
+
+def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch):
+    monkeypatch.setattr(unseen, "_MESHES", 2)
+    for obj in OBJECTS:
+        Catalogue(tmp_path).add(obj)
+    pools = folder_pools(tmp_path, "native")
+    (tmp_path / f"{sorted(obj.name for obj in OBJECTS)[-1]}.safetensors").write_bytes(b"damaged")
+    loaded = [make() for make in pools.make]
+    assert pools.size == 2 and [len(one.objects) for one in loaded] == [2, 2, 0]
+    assert [one.left_out for one in loaded] == [[], [], [sorted(obj.name for obj in OBJECTS)[-1]]]
+
+
+def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
+    monkeypatch.setitem(unseen._MOST, False, 2)
+    pools = procedural_pools(5, "native", 1_000_000)
+    objects = [make().objects for make in pools.make]
+    assert pools.size == 2 and [len(pool) for pool in objects] == [2, 2, 2]
+    names = [obj.name for pool in objects for obj in pool]
+    assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000)]

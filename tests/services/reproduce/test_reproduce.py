@@ -1,0 +1,126 @@
+"""The command from end to end on a few episodes, what a second start repeats, and what it refuses."""
+
+import json
+
+import pytest
+
+from common.config import NetworkConfig, RunConfig
+from common.errors import CongraspError
+from common.policy import bundle as bundles
+from services.cli.main import load
+from services.evaluate.lineup import read_entrant
+from services.reproduce import evaluation, run
+from services.reproduce.evaluation import Numbers, Result
+from services.reproduce.plan import Policy
+from services.train.command import untrained
+from tests.pages import Reader
+from tests.rows import row
+
+OURS = Policy("human", "ours")
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    """In the full system's place, with a network that compiles quickly."""
+    path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
+    bundles.save(untrained(RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))), path)
+    return path
+
+
+@pytest.mark.timeout(480)
+def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, tmp_path, capsys, monkeypatch):
+    command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy), "--out", str(tmp_path)]
+    command += ["--episodes", "3", "--pool", "3", "--physics", "native"]
+    assert load("reproduce")(command)() == 0
+    first, printed = json.loads((tmp_path / "reproduction.json").read_text()), capsys.readouterr().out
+    names = ["human-ours-single", "human-ours-composed", "human-ours-objects"]
+    assert [part["name"] for part in first["parts"]] == names
+    rates = [cell for cell in first["cells"] if cell["quantity"] == "success"]
+    compared = [cell for cell in rates if cell["ours"] is not None]
+    assert f"{len(compared)} of the paper's 47 success rates" in printed and "reproduction.html" in printed
+    assert {cell["table"] for cell in compared} == {"hands", "objects"} and len(compared) >= 7
+    for cell in compared:
+        assert 0.0 <= cell["low"] <= cell["ours"] <= cell["high"] <= 1.0
+        assert cell["difference"] == pytest.approx(cell["ours"] - cell["paper"])
+    assert len(first["not_comparable"]) == len(rates) - len(compared)
+    page = Reader(text := (tmp_path / "reproduction.html").read_text())
+    assert not page.links and len(page.sources) == 7 and "aligned pairs" in text and "--quick trains none" in text
+    assert (tmp_path / "tables.tex").read_text().count(r"\begin{tabular}") == 6
+    assert not list((tmp_path / "tables").glob("*.pools"))
+
+    def never(*arguments, **options):
+        raise CongraspError("This must not be evaluated.")
+
+    monkeypatch.setattr(evaluation, "evaluate_tables", never)
+    assert load("reproduce")(command)() == 0
+    assert capsys.readouterr().out.count("done before") == 3
+    again = json.loads((tmp_path / "reproduction.json").read_text())
+    assert again["cells"] == first["cells"]
+    assert Reader((tmp_path / "reproduction.html").read_text()).sources == page.sources
+    (tmp_path / "tables" / "human-ours-composed.json").write_text("{")
+    assert load("reproduce")(command)() == 1  # what cannot be evaluated does not stop the rest, and is named
+    failed = json.loads((tmp_path / "reproduction.json").read_text())
+    assert failed["failures"] == ["human-ours-composed: This must not be evaluated."]
+    assert [part["name"] for part in failed["parts"]] == [names[0], names[2]]
+    with pytest.raises(CongraspError, match=r"Nothing could be evaluated.*must not be"):
+        load("reproduce")([*command, "--seed", "1"])()
+
+
+def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, tmp_path, monkeypatch):
+    """A method whose training fails is named with the reason, and the others are evaluated."""
+    asked = []
+
+    def train_all(folder, wanted, **options):
+        asked.extend(wanted)
+        return {one: "it failed" for one in wanted}
+
+    def evaluate_part(part, entrant, numbers, out, track):
+        asked.append(part.name)
+        constraint = "heading" if part.table == "single" else "pose+trajectory"
+        made = row(constraint, 0.9, 0.8, 0.95, hand=entrant.hand, method=entrant.method)
+        return Result(part, "hands", [made], {"pictures": [], "seconds": 1.0}, True)
+
+    monkeypatch.setattr(run.training, "train_all", train_all)
+    monkeypatch.setattr(run, "evaluate_part", evaluate_part)
+    request = run.Request(
+        out=tmp_path, hands=("human", "allegro"), methods=("pd", "graspxl"), given={OURS: read_entrant(policy)},
+        captured=(), quick=False, options=(), patience=1.0, command="congrasp reproduce",
+    )  # fmt: skip
+    numbers = Numbers(3, 3, 6, "native", 0, 1.0)
+    account = run.reproduce(request, numbers, lambda text, total: lambda done: None)
+    what = {one.name: text for one, text in account.policies}
+    assert asked[:2] == [Policy("allegro", "ours"), Policy("human", "graspxl")]
+    assert asked[2:6] == ["human-ours-single", "human-pd-single", "human-ours-composed", "human-ours-noise"]
+    assert what["human-ours"].startswith("policy.safetensors, version 0") and what["human-pd"] == "needs none"
+    assert what["allegro-ours"] == what["human-graspxl"] == "none: it failed"
+    assert what["human-dgrasp"] == "none: it was not asked for"
+    assert account.failures == ["it failed", "it failed"] and (tmp_path / "reproduction.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--hands", "human", "--methods", "levitate"], "no method 'levitate'"),
+        (["--quick", "--hands", "allegro", "--policy", "{policy}"], "is of the hand 'human' and the method 'ours'"),
+        (["--hands", "human", "--methods", "pd"], "human-ours must be trained first, and this machine has no GPU"),
+        (["--quick", "--hands", "paw"], "no hand 'paw'"),
+        (["--out", "{policy}"], "is the file"),
+        (["--patience", "0"], "--patience is 0"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_begins(policy, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.setattr("services.train.processes.accelerators", lambda: ("cpu", 1))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CongraspError, match=words):
+        load("reproduce")([text.format(policy=policy) for text in arguments])()
+    assert not list(tmp_path.iterdir())
+
+
+def test_captured_sets_are_looked_for_where_the_import_puts_them(policy, tmp_path, capsys, monkeypatch):
+    (tmp_path / "grab" / "objects").mkdir(parents=True)
+    nothing = evaluation.Found(None, [], [], [], [], "")
+    monkeypatch.setattr(evaluation, "evaluate_tables", lambda *arguments, **options: nothing)
+    command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy)]
+    assert load("reproduce")([*command, "--captured", str(tmp_path / "grab"), "--out", str(tmp_path / "out")])() == 1
+    assert "human-ours-grab: " in (printed := capsys.readouterr().out)
+    assert "has no folder 'constraints'" in printed and "congrasp constraints import" in printed

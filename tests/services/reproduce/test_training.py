@@ -1,0 +1,77 @@
+"""Trainings of a reproduction; scripts stand in for them."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from services.cli import main
+from services.reproduce import training
+from services.reproduce.plan import Policy
+from services.train.processes import Child
+
+OURS, GRAPSXL, PHASES = (Policy("human", method) for method in ("ours", "graspxl", "two-phase"))
+FINISHES = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'policy.safetensors').touch()"
+FAILS = "print('compiling'); print('congrasp: error: The disk is full.'); raise SystemExit(2)"
+HANGS = "import time; print('update 3', flush=True); time.sleep(60)"
+
+
+@pytest.fixture
+def scripts(monkeypatch):
+    """What runs for each policy, by name; and all children that were started."""
+    chosen, started = {}, []
+
+    class Script(Child):
+        def start(self):
+            run_dir = self.arguments[self.arguments.index("--run-dir") + 1]
+            started.append(self)
+            with self.log.open("ab") as log:
+                command = [sys.executable, "-c", chosen[self.name], run_dir]
+                self.process = subprocess.Popen(command, stdout=log, stderr=log)
+
+    monkeypatch.setattr(training, "Child", Script)
+    monkeypatch.setattr(training, "_POLL", 0.05)
+    yield chosen, started
+    assert all(child.process.poll() is not None for child in started)
+
+
+@pytest.mark.timeout(60)
+def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tmp_path):
+    chosen, started = scripts
+    chosen |= {OURS.name: FAILS, GRAPSXL.name: HANGS, PHASES.name: FINISHES}
+    began, lines = time.monotonic(), []
+    failures = training.train_all(
+        tmp_path, [OURS, GRAPSXL, PHASES], patience=3.0, progress=lambda policy, line: lines.append((policy, line))
+    )
+    assert set(failures) == {OURS, GRAPSXL} and time.monotonic() - began < 40
+    assert "human-ours failed: The disk is full." in failures[OURS] and "human-ours.log" in failures[OURS]
+    assert "human-graspxl was ended" in failures[GRAPSXL] and (GRAPSXL, "update 3") in lines
+    assert training.trained(tmp_path, OURS) is None and training.seconds(tmp_path, OURS) is None
+    assert training.trained(tmp_path, PHASES) == tmp_path / PHASES.name / "policy.safetensors"
+    assert training.seconds(tmp_path, PHASES) > 0.0
+    assert not any("--resume" in child.arguments for child in started)
+
+
+@pytest.mark.timeout(60)
+def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scripts, tmp_path):
+    chosen, started = scripts
+    chosen |= {OURS.name: FINISHES.replace("p.mkdir(); ", ""), GRAPSXL.name: FINISHES}
+    (tmp_path / OURS.name / "checkpoints").mkdir(parents=True)
+    (tmp_path / OURS.name / "checkpoints" / "checkpoint_00000003.safetensors").touch()
+    (tmp_path / GRAPSXL.name).mkdir()
+    (tmp_path / GRAPSXL.name / "config.json").touch()
+    assert training.train_all(tmp_path, [OURS, GRAPSXL], options=["--updates", "9"], patience=20.0) == {}
+    ours, graspxl = (child.arguments for child in started)
+    assert "--resume" in ours and ours[-2:] == ["--updates", "9"] and "--preset" not in ours
+    assert "--resume" not in graspxl and not (tmp_path / GRAPSXL.name / "config.json").exists()
+
+
+@pytest.mark.parametrize("policy", [OURS, GRAPSXL, Policy("allegro", "ours")], ids=lambda policy: policy.name)
+def test_its_command_lines_are_those_of_train(policy, tmp_path):
+    name, *arguments = training.command(tmp_path, policy, ["--environments", "32768"])
+    train = main._parsed(name, main.load(name), arguments)
+    config = train.keywords["config"]
+    assert (config.task.hand, config.environments) == (policy.hand, 32768)
+    assert train.keywords["method"] == (None if policy.method == "ours" else policy.method)
+    assert train.keywords["run_dir"] == tmp_path and train.keywords["evaluation"] == 0
