@@ -74,7 +74,8 @@ class ZenohTransport:
           credentials: everything goes over mutual TLS with these; one that listens allows each role what
             `common.transport.security` gives it, and nothing else.
           longest_rollout: bytes of the longest rollout that one that listens takes; by default `max_message`.
-          revocation_seconds: how often one that listens looks whether certificates have been revoked.
+          revocation_seconds: how often it looks whether certificates have been revoked. One that listens then makes
+            all connections anew; one that connects is closed if it is connected to the owner of one of these.
 
         Raises:
           CongraspError: an endpoint or key is malformed, a port is in use, or the certificates are not accepted.
@@ -110,6 +111,8 @@ class ZenohTransport:
         if listen and credentials:
             follow = zenoh_session.follow_revocations
             self._sessions.start(follow, self._sessions, credentials, known, revocation_seconds)
+        elif credentials:
+            self._sessions.start(zenoh_session.heed_revocations, self._sessions, credentials, revocation_seconds)
 
     def serve(
         self,
@@ -233,6 +236,8 @@ class ZenohTransport:
     def _session(self, key: str) -> zenoh.Session:
         """The session of the flow that a key belongs to."""
         session = self._sessions.get(flow(key))
+        if self._sessions.failure:
+            raise self._sessions.failure
         if session is None:
             raise TransportError(
                 "The transport is closed."
