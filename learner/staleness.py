@@ -2,15 +2,15 @@
 
 An actor asks for a ticket before it makes a rollout. A ticket is granted while
 
-    accepted + running < (max_staleness + version + 1) * batch
+    accepted + awaited < (max_staleness + version + 1) * batch
 
 (AReaL, arXiv 2505.24298, section on staleness control), where `version` counts the updates, `accepted` all rollouts
-that its updates have used or that wait for one, and `running` the tickets that are out. So nothing is made that could
-only be thrown away, unless its actor is slow. A rollout that arrives more than `max_staleness` versions after the
-policy that made it is refused, and dropped if it grows that old while it waits.
+that its updates have used or that wait for one, and `awaited` the tickets that are out and whose rollouts are waited
+for. So nothing is made that could only be thrown away, unless its actor is slow. A rollout that arrives more than
+`max_staleness` versions after the policy that made it is refused, and dropped if it grows that old while it waits.
 
-A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes. Who gets one, and until when,
-also depends on what has come of earlier ones (`learner.tickets`).
+A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes. Who gets one, until when, and
+how long it is waited for also depends on what has come of earlier ones (`learner.tickets`).
 
 The lag of a rollout is the number of updates between the policy that acted and the current one. A learner that resumes
 from a checkpoint gives its policy a new number; what acted under the versions before is measured from the checkpoint's:
@@ -145,7 +145,7 @@ class StalenessManager:
         with self._lock:
             # Every version stands for one batch; so a resumed run, or an update of another size, leaves no debt.
             accepted = self._version * self._batch + self._in_update + self.queued
-            return (self._max_staleness + self._version + 1) * self._batch - accepted - self.running
+            return (self._max_staleness + self._version + 1) * self._batch - accepted - self._awaited()
 
     def grant(self, owner: Owner, ticket_id: str) -> Ticket | None:
         """A ticket, or None if there is none now; asking again with the same id returns the same ticket."""
@@ -191,17 +191,19 @@ class StalenessManager:
           beyond_capacity: without a ticket it need not fit: it had been admitted before.
         """
         with self._lock:
+            self._expire()
             if self.is_stale(version) or version > self._version:
+                if ticket := self._known(owner, ticket_id):
+                    self._budget.measure(owner[0], self._clock() - ticket.granted)
                 self.refuse_stale(owner, ticket_id)
                 return "stale"
-            self._expire()
             if (owner, ticket_id) not in self._tickets and self.capacity <= 0 and not beyond_capacity:
                 # Perhaps its ticket is of a session before: one of its owner's present ones does as well. Otherwise an
                 # actor with one upload at a time would hold the place that its own rollout waits for.
                 ticket_id = next((other for of, other in self._tickets if of == owner), "")
                 if not ticket_id:
                     return "full"
-            if ticket := self._tickets.get((owner, ticket_id)) or self._expired.pop((owner, ticket_id), None):
+            if ticket := self._known(owner, ticket_id):
                 self._budget.deliver(owner[0], self._clock() - ticket.granted)
             self.redeem(owner, ticket_id)
             self._counters.accepted += 1
@@ -290,6 +292,16 @@ class StalenessManager:
         """Notes how many rollouts the run has lost with updates that died with a killed learner."""
         with self._lock:
             self._counters.undone = count
+
+    def _awaited(self) -> int:
+        """Tickets whose rollouts are waited for."""
+        self._expire()
+        now = self._clock()
+        return sum(self._budget.holds_place(t.owner[0], now - t.granted) for t in self._tickets.values())
+
+    def _known(self, owner: Owner, ticket_id: str) -> Ticket | None:
+        """A ticket that is out, or one that has expired, which is forgotten then."""
+        return self._tickets.get((owner, ticket_id)) or self._expired.pop((owner, ticket_id), None)
 
     def _expire(self) -> None:
         now = self._clock()

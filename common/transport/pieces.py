@@ -1,8 +1,9 @@
 """Long replies in pieces, which whoever asked fetches one after another, at the pace of its own link.
 
-The first piece is short; its attachment holds a token and the length of the whole. The rest is asked for under the same
-key, by token, offset and length. So nothing that is sent at once is longer than the asker's link takes in a moment, and
-a reader who is slow or stopped costs the process that serves it nothing but pieces that are dropped.
+The first piece is short, or as long as the asker wishes who has had pieces of that length before: a reply that is no
+longer comes whole. The attachment of any other holds a token and the length of the whole. The rest is asked for under
+the same key, by token, offset and length. So nothing that is sent at once is longer than the asker's link takes in a
+moment, and a reader who is slow or stopped costs the process that serves it nothing but pieces that are dropped.
 """
 
 import contextlib
@@ -17,11 +18,13 @@ from common.errors import TransportError
 
 _SHORTEST, _FIRST, _LONGEST = 8 << 10, 32 << 10, 4 << 20  # bytes of a piece
 _FAST, _SLOW = 0.1, 0.4  # seconds of a piece below which the next is longer, and above which it is shorter
-_TIMEOUT = 1.0  # seconds until a piece counts as lost
+TIMEOUT = 1.0
+"""Seconds until a piece counts as lost."""
 _PAUSE = 0.05  # seconds to wait after a piece that was lost or put off
 _TOKEN = 8
 _HEAD = struct.Struct(f"<{_TOKEN}sQ")
 _REQUEST = struct.Struct(f"<{_TOKEN}sQI")
+_WISH = struct.Struct("<I")
 
 Ask = Callable[[bytes, float], bytes | None]
 """(request, seconds) -> the piece, or None if there is none now."""
@@ -31,6 +34,14 @@ class Pace:
     """How long pieces may be: longer while they come quickly, and remembered from one reply to the next."""
 
     def __init__(self) -> None:
+        self._length = _FIRST
+
+    def wish(self) -> bytes | None:
+        """Attachment of a query whose reply may begin with a longer piece; None before there has been one."""
+        return _WISH.pack(self._length) if self._length > _FIRST else None
+
+    def lost(self) -> None:
+        """Takes in that a longer first piece did not come: begins anew."""
         self._length = _FIRST
 
     def request(self, token: bytes, offset: int) -> bytes:
@@ -55,9 +66,25 @@ class Outbox:
         self._lock = threading.Lock()
         self._kept: OrderedDict[bytes, bytes] = OrderedDict()
 
-    def first(self, payload: bytes) -> tuple[bytes, bytes | None]:
-        """The first piece of a reply, and its attachment; None if it is the whole."""
-        if len(payload) <= _FIRST:
+    @contextlib.contextmanager
+    def first(self, payload: bytes, attachment: bytes, account: str) -> Iterator[tuple[bytes, bytes | None]]:
+        """Around the sending of a reply: its first piece, and the attachment of that; None if it is the whole.
+
+        Args:
+          payload: the whole.
+          attachment: of the query.
+          account: whose it is. It has no long first piece while it has others on their way.
+        """
+        longest = min(_WISH.unpack(attachment)[0], _LONGEST) if len(attachment) == _WISH.size else 0
+        if len(payload) <= _FIRST or longest <= _FIRST:
+            yield self._cut(payload, _FIRST)
+            return
+        with self.turn(account) as mine:
+            yield self._cut(payload, longest if mine else _FIRST)
+
+    def _cut(self, payload: bytes, longest: int) -> tuple[bytes, bytes | None]:
+        """The first piece of a reply, which is kept if that is not the whole, and its attachment."""
+        if len(payload) <= longest:
             return payload, None
         with self._lock:
             token = next((token for token, kept in self._kept.items() if kept is payload), None)
@@ -66,7 +93,7 @@ class Outbox:
             self._kept.move_to_end(token)
             if len(self._kept) > self._most:
                 self._kept.popitem(last=False)
-        return payload[:_FIRST], _HEAD.pack(token, len(payload))
+        return payload[:longest], _HEAD.pack(token, len(payload))
 
     @contextlib.contextmanager
     def turn(self, account: str) -> Iterator[bool]:
@@ -123,7 +150,7 @@ def fetch(head: bytes, first: bytes, ask: Ask, pace: Pace, *, most: int, timeout
         began = time.monotonic()
         if began >= deadline:
             raise TransportError(f"Only {have} of {size} bytes of a reply came in time.")
-        piece = ask(pace.request(token, have), min(_TIMEOUT, deadline - began))
+        piece = ask(pace.request(token, have), min(TIMEOUT, deadline - began))
         ended = time.monotonic()
         pace.note(ended - began, came=piece is not None)
         if piece is None:

@@ -148,6 +148,10 @@ class Sessions:
     """The sessions of a transport, what was declared in them, and the threads that are inside them.
 
     A thread that is inside Zenoh when the interpreter ends aborts the process, so closing waits for all of them.
+
+    Attributes:
+      closed: set once they are closed.
+      failure: why, if nobody asked for it.
     """
 
     def __init__(self) -> None:
@@ -159,6 +163,7 @@ class Sessions:
         self._changed = threading.Condition()
         self._reopening = threading.RLock()
         self.closed = threading.Event()
+        self.failure: CongraspError | None = None
 
     def open(self, name: Flow, opener: Callable[[], zenoh.Session]) -> None:
         """Opens a flow's session."""
@@ -204,6 +209,9 @@ class Sessions:
             for name, opener in self._openers.items():
                 if not self.closed.is_set():
                     self._open[name] = opener()
+            if self.closed.is_set():  # by another thread, which saw no more than the sessions that were open then
+                self.close()
+                return
             for declaration in self._declarations:
                 self._start_all(declaration)
 
@@ -229,9 +237,11 @@ class Sessions:
     def close(self) -> None:
         """Closes the sessions, and waits a moment for the threads."""
         self.closed.set()
+        deadline = time.monotonic() + _CLOSE
+        if self._reopening.acquire(timeout=_CLOSE):
+            self._reopening.release()
         sessions = list(self._open.values())
         self._open.clear()
-        deadline = time.monotonic() + _CLOSE
         for session in sessions:
             try:
                 self.start(session.close)
@@ -240,6 +250,10 @@ class Sessions:
         join(self._threads, deadline)
         with self._changed:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
+
+    def peers(self) -> set[str]:
+        """Common names of the certificates that those at the other ends show."""
+        return {str(link.auth_identifier) for session in list(self._open.values()) for link in session.info.links()}
 
     def _start_all(self, declaration: _Declaration) -> None:
         """Declares in the present session, and starts the threads; a TransportError if there is no session."""
@@ -270,3 +284,26 @@ def follow_revocations(sessions: Sessions, credentials: Credentials, known: froz
             known = listed
         except CongraspError as error:  # tried again at the next look
             _log.error("The list of revoked certificates is not in effect: %s", error)
+
+
+def heed_revocations(sessions: Sessions, credentials: Credentials, period: float) -> None:
+    """Closes the sessions of one that connects once who listens there shows a revoked certificate.
+
+    Args:
+      sessions: of the one that connects.
+      credentials: its own.
+      period: seconds between two looks.
+    """
+    while not sessions.closed.wait(period):
+        try:
+            with sessions.inside(), contextlib.suppress(zenoh.ZError):
+                if found := sorted(sessions.peers() & credentials.revoked()):
+                    sessions.failure = CongraspError(
+                        f"The certificate {found[0]} of who listens there is revoked.",
+                        "Connect anew once it has another one (congrasp certs issue).",
+                    )
+        except CongraspError as error:  # tried again at the next look
+            _log.error("Whether the other end is revoked cannot be seen: %s", error)
+        if sessions.failure:
+            _log.error("%s", sessions.failure)
+            sessions.close()

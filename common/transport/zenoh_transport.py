@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, Self
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from common.errors import CongraspError, TransportError, error_of
+from common.errors import CongraspError, RefusedError, TransportError, error_of
 from common.transport import pieces, zenoh_session
 from common.transport.base import Admission, Answerer, Damage, Subscription
 from common.transport.keys import FLOWS, Flow, account, flow
@@ -34,6 +34,7 @@ from common.transport.zenoh_session import Sessions, first_line
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 _QUEUE = 256  # samples that wait for a thread that only moves them on
+_FEW = 4 << 10  # bytes of a query that may be sent twice
 _STAMP = struct.Struct("<8sQ")  # sender and count, by which a listener sees gaps
 _REVOCATION_SECONDS = 5.0  # between two looks at the list of revoked certificates
 _log = logging.getLogger(__name__)
@@ -74,7 +75,8 @@ class ZenohTransport:
           credentials: everything goes over mutual TLS with these; one that listens allows each role what
             `common.transport.security` gives it, and nothing else.
           longest_rollout: bytes of the longest rollout that one that listens takes; by default `max_message`.
-          revocation_seconds: how often one that listens looks whether certificates have been revoked.
+          revocation_seconds: how often it looks whether certificates have been revoked. One that listens then makes
+            all connections anew; one that connects is closed if it is connected to the owner of one of these.
 
         Raises:
           CongraspError: an endpoint or key is malformed, a port is in use, or the certificates are not accepted.
@@ -110,6 +112,8 @@ class ZenohTransport:
         if listen and credentials:
             follow = zenoh_session.follow_revocations
             self._sessions.start(follow, self._sessions, credentials, known, revocation_seconds)
+        elif credentials:
+            self._sessions.start(zenoh_session.heed_revocations, self._sessions, credentials, revocation_seconds)
 
     def serve(
         self,
@@ -137,11 +141,30 @@ class ZenohTransport:
                 return None
             return reply.payload if reply.head else None
 
-        reply = self._ask(key, self._encode(request), None, timeout)
+        reply = self._first(key, self._encode(request), timeout)
         whole = reply.payload
         if reply.head:
             whole = pieces.fetch(reply.head, whole, ask, self._pace, most=self._max_message, timeout=timeout)
         return decode(whole, max_bytes=self._max_message)
+
+    def _first(self, key: str, payload: bytes, timeout: float) -> _Reply:
+        """Asks for a reply, or for its first piece; raises as `query` does.
+
+        What is asked in few words is asked again if a longer piece than the shortest does not come.
+        """
+        wish = self._pace.wish() if len(payload) <= _FEW else None
+        if wish is not None:
+            began = time.monotonic()
+            try:
+                reply = self._ask(key, payload, wish, min(timeout, pieces.TIMEOUT))
+            except RefusedError:
+                raise
+            except TransportError:
+                self._pace.lost()
+            else:
+                self._pace.note(time.monotonic() - began, came=False)
+                return reply
+        return self._ask(key, payload, None, timeout)
 
     def _ask(self, key: str, payload: bytes | None, attachment: bytes | None, timeout: float) -> _Reply:
         """Asks once; raises as `query` does."""
@@ -233,6 +256,8 @@ class ZenohTransport:
     def _session(self, key: str) -> zenoh.Session:
         """The session of the flow that a key belongs to."""
         session = self._sessions.get(flow(key))
+        if self._sessions.failure:
+            raise self._sessions.failure
         if session is None:
             raise TransportError(
                 "The transport is closed."
@@ -275,7 +300,7 @@ def _serve(queries: Any, server: _Server) -> None:
         key = str(query.key_expr)
         wanted = query.attachment.to_bytes() if query.attachment else b""
         if not pieces.is_request(wanted):
-            _reply(query, key, functools.partial(_answer, query, key, server), server.outbox)
+            _reply(query, key, functools.partial(_answer, query, key, server), server.outbox, wanted)
         else:
             with contextlib.suppress(zenoh.ZError, CongraspError), query, server.outbox.turn(account(key)) as mine:
                 if mine and server.admission(key) is None:
@@ -294,7 +319,9 @@ def _answer(query: Any, key: str, server: _Server) -> Message | Future[Message]:
     return server.handler(key, request)
 
 
-def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]], outbox: Outbox) -> None:
+def _reply(
+    query: Any, key: str, outcome: Callable[[], Message | Future[Message]], outbox: Outbox, attachment: bytes
+) -> None:
     """Answers a query with what a function returns, once it is there, or with message and code of what it raises.
 
     The message is the error's payload, and the code the schema of its encoding.
@@ -303,7 +330,7 @@ def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]
     try:
         result = outcome()
         if isinstance(result, Future):
-            result.add_done_callback(lambda done: _reply(query, key, done.result, outbox))
+            result.add_done_callback(lambda done: _reply(query, key, done.result, outbox, attachment))
             return
         payload = encode(result)
     except CongraspError as error:
@@ -316,8 +343,8 @@ def _reply(query: Any, key: str, outcome: Callable[[], Message | Future[Message]
             encoding = zenoh.Encoding.TEXT_PLAIN.with_schema(code)
             query.reply_err(message.encode(errors="replace"), encoding=encoding)
         else:
-            piece, head = outbox.first(payload)
-            query.reply(key, piece, attachment=head)
+            with outbox.first(payload, attachment, account(key)) as (piece, head):
+                query.reply(key, piece, attachment=head)
 
 
 def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:

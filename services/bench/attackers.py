@@ -24,6 +24,7 @@ _SILENT = 300
 _HUGE = 60 << 20
 _PULLS = 83.0  # a second
 _FOREVER = 3600.0
+_BURST = 0.001  # seconds of processor time
 
 
 def unread(endpoint: str, run: str, query: bytes) -> None:
@@ -93,8 +94,19 @@ def huge(endpoint: str, run: str, query: bytes) -> None:
     time.sleep(_FOREVER)
 
 
+def burn(endpoint: str, run: str, query: bytes) -> None:
+    """Harms nobody: takes the share of a processor that the file names, and talks to nobody."""
+    share = float(query)
+    print("began", flush=True)
+    while True:
+        began = time.thread_time()
+        while (spent := time.thread_time() - began) < _BURST:
+            pass
+        time.sleep(spent / share - spent)
+
+
 KINDS: dict[str, Callable[[str, str, bytes], None]] = {
-    "unread": unread, "greedy": greedy, "silent": silent, "huge": huge,
+    "unread": unread, "greedy": greedy, "silent": silent, "huge": huge, "burn": burn,
 }  # fmt: skip
 
 

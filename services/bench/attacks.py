@@ -6,20 +6,26 @@ weights of 3.5 MB after every second one. Attackers (`services.bench.attackers`)
 """
 
 import contextlib
-import itertools
+import functools
+import math
 import multiprocessing
+import os
 import pathlib
 import socket
+import statistics
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
+from rich.console import Console
+from rich.table import Table
 
 from actors.link import ActorLink
 from common.errors import CongraspError
@@ -32,7 +38,7 @@ from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from services.serve.client import PolicyClient
-from services.serve.load import Example, example_episode, serving, wait_until_ready
+from services.serve.load import Example, example_episode, processor_seconds, serving, wait_until_ready
 from services.train.command import untrained
 from services.train.presets import get_preset
 
@@ -44,30 +50,69 @@ _PACE = 0.05  # seconds in which an actor makes a rollout
 _PERIOD = 0.01  # seconds between two queries of a client
 _SLOW = 400e3  # bytes a second of a slow actor's link
 _START = 180.0  # seconds that processes may take to start
+_SETTLE = 1.0  # seconds of an attack that are not measured
+ON_SERVER = {"unread": 2, "silent": 1, "huge": 1}
+"""Attacks on a policy server, and how many of each there are."""
+ON_LEARNER = {"greedy": 1, "greedy-3": 3, "silent-learner": 1, "slow": 1, "slow-3": 3}
+"""Attacks on a learner."""
+_SERVER_FIGURES = {"p99 of a query, ms": 2, "answers a second": 0, "a new connection, ms": 0, "server, MB": 0}
+_LEARNER_FIGURES = {"rollouts a second": 1, "updates a second": 1, "longest pause, s": 2}
+"""What is measured, with the digits that are printed."""
+_DEFINITION = (
+    "Same cores: beside processes that only take as much processor time as the attackers did, and talk to nobody. "
+    "Figures are medians."
+)
 
 
-class Row(NamedTuple):
-    """What honest peers had alone, and beside an attack."""
-
-    attack: str
-    unit: str
-    alone: float
-    attacked: float
-    note: str
+Measure = Callable[[], Sequence[float]]
+Attack = Callable[[], contextlib.AbstractContextManager[Sequence[subprocess.Popen | BaseProcess]]]
+"""Begins an attack, and gives the attackers' processes."""
 
 
-def bench_attacks(seconds: float) -> None:
-    """Prints a table of all attacks, each measured for `seconds` and compared with as long without it."""
-    print(f"{'beside':34} {'honest':26} {'alone':>8} {'beside':>8} {'ratio':>6}", flush=True)
-    for row in itertools.chain(_on_the_server(seconds), _on_the_learner(seconds)):
-        ratio = row.attacked / row.alone
-        print(
-            f"{row.attack:34} {row.unit:26} {row.alone:8.2f} {row.attacked:8.2f} {ratio:6.2f}  {row.note}", flush=True
-        )
+class Found(NamedTuple):
+    """What honest peers had: medians, an entry for each figure that is measured."""
+
+    alone: np.ndarray
+    burnt: np.ndarray
+    """Beside processes that do nothing but take as much processor time as the attackers did."""
+    attacked: np.ndarray
+    cores: float
+    """Processor time that the attackers took, in cores."""
+
+
+def bench_attacks(seconds: float, turns: int, kinds: Sequence[str]) -> None:
+    """Prints a table of attacks, each beside the same honest work alone, and beside its processor time alone.
+
+    Args:
+      seconds: length of each measurement.
+      turns: measurements of each, alternating; medians count.
+      kinds: of `ON_SERVER` and `ON_LEARNER`; all of them if none is named.
+
+    Raises:
+      CongraspError: a kind is unknown; something did not start.
+    """
+    if unknown := set(kinds) - {*ON_SERVER, *ON_LEARNER}:
+        known = ", ".join((*ON_SERVER, *ON_LEARNER))
+        raise CongraspError(f"There is no attack '{min(unknown)}'.", f"Choose from: {known}.")
+    console = Console(width=140)
+    table = Table(title=f"{turns} x {seconds:g} s; load average {os.getloadavg()[0]:.1f}", caption=_DEFINITION)
+    for column in ("beside", "honest", "alone", "same cores", "attacked", "ratio to alone", "to same cores", "cores"):
+        table.add_column(column, justify="right" if table.columns[1:] else "left")
+    for chosen, measured in ((ON_SERVER, _on_the_server), (ON_LEARNER, _on_the_learner)):
+        wanted = [name for name in chosen if name in (kinds or chosen)]
+        for name, what, found in measured(wanted, seconds, turns) if wanted else ():
+            for i, (unit, digits) in enumerate(what.items()):
+                figures = [f"{value[i]:.{digits}f}" for value in found[:3]]
+                ratios = [f"{found.attacked[i] / max(value[i], 1e-9):.2f}" for value in (found.alone, found.burnt)]
+                table.add_row(name, unit, *figures, *ratios, f"{found.cores:.2f}")
+                console.print(f"{name}: {unit} {' / '.join(figures)}, ratios {' and '.join(ratios)}")
+    console.print(table)
 
 
 @contextlib.contextmanager
-def attacked(kind: str, endpoint: str, run: str, query: pathlib.Path | None = None, count: int = 1) -> Iterator[None]:
+def attacked(
+    kind: str, endpoint: str, run: str, query: pathlib.Path | None = None, count: int = 1
+) -> Iterator[Sequence[subprocess.Popen]]:
     """Attackers of a kind, in processes of their own, while the block runs."""
     command = [sys.executable, "-m", "services.bench.attackers", kind, endpoint, run, str(query or "")]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) for _ in range(count)]
@@ -76,17 +121,50 @@ def attacked(kind: str, endpoint: str, run: str, query: pathlib.Path | None = No
             assert process.stdout is not None
             if not process.stdout.readline():
                 raise CongraspError(f"The attacker '{kind}' did not start.")
-        yield
+        yield processes
     finally:
         for process in processes:
             process.kill()
             process.wait()
 
 
+def _compare(measure: Measure, attack: Attack, turns: int) -> Found:
+    """What is measured alone, beside an attack, and beside as much processor time, in turns."""
+    alone, burnt, beside, cores = [], [], [], []
+    for _ in range(turns):
+        alone.append(measure())
+        with attack() as processes:
+            time.sleep(_SETTLE)
+            began, spent = time.monotonic(), _processor_seconds(processes)
+            beside.append(measure())
+            cores.append((_processor_seconds(processes) - spent) / (time.monotonic() - began))
+        with _burning(cores[-1]):
+            time.sleep(_SETTLE)
+            burnt.append(measure())
+    medians = [np.median(values, axis=0) for values in (alone, burnt, beside)]
+    return Found(medians[0], medians[1], medians[2], statistics.median(cores))
+
+
+def _processor_seconds(processes: Sequence[subprocess.Popen | BaseProcess]) -> float:
+    """Processor time that processes have taken."""
+    return sum(processor_seconds(process.pid) for process in processes if process.pid)
+
+
+@contextlib.contextmanager
+def _burning(cores: float) -> Iterator[None]:
+    """Processes that take so many cores in all while the block runs."""
+    count = math.ceil(cores)
+    with tempfile.TemporaryDirectory() as folder:
+        share = pathlib.Path(folder, "share")
+        share.write_text(str(max(cores, 0.001) / max(1, count)))
+        with attacked("burn", "", "", share, count):
+            yield
+
+
 # --- a policy server and its clients ---
 
 
-def _on_the_server(seconds: float) -> Iterator[Row]:
+def _on_the_server(kinds: Sequence[str], seconds: float, turns: int) -> Iterator[tuple[str, dict[str, int], Found]]:
     """What a client's queries, and a new client's connection, take beside each attack on the policy server."""
     with tempfile.TemporaryDirectory() as folder:
         policy, query = pathlib.Path(folder, "policy.safetensors"), pathlib.Path(folder, "query")
@@ -97,17 +175,17 @@ def _on_the_server(seconds: float) -> Iterator[Row]:
                 wait_until_ready(client)
                 query.write_bytes(_long_query(client, episode))
                 _latencies(client, episode, 1.0)
-                for kind, count in (("unread", 2), ("silent", 1), ("huge", 1)):
-                    alone = _latencies(client, episode, seconds)
-                    before = _connecting(endpoint)
-                    with attacked(kind, endpoint, "policy", query if kind == "unread" else None, count):
-                        time.sleep(1.0)
-                        times, after = _latencies(client, episode, seconds), _connecting(endpoint)
+
+                def measure() -> list[float]:
+                    times = _latencies(client, episode, seconds)
                     memory = psutil.Process(process).memory_info().rss / 1e6
-                    name = f"{count} x {kind}"
-                    note = f"{len(times)} of {len(alone)} answers, server {memory:.0f} MB"
-                    yield Row(name, "p99 of a query, ms", _p99(alone), _p99(times), note)
-                    yield Row(name, "a new connection, ms", 1e3 * before, 1e3 * after, "")
+                    return [_p99(times), len(times) / seconds, 1e3 * _connecting(endpoint), memory]
+
+                for kind in kinds:
+                    attack = functools.partial(
+                        attacked, kind, endpoint, "policy", query if kind == "unread" else None, ON_SERVER[kind]
+                    )
+                    yield f"{ON_SERVER[kind]} x {kind}", _SERVER_FIGURES, _compare(measure, attack, turns)
 
 
 def _p99(times: list[float]) -> float:
@@ -154,14 +232,8 @@ def _long_query(client: PolicyClient, episode: Example) -> bytes:
 # --- a learner and its actors ---
 
 
-def _on_the_learner(seconds: float) -> Iterator[Row]:
+def _on_the_learner(kinds: Sequence[str], seconds: float, turns: int) -> Iterator[tuple[str, dict[str, int], Found]]:
     """What an honest actor's rollouts and the run's updates come to beside each attack on the learner."""
-    attacks: dict[str, Callable[[str], contextlib.AbstractContextManager[Any]]] = {
-        "1 x greedy": lambda endpoint: attacked("greedy", endpoint, _RUN),
-        "3 x greedy": lambda endpoint: attacked("greedy", endpoint, _RUN, count=3),
-        "1 x silent": lambda endpoint: attacked("silent", endpoint, _RUN),
-        "an actor of 400 kB/s": _slow_actor,
-    }
     spawn = multiprocessing.get_context("spawn")
     endpoint, updates, rollouts, pause = local_url(), spawn.Value("i", 0), spawn.Value("i", 0), spawn.Value("d", 0.0)
     roles = (_learn, (endpoint, updates)), (_act, (endpoint, "honest", rollouts, pause))
@@ -169,32 +241,34 @@ def _on_the_learner(seconds: float) -> Iterator[Row]:
     try:
         for process in processes:
             process.start()
-        deadline = time.monotonic() + _START
-        while not rollouts.value:
-            if time.monotonic() > deadline:
-                raise CongraspError("The learner or the actor did not start.")
-            time.sleep(0.1)
+        _until_made(rollouts)
 
-        def rates() -> tuple[float, float, float]:
+        def measure() -> list[float]:
             pause.value = 0.0
             before, began = (rollouts.value, updates.value), time.monotonic()
             time.sleep(seconds)
             spent = time.monotonic() - began
-            return (rollouts.value - before[0]) / spent, (updates.value - before[1]) / spent, pause.value
+            return [(rollouts.value - before[0]) / spent, (updates.value - before[1]) / spent, pause.value]
 
-        for name, attack in attacks.items():
-            alone = rates()
-            with attack(endpoint):
-                time.sleep(1.0)
-                beside = rates()
-            note = (
-                f"updates {beside[1]:.1f} of {alone[1]:.1f} a second, longest pause {beside[2]:.2f} ({alone[2]:.2f}) s"
-            )
-            yield Row(name, "rollouts a second", alone[0], beside[0], note)
+        for kind in kinds:
+            count = ON_LEARNER[kind]
+            name = kind.partition("-")[0]
+            attack: Attack = functools.partial(attacked, name, endpoint, _RUN, None, count)
+            attack = functools.partial(_slow_actors, endpoint, count) if name == "slow" else attack
+            yield f"{count} x {name}", _LEARNER_FIGURES, _compare(measure, attack, turns)
     finally:
         for process in processes:
             process.kill()
             process.join()
+
+
+def _until_made(rollouts: Any) -> None:
+    """Waits for an actor's first rollout."""
+    deadline = time.monotonic() + _START
+    while not rollouts.value:
+        if time.monotonic() > deadline:
+            raise CongraspError("The learner or the actor did not start.")
+        time.sleep(0.1)
 
 
 def _learn(endpoint: str, updates: Any) -> None:
@@ -237,19 +311,26 @@ def _act(endpoint: str, name: str, rollouts: Any, pause: Any) -> None:
 
 
 @contextlib.contextmanager
-def _slow_actor(endpoint: str) -> Iterator[None]:
-    """An honest actor behind a link of 400 kB/s, while the block runs."""
+def _slow_actors(endpoint: str, count: int) -> Iterator[Sequence[BaseProcess]]:
+    """Honest actors, each behind a link of 400 kB/s of its own, while the block runs; all have made a rollout."""
     spawn = multiprocessing.get_context("spawn")
-    with throttled(endpoint, _SLOW) as slow:
-        arguments = slow, "slow", spawn.Value("i", 0), spawn.Value("d", 0.0)
-        process = spawn.Process(target=_act, args=arguments, daemon=True)
-        process.start()
+    with contextlib.ExitStack() as stack:
+        made = [(spawn.Value("i", 0), spawn.Value("d", 0.0)) for _ in range(count)]
+        links = [stack.enter_context(throttled(endpoint, _SLOW)) for _ in made]
+        processes = [
+            spawn.Process(target=_act, args=(link, f"slow{number}", *made[number]), daemon=True)
+            for number, link in enumerate(links)
+        ]
         try:
-            time.sleep(5.0)
-            yield
+            for process in processes:
+                process.start()
+            for rollouts, _ in made:
+                _until_made(rollouts)
+            yield processes
         finally:
-            process.kill()
-            process.join()
+            for process in processes:
+                process.kill()
+                process.join()
 
 
 @contextlib.contextmanager

@@ -78,22 +78,27 @@ def shutdown(tries: int = 100, within: float = 45.0, seed: int = 0) -> int:
     return 0 if bench_shutdown(tries, within, seed) else 1
 
 
-def security(repeats: int = 5, seconds: float = 10.0) -> int:
+def security(repeats: int = 5, seconds: float = 5.0, turns: int = 3, attacks: tuple[str, ...] = ()) -> int:
     """What mutual TLS with access control costs beside plain TCP, and what hostile and slow peers cost honest ones.
 
     Over the loopback interface. The flood is 1 MB of rubbish at a time, as fast as it is answered. The attacks are in
-    services/bench/attackers.py; each is measured beside the same honest work alone.
+    services/bench/attackers.py; each is measured beside the same honest work alone, and beside processes that take as
+    much processor time and do nothing else.
 
     Args:
-      repeats: Measurements of each cost, alternating; medians are printed.
+      repeats: Measurements of each cost, alternating; medians are printed. 0 for none.
       seconds: Length of each measurement beside an attack; 0 for none.
+      turns: Measurements beside each attack, alternating; medians are printed.
+      attacks: On a policy server: unread, silent, huge. On a learner: greedy, greedy-3, silent-learner, slow, slow-3.
+        All of them if none is named.
     """
     from services.bench.attacks import bench_attacks
     from services.bench.security import bench_security
 
-    bench_security(repeats)
+    if repeats:
+        bench_security(repeats)
     if seconds:
-        bench_attacks(seconds)
+        bench_attacks(seconds, turns, attacks)
     return 0
 
 

@@ -70,8 +70,8 @@ def issue(
 def revoke(folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, run: str | None = None) -> int:
     """Revoke a certificate whose key is lost or stolen: learners and servers let its owner in no more.
 
-    Those on this machine notice within seconds, and all their peers connect anew. Elsewhere, copy the file 'revoked'
-    into the folder of the learner's or server's certificate.
+    Those on this machine notice within seconds, and all their peers connect anew. If it is a learner's or a server's
+    own, those who are connected to it end. Elsewhere, copy the file 'revoked' into the folders of the certificates.
 
     Args:
       folder: Folder of the authority.

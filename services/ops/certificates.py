@@ -161,7 +161,7 @@ def issue(
 
 
 def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = None) -> str:
-    """Revokes a certificate: its common name goes into the list of the authority and of all listeners in its folder.
+    """Revokes a certificate: its common name goes into the list of the authority and of everyone in its folder.
 
     Args:
       folder: of the authority.
@@ -178,7 +178,7 @@ def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = No
     _authority(folder)
     name = str(Identity(run or read(folder / CA_FILE).run, role, number))
     listed = "".join(f"{one}\n" for one in sorted(Credentials(folder, role).revoked() | {name}))
-    for place in (folder, *(path for listener in LISTENERS for path in folder.glob(f"{listener}.*"))):
+    for place in (folder, *(path for one in ROLES for path in folder.glob(f"{one}.*"))):
         part = place / f"{REVOKED_FILE}.part"
         part.write_text(listed)
         part.replace(place / REVOKED_FILE)

@@ -1,15 +1,18 @@
 """Queries that arrive together are answered together: a bounded queue, a worker thread, and none for a lone query.
 
-Peers take turns in the queue, and none may fill more than its part of it: one that asks without end delays the others
-by one query of its own, and is refused when nobody else would be.
+Peers take turns in the queue, and none may fill more than its part of it: one that asks without end is refused when
+nobody else would be. While several peers ask, a long query is answered in parts, one in each batch: it delays the
+others by one part.
 """
 
 import collections
+import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Generic, NamedTuple, TypeVar, cast
+from typing import Generic, NamedTuple, TypeVar
 
 from common.errors import CongraspError, LateError, OverloadedError
 
@@ -17,14 +20,40 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-class _Waiting(NamedTuple):
+_ALONE = 1.0  # seconds without a query of another peer until one counts as alone
+
+
+class Parts(NamedTuple, Generic[T, R]):
+    """How an item is run in parts."""
+
+    most: int
+    """What all that one peer has in a batch may weigh while there are several peers."""
+    cut: Callable[[T, int, int], T]
+    """(item, first, end) -> what weighs `end` - `first` of it."""
+    join: Callable[[T, list[R]], R | Exception]
+    """(item, results of its parts in order) -> its result."""
+
+
+@dataclasses.dataclass(eq=False)
+class _Waiting(Generic[T, R]):
     """An item in the queue; times in seconds of the monotonic clock."""
 
-    item: object
-    peer: str
-    future: Future
+    item: T
+    weight: int
+    future: "Future[R]"
     arrival: float
     deadline: float
+    taken: int = 0
+    """Weight of the parts that have been in a batch."""
+    results: list[R] = dataclasses.field(default_factory=list)
+    """Of those parts."""
+
+
+class _Part(NamedTuple, Generic[T, R]):
+    """What a batch holds of an item."""
+
+    whole: _Waiting[T, R]
+    item: T
 
 
 class Batcher(Generic[T, R]):
@@ -42,6 +71,7 @@ class Batcher(Generic[T, R]):
       depth: most items that wait; one more is refused with `OverloadedError`.
       share: most items of one peer that wait; by default `depth`.
       weigh: an item's weight, which is at most `size`.
+      parts: how items are run in parts; without it each is run whole.
     """
 
     def __init__(
@@ -53,14 +83,16 @@ class Batcher(Generic[T, R]):
         depth: int,
         share: int | None = None,
         weigh: Callable[[T], int] = lambda item: 1,
+        parts: Parts[T, R] | None = None,
     ):
         self._run = run
-        self._weigh = weigh
+        self._weigh, self._parts = weigh, parts
         self._size = size
         self._window = window
         self._depth = depth
         self._share = depth if share is None else share
-        self._queues: collections.OrderedDict[str, collections.deque[_Waiting]] = collections.OrderedDict()
+        self._queues: collections.OrderedDict[str, collections.deque[_Waiting[T, R]]] = collections.OrderedDict()
+        self._latest, self._several_until = "", -math.inf  # peer, and when it will count as alone
         self._changed = threading.Condition()
         self._running = False
         self._expected = 1
@@ -88,11 +120,14 @@ class Batcher(Generic[T, R]):
           OverloadedError: `depth` items wait already, or `share` of this peer.
         """
         now = time.monotonic()
-        waiting = _Waiting(item, peer, Future(), now, now + timeout)
+        waiting: _Waiting[T, R] = _Waiting(item, self._weigh(item), Future(), now, now + timeout)
         with self._changed:
             if self._closed:
                 raise CongraspError("The server is shutting down.")
+            if peer != self._latest:
+                self._several_until, self._latest = (now + _ALONE) if self._latest else -math.inf, peer
             alone = not self._running and not self._queues and self._expected == 1
+            alone = alone and waiting.weight <= self._turn()
             if alone:
                 self._running = True
             else:
@@ -100,7 +135,7 @@ class Batcher(Generic[T, R]):
                 self._queues.setdefault(peer, collections.deque()).append(waiting)
                 self._changed.notify()
         if alone:
-            self._answer([waiting])
+            self._answer([_Part(waiting, item)])
         return waiting.future
 
     def close(self, timeout: float = 2.0) -> None:
@@ -117,29 +152,35 @@ class Batcher(Generic[T, R]):
         for waiting in (one for queue in self._queues.values() for one in queue):
             waiting.future.set_exception(CongraspError("The server is shutting down."))
 
-    def _answer(self, batch: list[_Waiting]) -> None:
-        """Runs a batch without what is late, and gives every item its outcome."""
+    def _answer(self, batch: list[_Part[T, R]]) -> None:
+        """Runs a batch without what is late, and gives every item its outcome once all its parts have run."""
         now = time.monotonic()
-        for waiting in batch:
+        for waiting, _ in batch:
             if waiting.deadline < now:
                 late = f"Too late: the query waited {1e3 * (now - waiting.arrival):.0f} ms, beyond its deadline."
-                waiting.future.set_exception(LateError(late))
-        batch = [waiting for waiting in batch if waiting.deadline >= now]
+                self._fail(waiting, LateError(late))
+        batch = [part for part in batch if part.whole.deadline >= now]
+        results: Sequence[R | Exception]
         try:
-            items = [cast(T, waiting.item) for waiting in batch]
-            results = self._run(items, [now - waiting.arrival for waiting in batch]) if batch else []
+            queued = [now - part.whole.arrival for part in batch]
+            results = self._run([part.item for part in batch], queued) if batch else []
         except Exception as error:
             results = [error] * len(batch)
         with self._changed:
             self._running = False
             self._changed.notify()
-        for waiting, result in zip(batch, results, strict=True):
+        for (waiting, item), result in zip(batch, results, strict=True):
+            if self._parts is not None and item is not waiting.item and not isinstance(result, Exception):
+                waiting.results.append(result)
+                if waiting.taken < waiting.weight:
+                    continue
+                result = self._parts.join(waiting.item, waiting.results)
             if isinstance(result, Exception):
-                waiting.future.set_exception(result)
+                self._fail(waiting, result)
             else:
                 waiting.future.set_result(result)
 
-    def _collect(self) -> list[_Waiting]:
+    def _collect(self) -> list[_Part[T, R]]:
         """The next batch; empty once closed."""
         with self._changed:
             while (self._running or not self._queues) and not self._closed:
@@ -150,16 +191,53 @@ class Batcher(Generic[T, R]):
             until = min(queue[0].arrival for queue in self._queues.values()) + self._window
             while len(self) < self._expected and (rest := until - time.monotonic()) > 0 and not self._closed:
                 self._changed.wait(rest)
-            batch, room = [], self._size
-            while self._queues:
-                peer, queue = next(iter(self._queues.items()))  # whose turn it is
-                weight = self._weigh(cast(T, queue[0].item))
-                if weight > room:
-                    break
-                batch.append(queue.popleft())
-                room -= weight
-                self._queues.move_to_end(peer)
-                if not queue:
-                    del self._queues[peer]
+            batch = self._take()
             self._running, self._expected = True, len(batch)
             return batch
+
+    def _turn(self) -> int:
+        """What one peer may have in a batch."""
+        return self._parts.most if self._parts and time.monotonic() < self._several_until else self._size
+
+    def _take(self) -> list[_Part[T, R]]:
+        """Takes a batch from the queue, one item or part of each peer after the other; the caller holds the lock."""
+        batch: list[_Part[T, R]] = []
+        room, most = self._size, self._turn()
+        turns = collections.Counter[str]()
+        while waiting := [peer for peer in self._queues if turns[peer] < most]:
+            peer = waiting[0]  # whose turn it is
+            queue = self._queues[peer]
+            first = queue[0]
+            weight = first.weight - first.taken
+            if most < self._size:
+                weight = min(weight, most - turns[peer], room)
+            if weight > room or not room:
+                break
+            batch.append(self._part(first, weight))
+            turns[peer] += weight
+            room -= weight
+            self._queues.move_to_end(peer)
+            if first.taken == first.weight:
+                queue.popleft()
+            if not queue:
+                del self._queues[peer]
+        return batch
+
+    def _part(self, waiting: _Waiting[T, R], weight: int) -> _Part[T, R]:
+        """Takes so much of an item."""
+        item, first = waiting.item, waiting.taken
+        waiting.taken += weight
+        if weight < waiting.weight and self._parts is not None:
+            item = self._parts.cut(item, first, waiting.taken)
+        return _Part(waiting, item)
+
+    def _fail(self, waiting: _Waiting[T, R], error: Exception) -> None:
+        """Gives an item an error, and runs no further part of it."""
+        with self._changed:
+            for peer, queue in self._queues.items():
+                if waiting in queue:
+                    queue.remove(waiting)
+                    if not queue:
+                        del self._queues[peer]
+                    break
+        waiting.future.set_exception(error)

@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from common.errors import CongraspError, LateError, OverloadedError, TransportError
 from common.hands import get_hand
 from common.policy import bundle as bundles
@@ -16,7 +18,7 @@ from common.transport.base import Transport
 from common.transport.keys import Keys, account, below
 from common.wire.codec import Message, encode
 from services.ops.logs import log
-from services.serve.batching import Batcher
+from services.serve.batching import Batcher, Parts
 from services.serve.inference import BATCH_SIZES, Inference, PolicyFunction
 from services.serve.requests import Query
 
@@ -28,6 +30,8 @@ DEPTH = 64
 """Queries that wait for the next batch; one more is refused at once."""
 SHARE = 16
 """Queries of one peer among them."""
+TURN = BATCH_SIZES[1] - 1
+"""States of one peer in a batch while there are several: with the one of a control loop the batch is still small."""
 _MAX_TIMEOUT = 60.0
 _FOLLOW_SECONDS = 0.5
 
@@ -88,6 +92,7 @@ class PolicyServer:
             window=WINDOW,
             depth=DEPTH,
             share=SHARE,
+            parts=Parts(TURN, _cut, self._join),
         )
         keys = Keys(run)
         transport.serve(keys.health, lambda key, request: Message({}, self.health()))
@@ -184,6 +189,15 @@ class PolicyServer:
             for answer, waited in zip(answers, queued, strict=True)
         ]
 
+    def _join(self, query: Query, answers: list[_Answered]) -> _Answered | Exception:
+        """The answer to a query that was inferred in parts: by one policy, so anew if it was swapped meanwhile."""
+        inferences, held, queued, inferred = zip(*answers, strict=True)
+        if any(one is not held[-1] for one in held):
+            return self._infer([query], queued[:1])[0]
+        vectors = np.concatenate([inference.vectors for inference in inferences])
+        active = [reasons for inference in inferences for reasons in inference.active]
+        return Inference(vectors, active), held[-1], queued[0], sum(inferred)
+
     def _follow(self) -> None:
         """Swaps in newer policies; one that does not fit is refused and the old one stays."""
         while not self._closed.wait(_FOLLOW_SECONDS):
@@ -206,6 +220,11 @@ class PolicyServer:
             raise CongraspError("The newer policy was trained on another task.", "Start the server anew to serve it.")
         self._held = _hold(newer)
         self._trouble = ""
+
+
+def _cut(query: Query, first: int, end: int) -> Query:
+    """Some states of a query."""
+    return query._replace(vectors=query.vectors[first:end])
 
 
 def _hold(bundle: PolicyBundle) -> _Held:

@@ -12,9 +12,15 @@ from common.transport.keys import account
 from common.transport.pieces import Outbox, Pace, fetch, is_request
 
 
+def _first(outbox, payload, wish=b"", account="a"):
+    """The first piece of a reply and its attachment."""
+    with outbox.first(payload, wish, account) as found:
+        return found
+
+
 def _fetched(outbox, payload, lost=(), **options):
     """A reply that went through an outbox, of which some pieces are lost on the way."""
-    first, head = outbox.first(payload)
+    first, head = _first(outbox, payload)
     if head is None:
         return first
     asked = iter(range(10**9))
@@ -54,14 +60,32 @@ def test_pieces_grow_on_a_fast_link_and_shrink_on_a_slow_one():
 def test_the_same_bytes_are_kept_once_and_what_nobody_fetches_goes_first():
     outbox = Outbox(most=2)
     payloads = [bytes([i]) * (1 << 20) for i in range(3)]
-    heads = [outbox.first(payloads[0])[1], outbox.first(payloads[1])[1]]
-    assert outbox.first(payloads[0])[1] == heads[0]
-    fresh = outbox.first(payloads[2])[1]
+    heads = [_first(outbox, payloads[0])[1], _first(outbox, payloads[1])[1]]
+    assert _first(outbox, payloads[0])[1] == heads[0]
+    fresh = _first(outbox, payloads[2])[1]
     request = lambda head: Pace().request(head[:8], 100)  # noqa: E731
     assert outbox.piece(request(heads[1])) == b""
     assert outbox.piece(request(heads[0])) == payloads[0][100 : 100 + (32 << 10)]
     assert outbox.piece(request(fresh)) == payloads[2][100 : 100 + (32 << 10)]
     assert outbox.piece(Pace().request(fresh[:8], 1 << 40)) == b""
+
+
+def test_a_reply_comes_whole_to_an_asker_that_has_had_pieces_as_long():
+    outbox, pace, payload = Outbox(at_once=1), Pace(), bytes(3 << 20)
+    assert pace.wish() is None and _first(outbox, payload, b"")[0] == payload[: 32 << 10]
+    for _ in range(6):
+        pace.note(0.01, came=True)
+    piece, head = _first(outbox, payload, pace.wish())
+    assert len(piece) == 2 << 20
+    assert fetch(head, piece, lambda request, _: outbox.piece(request), pace, most=1 << 30, timeout=5.0) == payload
+    pace.note(0.01, came=True)
+    assert _first(outbox, payload, pace.wish()) == (payload, None)
+    with outbox.turn("a"):  # one of its pieces is on its way
+        assert len(_first(outbox, payload, pace.wish())[0]) == 32 << 10
+        assert _first(outbox, payload, pace.wish(), account="b") == (payload, None)
+    assert len(_first(outbox, bytes(5 << 20), b"\xff" * 4)[0]) == 4 << 20  # whatever is wished
+    pace.lost()
+    assert pace.wish() is None
 
 
 def test_what_cannot_be_whole_is_an_error_with_a_deadline():
@@ -70,7 +94,7 @@ def test_what_cannot_be_whole_is_an_error_with_a_deadline():
         _fetched(outbox, payload, most=1000)
     with pytest.raises(TransportError, match="Only 32768 of 1048576 bytes"):
         _fetched(outbox, payload, lost=range(10**6), timeout=0.2)
-    first, head = outbox.first(payload)
+    first, head = _first(outbox, payload)
     with pytest.raises(TransportError, match="not kept any more"):
         fetch(head, first, lambda request, seconds: b"", Pace(), most=1 << 30, timeout=1.0)
     with pytest.raises(TransportError, match="not kept any more"):  # longer than announced
@@ -93,7 +117,7 @@ def test_one_account_has_few_pieces_on_their_way():
 def test_a_slow_link_gets_a_long_reply_while_it_makes_progress():
     """The deadline is for each piece: a whole that takes longer than it arrives all the same."""
     outbox, payload = Outbox(), bytes(range(256)) * 1024
-    first, head = outbox.first(payload)
+    first, head = _first(outbox, payload)
 
     def ask(request, seconds):
         time.sleep(0.12)

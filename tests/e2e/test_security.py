@@ -431,6 +431,72 @@ def test_who_is_revoked_is_out_and_the_others_stay(run):
     wait_for(lambda: answers(thief, KEYS.config))  # and let in again once the list is empty
 
 
+ACTOR = """
+import sys
+from actors.link import ActorLink
+from common.errors import CongraspError
+from common.transport import urls
+
+try:
+    transport = urls.connect(sys.argv[1], "actor", certs=sys.argv[2])
+    with transport, ActorLink(transport, "safe", "0.z") as link:
+        link.config(20)
+        print("ready", flush=True)
+        while True:
+            link.acquire_ticket(1.0)
+except CongraspError as error:
+    sys.exit(f"congrasp: error: {error}")
+"""
+"""An actor that does nothing but ask for tickets, and ends as the command does."""
+
+
+def _started(*command):
+    """A process, once it has printed its first line."""
+    process = subprocess.Popen(
+        [sys.executable, *map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline(), process.stderr.read()
+    return process
+
+
+@pytest.fixture
+def forgiven(certs):
+    """Nobody is revoked any more once everything else is closed."""
+    yield
+    for path in certs.rglob("revoked"):
+        path.unlink()
+
+
+def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(forgiven, run, certs):
+    status = ["-m", "services.cli.main", "status", "--watch", "--json", "--run", "safe", "--connect", run.endpoint]
+    processes = _started("-c", ACTOR, run.endpoint, certs / "actor.0"), _started(*status, "--certs", certs)
+    try:
+        with PolicyClient(run.policy, "safe", certs=certs / "client.0") as client:
+            revoke(certs, "learner", 0)
+            for process in processes:
+                _, said = process.communicate(timeout=40)
+                assert process.returncode
+                assert "congrasp: error: The certificate safe.learner.0 of who listens there is revoked" in said
+                assert "Traceback" not in said
+            assert client.health()["ready"]  # the policy server is another
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def test_a_client_of_a_policy_server_that_is_revoked_is_told_so(forgiven, run, certs):
+    client = run.connect("client.0", run.policy, revocation_seconds=0.1)
+    key = KEYS.act_for("0.c")
+    assert answers(client, key)
+    revoke(certs, "server", 0)
+
+    wait_for(client._sessions.closed.is_set)
+    for _ in range(2):
+        with pytest.raises(CongraspError, match=r"safe\.server\.0 of who listens there is revoked"):
+            client.query(key, Message(), timeout=5)
+
+
 def test_a_certificate_for_another_host_is_not_trusted(certs):
     """The learner's certificate names the loopback addresses alone; 127.0.0.2 is another host."""
     port = free_port()

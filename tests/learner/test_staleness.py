@@ -1,6 +1,7 @@
 """Admission: the bound holds, capacity returns, and every rollout is accounted for."""
 
 import math
+import statistics
 import threading
 
 import hypothesis.strategies as st
@@ -167,6 +168,10 @@ class Admission(RuleBasedStateMachine):
         self.fates = {"accepted": 0, "consumed": 0, "dropped": 0, "stale": 0}
         self.next_id = 0
         self.delivered = []  # whose rollouts came in under a ticket
+        self.granted = {}  # (owner, id) -> when
+        self.needed = {name: [] for name in "abc"}  # seconds of every rollout that came under a ticket
+        self.useful = []  # seconds of those that were accepted
+        self.passed_over = set()  # tickets that were not waited for at some time
         self.late = set()  # whose tickets have expired: they may be put off
 
     owners = st.sampled_from([A, B, ("c", "2")])
@@ -185,6 +190,7 @@ class Admission(RuleBasedStateMachine):
             assert self.now + 5 <= ticket.deadline <= self.now + 10
             self.tickets[owner, ticket.id] = ticket.version
             self.deadlines[owner, ticket.id] = ticket.deadline
+            self.granted[owner, ticket.id] = self.now
 
     @precondition(lambda self: self.tickets)
     @rule(data=st.data())
@@ -203,12 +209,16 @@ class Admission(RuleBasedStateMachine):
         if not 0 <= self.staleness.version - version <= self.eta:
             assert verdict == "stale"
             self.fates["stale"] += 1
+            self.needed[key[0][0]] += [self.now - self.granted[key]] if must_fit else []
         elif must_fit or capacity > 0 or (mine := [held for held in self.tickets if held[0] == key[0]]):
             assert verdict == "accepted"
             if not must_fit and capacity <= 0:  # under the oldest of its owner's tickets
                 del self.tickets[mine[0]]
-                must_fit = True
-            self.delivered += [key[0]] if must_fit else []
+                key, must_fit = mine[0], True
+            if must_fit:
+                self.delivered.append(key[0])
+                self.needed[key[0][0]].append(self.now - self.granted[key])
+                self.useful.append(self.now - self.granted[key])
             self.fates["accepted"] += 1
             self.queue.append(version)
         else:
@@ -248,16 +258,23 @@ class Admission(RuleBasedStateMachine):
         self.fates["accepted"] -= len(self.queue)
         self.tickets, self.queue, self.in_update = {}, [], 0
 
+    def awaited(self, key):
+        """Nobody waits for one that takes four times as long as usual, nor for an actor that needs twice as long."""
+        usual = statistics.median(self.useful) if self.useful else math.inf
+        own = statistics.median(self.needed[key[0][0]][-16:] or [0.0])
+        return self.now - self.granted[key] <= 4 * usual and own <= 2 * usual
+
     @invariant()
     def bound_and_books(self):
         counts = self.staleness.counters()
         version = self.staleness.version
-        assert (
-            version * self.batch + self.in_update + len(self.queue) + len(self.tickets)
-            <= (self.eta + version + 1) * self.batch
-        )
+        awaited = sum(map(self.awaited, self.tickets))
+        self.passed_over |= {key for key in self.tickets if not self.awaited(key)}
+        assert version * self.batch + self.in_update + len(self.queue) + len(self.tickets) <= (
+            self.eta + version + 1
+        ) * self.batch + len(self.passed_over)
         assert counts["running"] == len(self.tickets) and counts["queued"] == len(self.queue)
-        assert counts["capacity"] == (self.eta + 1) * self.batch - self.in_update - len(self.queue) - len(self.tickets)
+        assert counts["capacity"] == (self.eta + 1) * self.batch - self.in_update - len(self.queue) - awaited
         assert counts["granted"] == counts["running"] + counts["redeemed"] + counts["returned"] + counts["expired"]
         assert {name: counts[name] for name in self.fates} == self.fates
 

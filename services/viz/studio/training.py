@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError, TransportError
+from common.errors import CongraspError
 from common.task.constraints import CONSTRAINTS
 from common.transport.base import Transport
 from common.transport.keys import Keys
@@ -254,7 +254,7 @@ class Follower:
         while True:
             try:
                 found = statuses.ask(self._transport, self._window.run)
-            except TransportError:
+            except CongraspError:
                 found = None
             self._window.take_status(found, time.time())
             if self._stop.wait(self._every):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.errors import CongraspError, LateError, OverloadedError
-from services.serve.batching import Batcher
+from services.serve.batching import Batcher, Parts
 
 
 class Gate:
@@ -84,6 +84,61 @@ def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
     gate.go.set()
     assert [future.result(10) for future in futures] == [0, 10, 20, 30, 70, 80]
     assert gate.batches == [[0], [1, 7], [2, 8], [3]]
+    batcher.close()
+
+
+@pytest.fixture
+def several(monkeypatch):
+    """However long ago another peer has asked, it counts."""
+    monkeypatch.setattr("services.serve.batching._ALONE", 1e6)
+
+
+class Letters(Gate):
+    """Items are texts, whose letters are what they weigh, and are run one by one."""
+
+    def __call__(self, items, queued):
+        self.entered.release()
+        assert self.go.wait(10)
+        self.batches.append(list(items))
+        return [CongraspError("bad") if "!" in item else item.upper() for item in items]
+
+    def batcher(self):
+        parts = Parts(2, lambda item, first, end: item[first:end], lambda item, results: "".join(results))
+        return Batcher(self, size=8, window=0.0, depth=10, weigh=len, parts=parts)
+
+    def run(self, *items):
+        """Submits (peer, item) while the first is held back; their futures."""
+        batcher, first = self.batcher(), Future()
+        (peer, item), *rest = items
+        threading.Thread(target=lambda: first.set_result(batcher.submit(item, 10.0, peer)), daemon=True).start()
+        assert self.entered.acquire(timeout=10)
+        futures = [batcher.submit(item, 10.0, peer) for peer, item in rest]
+        self.go.set()
+        return [first.result(10), *futures], batcher
+
+
+def test_a_long_item_is_run_in_parts_beside_another_peers(several):
+    gate = Letters()
+    futures, batcher = gate.run(("a", "k"), ("b", "abcdefg"), ("a", "l"), ("b", "hi"), ("a", "mno"))
+    assert [future.result(10) for future in futures] == ["K", "ABCDEFG", "L", "HI", "MNO"]
+    assert gate.batches == [["k"], ["ab", "l", "m"], ["cd", "no"], ["ef"], ["g", "h"], ["i"]]
+    batcher.close()
+
+
+def test_a_peer_that_is_alone_has_its_items_run_whole():
+    gate = Letters()
+    futures, batcher = gate.run(("a", "k"), ("a", "abcdefg"), ("a", "hi"))
+    assert [future.result(10) for future in futures] == ["K", "ABCDEFG", "HI"]
+    assert gate.batches == [["k"], ["abcdefg"], ["hi"]]
+    batcher.close()
+
+
+def test_an_item_of_which_a_part_fails_is_run_no_further(several):
+    gate = Letters()
+    futures, batcher = gate.run(("a", "k"), ("b", "ab!defgh"), ("a", "l"), ("b", "ij"))
+    assert str(futures[1].exception(10)) == "bad"
+    assert [futures[i].result(10) for i in (0, 2, 3)] == ["K", "L", "IJ"]
+    assert gate.batches == [["k"], ["ab", "l"], ["!d"], ["ij"]]
     batcher.close()
 
 

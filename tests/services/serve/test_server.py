@@ -6,6 +6,7 @@ import dataclasses
 import pathlib
 import threading
 import time
+import types
 
 import numpy as np
 import pytest
@@ -28,8 +29,9 @@ from common.transport.zenoh_transport import ZenohTransport
 from common.wire.codec import Message
 from services.ops.metrics import ServerMetrics, exposed
 from services.serve.client import PolicyClient
-from services.serve.inference import PolicyFunction
+from services.serve.inference import Inference, PolicyFunction
 from services.serve.load import example_episode
+from services.serve.requests import Query
 from services.serve.server import DEPTH, PolicyServer, follow_file, follow_run
 from services.train.command import untrained
 from services.train.presets import get_preset
@@ -170,8 +172,15 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
             assert len(set(versions)) > 10
 
 
-def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(served):
+@pytest.mark.parametrize("beside_others", [False, True])
+def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(served, beside_others, monkeypatch):
+    """Beside other clients the eleven are inferred in two parts."""
     _, endpoint, episode = served
+    monkeypatch.setattr("services.serve.batching._ALONE", 1e6 if beside_others else 0.0)
+    if beside_others:
+        with PolicyClient(endpoint, timeout=5.0) as other:
+            other.reset(episode.request)
+            other.act(episode.state)
     poses = [episode.state["q"] + 0.01 * i for i in range(11)]
     states = [{**episode.state, "q": pose, "q_target": pose} for pose in poses]
     alone = []
@@ -187,6 +196,18 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
         for name in ("action", "q_target", "u_target"):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-5, err_msg=name)
     assert np.abs(together[0].q_target - together[10].q_target).max() > 0.01
+
+
+def test_a_query_whose_policy_is_swapped_between_two_parts_is_answered_by_one():
+    old, new = object(), object()
+    part = lambda held, value: (Inference(np.full((2, 3), value), [["x"]] * 2), held, 0.25, 0.5)  # noqa: E731
+    whole = (Inference(np.full((4, 3), 7.0), [["y"]] * 4), new, 0.25, 0.75)
+    server = types.SimpleNamespace(_infer=lambda queries, queued: [whole])
+    query = Query(np.zeros((4, 5), np.float32), ())
+    assert PolicyServer._join(server, query, [part(old, 1.0), part(new, 2.0)]) is whole
+    inference, held, queued, inferred = PolicyServer._join(server, query, [part(new, 1.0), part(new, 2.0)])
+    np.testing.assert_array_equal(inference.vectors[:, 0], [1.0, 1.0, 2.0, 2.0])
+    assert (inference.active, held, queued, inferred) == ([["x"]] * 4, new, 0.25, 1.0)
 
 
 def test_bad_lists_of_states_are_refused(served):
