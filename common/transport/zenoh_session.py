@@ -28,7 +28,7 @@ _LEASE_MS: dict[Flow, int] = {"control": 2500, "bulk": 10000, "log": 10000, "pol
 _BLOCK_US: dict[Flow, int] = {"control": 2_000_000, "bulk": 5_000_000, "log": 1_000_000, "policy": 2_000_000}
 _OVERHEAD = 64 << 10  # bytes that Zenoh may add to a message
 _ATTEMPT = 1.0  # seconds of one attempt to connect; signals are seen between two
-_CLOSE = 0.5  # seconds that closing may take
+_CLOSE = 2.0  # seconds that closing may take: with thousands of tokens on a busy machine it takes more than one
 _REOPEN = 10.0  # seconds that opening anew may take
 _ROOM_US: dict[Flow, int] = {"control": 10_000, "bulk": 50_000, "log": 10_000, "policy": 5_000}
 """Microseconds that an answer waits for room in its reader's link; then all are dropped until there is some."""

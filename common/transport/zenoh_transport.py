@@ -244,7 +244,7 @@ class ZenohTransport:
         self._sessions.declare(flow(key_expression), declare, watch)
 
     def close(self) -> None:
-        """See `Transport.close`; takes half a second at most."""
+        """See `Transport.close`; takes two seconds at most."""
         self._finalizer()
 
     def __enter__(self) -> Self:

@@ -60,7 +60,7 @@ def read_again(run_dir: pathlib.Path) -> Verdict:
     known = {rollout: sums for rollout, sums in used.items() if rollout[:2] in starts}
     return Verdict(
         0 if unreadable else len(lost),
-        sum(len(sums) > 1 for sums in used.values()),
+        0 if unreadable else sum(len(sums) > 1 for sums in used.values()),
         0 if unreadable else sum(rollout not in made for rollout in known),
         sum(any(check != made[rollout][1] for check in sums) for rollout, sums in known.items() if rollout in made),
         unreadable,
@@ -101,12 +101,14 @@ def _walk(book: list[dict[str, Any]], actors: _Actors, used: dict[Rollout, list[
         if "taken" in line:  # the first line of a session that was not killed as it started
             over = _named(line, "taken") | _named(line, "dropped") | _named(line, "spoilt")
             missing = hand - over - settled - unwritten - {rollout for _, rollout, _ in uses}
-            if session.get("kept") and session["epoch"] == begun["epoch"] and not falls_back:
+            if session.get("kept") and session["epoch"] == begun.get("epoch") and not falls_back:
                 near = {r for r in missing if abs(actors.made[r][0] - begun["version"]) <= begun["max_staleness"]}
                 lost |= near
             session, unwritten = begun, set()
             before = settled | {rollout for _, rollout, _ in uses}
-            hand = (actors.kept_by.get(begun["life"], set()) | _named(line, "taken")) & actors.made.keys() - before
+            hand = (
+                actors.kept_by.get(begun.get("life", ""), set()) | _named(line, "taken")
+            ) & actors.made.keys() - before
         newest = line.get("saved", newest)
         unwritten |= _named(line, "unwritten")
         settled |= _named(line, "dropped") | _named(line, "spoilt")

@@ -60,3 +60,24 @@ def test_a_whole_run_with_resumes_and_its_damage(tmp_path):
     path = tmp_path / "audit" / "learner-0.jsonl"
     path.write_bytes(path.read_bytes().replace(b'"used"', b'"usep"', 1))
     assert read_again(tmp_path).unreadable == audit(tmp_path).damaged == 1
+
+
+def test_no_single_damaged_line_is_taken_for_a_loss(tmp_path):
+    """Whichever it is: also the one by which a session begins."""
+    whole_run(tmp_path)
+    for path in (tmp_path / "audit").iterdir():
+        data = path.read_bytes()
+        for line in data.splitlines():
+            path.write_bytes(data.replace(line, line[:-3] + b"#" + line[-2:], 1))
+            second = read_again(tmp_path)
+            assert second[:4] == (0, 0, 0, 0) and second.unreadable == 1, line
+            report = audit(tmp_path)
+            assert report.damaged == 1 and not any(report.counts[name] for name in FAULTS), line
+        path.write_bytes(data)
+
+
+def test_a_session_whose_first_line_is_damaged_can_be_read(run_dir):
+    learner(run_dir, {"taken": [], "dropped": []}, used(0, 1), used(2, 3), END)
+    path = run_dir / "audit" / "learner-0.jsonl"
+    path.write_bytes(b"damaged\n" + path.read_bytes())
+    assert read_again(run_dir) == (0, 0, 0, 0, 1)
