@@ -29,7 +29,7 @@ def policy(tmp_path_factory):
     return path
 
 
-@pytest.mark.timeout(480)
+@pytest.mark.timeout(600)
 def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, tmp_path, capsys, monkeypatch):
     command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy), "--out", str(tmp_path)]
     command += ["--episodes", "3", "--pool", "3", "--physics", "native"]
