@@ -1,6 +1,7 @@
 """Which policies the tables of several compare."""
 
 import dataclasses
+import json
 
 import pytest
 
@@ -9,8 +10,11 @@ from common.errors import CongraspError
 from common.policy import bundle as bundles
 from common.policy.pretrained import pretrained_hands
 from common.task.methods import with_method
+from services.cli.main import load
+from services.evaluate import tables
 from services.evaluate.lineup import ABLATION, line_up, read_entrants
 from services.train.command import untrained
+from tests.rows import row
 
 CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
 
@@ -82,3 +86,30 @@ def test_what_cannot_be_compared_is_refused(saved, tmp_path, texts, words):
     names = {"ours": saved("ours"), "other": saved("ours", folder="other"), "empty": tmp_path / "empty"}
     with pytest.raises(CongraspError, match=words):
         read_entrants([text.format(**names) for text in texts])
+
+
+def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monkeypatch):
+    def evaluate_tables(policy, names, setup, track, *, keep):
+        assert names == ("single",) and setup.episodes == 7
+        return tables.Found(None, [], [], [], [row("heading", 0.9, 0.8, 0.95, method=policy.task.method)], "")
+
+    monkeypatch.setattr(tables, "evaluate_tables", evaluate_tables)
+    files = [str(saved("ours")), f"no-feedforward={saved('no-feedforward')}"]
+    command = ["--table", "ablation", "--policy", *files, "--episodes", "7", "--json", str(tmp_path / "rows.json")]
+    assert load("evaluate")(command)() == 0
+    printed, read = capsys.readouterr().out, json.loads((tmp_path / "rows.json").read_text())
+    assert "2 policies, on held-out procedural objects" in printed and printed.count("not trained") == 3
+    assert [one["method"] for one in read["rows"]] == ["ours", "no-feedforward"]
+    assert [one["method"] for one in read["policies"]] == ["ours", "no-feedforward"]
+    missing = [(one["method"], one["reason"]) for one in read["missing"]]
+    assert missing == [(name, "not trained") for name in ("no-dynamic-center", "single-stage", "two-phase")]
+    assert not (tmp_path / "rows.json.pools").exists()
+
+
+def test_captured_sets_of_one_hand_are_not_evaluated_with_another(monkeypatch, tmp_path):
+    sets = tables.Captured([], None, "human", "captured")
+    monkeypatch.setattr(tables, "captured", lambda folder, split, objects: sets)
+    monkeypatch.setattr("services.assets.objects.named.objects_of", lambda *arguments, **options: [])
+    command = ["--hand", "allegro", "--objects", str(tmp_path), "--constraints", str(tmp_path)]
+    with pytest.raises(CongraspError, match=r"sets are for the hand 'human', the policy for 'allegro'.*--hand allegro"):
+        load("evaluate")(command)()

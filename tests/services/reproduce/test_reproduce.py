@@ -1,10 +1,11 @@
 """The command from end to end on a few episodes, what a second start repeats, and what it refuses."""
 
+import html
 import json
 
 import pytest
 
-from common.config import NetworkConfig, RunConfig
+from common.config import NetworkConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
 from common.policy import bundle as bundles
 from services.cli.main import load
@@ -21,30 +22,38 @@ OURS = Policy("human", "ours")
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    """In the full system's place, with a network that compiles quickly."""
+    """In the full system's place, with a network that compiles quickly; it knows no references, which take long."""
+    task = TaskConfig(constraints=("heading", "affordance"))
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
-    bundles.save(untrained(RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))), path)
+    bundles.save(untrained(RunConfig(task=task, network=NetworkConfig(hidden=(16,), encoder=4))), path)
     return path
 
 
-@pytest.mark.timeout(480)
+@pytest.mark.timeout(600)
 def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, tmp_path, capsys, monkeypatch):
     command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy), "--out", str(tmp_path)]
     command += ["--episodes", "3", "--pool", "3", "--physics", "native"]
-    assert load("reproduce")(command)() == 0
-    first, printed = json.loads((tmp_path / "reproduction.json").read_text()), capsys.readouterr().out
-    names = ["human-ours-single", "human-ours-composed", "human-ours-objects"]
-    assert [part["name"] for part in first["parts"]] == names
+    failed = "human-ours-composed: The method 'ours' has no row in these tables."
+
+    def reproduced():
+        """What the file says after another start, which one part of the three fails."""
+        assert load("reproduce")(command)() == 1
+        return json.loads((tmp_path / "reproduction.json").read_text())
+
+    first, printed = reproduced(), capsys.readouterr().out
+    assert [part["name"] for part in first["parts"]] == ["human-ours-single", "human-ours-objects"]
+    (failure,) = first["failures"]
+    assert failure.startswith(failed) and failed in printed
     rates = [cell for cell in first["cells"] if cell["quantity"] == "success"]
     compared = [cell for cell in rates if cell["ours"] is not None]
     assert f"{len(compared)} of the paper's 47 success rates" in printed and "reproduction.html" in printed
-    assert {cell["table"] for cell in compared} == {"hands", "objects"} and len(compared) >= 7
+    assert {cell["table"] for cell in compared} == {"hands", "objects"} and len(compared) >= 5
     for cell in compared:
         assert 0.0 <= cell["low"] <= cell["ours"] <= cell["high"] <= 1.0
         assert cell["difference"] == pytest.approx(cell["ours"] - cell["paper"])
     assert len(first["not_comparable"]) == len(rates) - len(compared)
     page = Reader(text := (tmp_path / "reproduction.html").read_text())
-    assert not page.links and len(page.sources) == 7 and "aligned pairs" in text and "--quick trains none" in text
+    assert not page.links and len(page.sources) == 2 and "--quick trains none" in text and failed in html.unescape(text)
     assert (tmp_path / "tables.tex").read_text().count(r"\begin{tabular}") == 6
     assert not list((tmp_path / "tables").glob("*.pools"))
 
@@ -52,18 +61,14 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, 
         raise CongraspError("This must not be evaluated.")
 
     monkeypatch.setattr(evaluation, "evaluate_tables", never)
-    assert load("reproduce")(command)() == 0
-    assert capsys.readouterr().out.count("done before") == 3
-    again = json.loads((tmp_path / "reproduction.json").read_text())
-    assert again["cells"] == first["cells"]
+    again, printed = reproduced(), capsys.readouterr().out
+    assert printed.count("done before") == 2 and again["cells"] == first["cells"]
     assert Reader((tmp_path / "reproduction.html").read_text()).sources == page.sources
-    (tmp_path / "tables" / "human-ours-composed.json").write_text("{")
-    assert load("reproduce")(command)() == 1  # what cannot be evaluated does not stop the rest, and is named
-    failed = json.loads((tmp_path / "reproduction.json").read_text())
-    assert failed["failures"] == ["human-ours-composed: This must not be evaluated."]
-    assert [part["name"] for part in failed["parts"]] == [names[0], names[2]]
+    (tmp_path / "tables" / "human-ours-single.json").write_text("{")
+    assert [part["name"] for part in reproduced()["parts"]] == ["human-ours-objects"]
+    command += ["--seed", "1"]
     with pytest.raises(CongraspError, match=r"Nothing could be evaluated.*must not be"):
-        load("reproduce")([*command, "--seed", "1"])()
+        reproduced()
 
 
 def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, tmp_path, monkeypatch):
