@@ -58,7 +58,6 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
-    grasp_frame(hand)  # kept; inside of a trace, it would be compiled operation by operation
     return kept_bank(hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed))
 
 

@@ -293,7 +293,7 @@ class RolloutWorker:
         # One key more than there are steps: what is decided after the last one only yields `last_observation`.
         keys = jax.random.split(key, steps + 1)
         key_data = jax.random.key_data(keys)
-        settings = jax.device_put(self._settings)
+        parameters, settings = _on_device((parameters, self._settings))
         assert self.state is not None
         decision = self._decide_jit(parameters, settings, self.state, keys[0])
         state = self.state._replace(scene=())

@@ -4,6 +4,7 @@ Everything is in the wrist frame. A link's frame at zero has the wrist frame's o
 `common.hands.spec.link_origin`.
 """
 
+import concurrent.futures
 import functools
 from typing import NamedTuple
 
@@ -133,8 +134,9 @@ def _points(hand: Hand, q: Array) -> Array:
 @functools.cache
 def grasp_frame(hand: Hand) -> GraspFrame:
     """The grasp frame of the open hand; v is the direction from the wrist to the centre, made orthogonal to w."""
-    with jax.ensure_compile_time_eval():
-        points = np.asarray(_points(hand, jnp.array(hand.q_open)))
+    # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
+    with concurrent.futures.ThreadPoolExecutor(1) as thread:
+        points = thread.submit(lambda: np.asarray(_points(hand, np.array(hand.q_open, np.float32)))).result()
     tips = points[len(hand.links) :]
     center = 0.5 * (tips[0] + tips[1:].mean(0))
     across = tips[1:].mean(0) - tips[0]

@@ -92,7 +92,7 @@ def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) 
         rows |= {f"{name}, all threads": f"{total:.2f}" for name, total in seconds.items()}
         rows["compiled programs"] = str(programs.total())
         rows["of these more than once"] = ", ".join(f"{name} {n}" for name, n in programs.items() if n > 1)
-        rows["first update"] = f"{since_start():.2f}"
+        rows["in all, from the start of the process"] = f"{since_start():.2f}"
         results.send_bytes(json.dumps(rows).encode())
 
     until_first_update(config, physics, threading.Event(), report)

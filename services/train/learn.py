@@ -39,6 +39,7 @@ def learn(
     writers: Sequence[MetricWriter] = (),
     metrics_port: int = 0,
     metrics_host: str = "127.0.0.1",
+    grace: float = GRACE,
 ) -> None:
     """Runs a learner until it is finished or told to stop.
 
@@ -54,6 +55,7 @@ def learn(
       writers: which metric writers get the metrics of rank 0.
       metrics_port: port of a Prometheus endpoint; 0 for none.
       metrics_host: its interface.
+      grace: seconds that the actor inside may take to end.
     """
     rank, transport = 0 if ranks is None else ranks.rank, wire
     with contextlib.ExitStack() as stack:
@@ -72,7 +74,7 @@ def learn(
         if metrics_port:
             stack.enter_context(exposed(metrics_port, metrics_host, metrics))
         if inside is not None:
-            stack.enter_context(_actor_thread(url, config, f"actor-{rank}", inside, stop))
+            stack.enter_context(_actor_thread(url, config, f"actor-{rank}", inside, stop, grace))
         run_learner(
             run_dir,
             config,
@@ -89,7 +91,7 @@ def learn(
 
 @contextlib.contextmanager
 def _actor_thread(
-    url: str, config: RunConfig, name: str, physics: PhysicsName, stop: threading.Event
+    url: str, config: RunConfig, name: str, physics: PhysicsName, stop: threading.Event, grace: float
 ) -> Iterator[None]:
     """An actor in a thread of its own while the block runs; should it fail, it sets `stop`, and its error is raised."""
     failures: list[BaseException] = []
@@ -120,6 +122,6 @@ def _actor_thread(
         ended.set()
         start.cancel()
         if thread.ident is not None:
-            thread.join(GRACE)
+            thread.join(grace)
     if failures:
         raise failures[0]

@@ -12,6 +12,9 @@ from learner.run_directory import create_run
 from services.train.learn import learn
 from services.train.processes import engine_of
 
+_GRACE = 60.0
+"""Seconds for an actor that is in the middle of a rollout: a process that ended meanwhile would abort."""
+
 
 def until_first_update(
     config: RunConfig, physics: PhysicsName, stop: threading.Event, report: Callable[[], None]
@@ -34,4 +37,13 @@ def until_first_update(
         run_dir = pathlib.Path(folder, "run")
         config = dataclasses.replace(config, updates=1)
         create_run(run_dir, config, None)
-        learn(run_dir, config, wire=None, inside=engine_of(physics, False), stop=stop, resume=False, on_update=updated)
+        learn(
+            run_dir,
+            config,
+            wire=None,
+            inside=engine_of(physics, False),
+            stop=stop,
+            resume=False,
+            on_update=updated,
+            grace=_GRACE,
+        )

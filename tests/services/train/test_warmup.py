@@ -10,7 +10,7 @@ from services.train import warmup
 def test_it_ends_with_the_first_update_and_leaves_no_run_behind(monkeypatch):
     seen, events = {}, []
 
-    def learn(run_dir, config, *, wire, inside, stop, resume, on_update):
+    def learn(run_dir, config, *, wire, inside, stop, resume, on_update, grace):
         seen.update(run_dir=run_dir, config=config, inside=inside, stop=stop)
         assert pathlib.Path(run_dir, "config.json").exists()
         for update in range(2):
