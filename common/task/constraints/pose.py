@@ -97,13 +97,13 @@ class Pose(Constraint):
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> PoseGoal:
         """One of the object's reference poses."""
         index = draw.objects, draw.region, draw.reference["pose"]
-        q, *wrist = draw.bank.pose_q[index], draw.bank.pose_position[index], draw.bank.pose_quaternion[index]
+        q, position, quaternion = (getattr(draw.bank, f"pose_{name}")[index] for name in PoseGoal._fields)
         if draw.disturbance is not None:
             finger_key, wrist_key = jax.random.split(key)
             q = disturbed_fingers(hand, q, draw.disturbance, finger_key)
-            wrist = disturbed_wrist(*(part[:, None] for part in wrist), draw.disturbance, wrist_key)
-            wrist = [part[:, 0] for part in wrist]
-        return PoseGoal(q, *wrist)
+            wrist = disturbed_wrist(position[:, None], quaternion[:, None], draw.disturbance, wrist_key)
+            position, quaternion = (part[:, 0] for part in wrist)
+        return PoseGoal(q, position, quaternion)
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
         """The heading becomes that of the reference pose."""
