@@ -217,7 +217,7 @@ class RolloutWorker:
         """The grasps that succeeded since the last call."""
         assert self.state is not None, "no episode was begun"
         grasps = self.state.grasps
-        self.state = self.state._replace(grasps=grasps._replace(found=np.zeros(self.batch, bool)))
+        self.state = self.state._replace(grasps=grasps._replace(found=_on_device(np.zeros(self.batch, bool))))
         return grasps
 
     def collect(self, parameters: Any, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
@@ -230,7 +230,7 @@ class RolloutWorker:
         """
         assert self.state is not None, "no episode was begun"
         self._key, key = _split(self._key)
-        self.state = self.state._replace(has_finished=np.zeros(self.batch, bool))
+        self.state = self.state._replace(has_finished=_on_device(np.zeros(self.batch, bool)))
         if self.physics.compiled:
             return self._collect_compiled(parameters, key, steps)
         return self._collect_stepwise(parameters, key, steps, progress)

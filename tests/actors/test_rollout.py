@@ -257,3 +257,14 @@ def test_an_environment_that_goes_on_keeps_its_contacts_when_another_restarts(ba
     # World 0 begins anew at step 5 and has not touched yet; in the very first step nobody has.
     assert touching[:, 0].tolist() == [False, True, True, True, True, False, True]
     assert touching[:, 1].tolist() == [False] + [True] * 6
+
+
+def test_a_rollout_compiles_once_wherever_its_parameters_are(bank):
+    """Those of the first policy are committed to no device, those of an update are: a start must not compile twice."""
+    worker = _worker(bank)
+    first = jnp.zeros(1)
+    for parameters in (first, jax.device_put(first, jax.local_devices()[0]), np.zeros(1, np.float32)):
+        worker.collect(parameters, 2)
+        worker.restart()
+    programs = worker._decide_jit, worker._advance_jit, worker._sample_jit, worker._with_scene_jit
+    assert [program._cache_size() for program in programs] == [1, 1, 1, 1]
