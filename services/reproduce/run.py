@@ -1,10 +1,13 @@
 """The flow of `congrasp reproduce`: train what is missing, evaluate every part, write the result."""
 
 import dataclasses
+import gc
 import itertools
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
+
+import jax
 
 from actors.physics import resolve_physics
 from common.errors import CongraspError
@@ -112,6 +115,9 @@ def reproduce(
         else:
             results.append(result)
             note(f"{part.name}: {_outcome(result)}")
+            if result.fresh:  # its compiled programs serve no other part
+                jax.clear_caches()
+                gc.collect()
         advance(done)
     if not results:
         raise CongraspError("Nothing could be evaluated.", failures[0] if failures else "Name a hand with a policy.")
