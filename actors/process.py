@@ -121,6 +121,7 @@ class _Actor:
                 # Another incarnation must not repeat the episodes of the one that it replaces.
                 seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
                 half_precision=config.half_observations,
+                staggered=True,
             )
         self._failures = self._failure_weights(bank)
         self._on_rollout = on_rollout

@@ -111,6 +111,7 @@ class RolloutWorker:
         half_precision: bool,
         probe: Probe = lambda scene, index, data: None,
         traced: int | slice = 0,
+        staggered: bool = False,
     ):
         """Starts fresh episodes, if there is a bank.
 
@@ -125,10 +126,12 @@ class RolloutWorker:
           half_precision: observations are rounded to half precision, for the policy as well as for the learner.
           probe: what else to keep of every step.
           traced: of which environments a trace is kept.
+          staggered: the first episodes end early, each at a time of its own, so that short rollouts show all phases of
+            the task from then on.
         """
         self.physics, self.env = physics, GraspEnv(hand, task, physics)
         self._hand, self._task, self._bank, self._policy = hand, task, _on_device(bank), policy
-        self._probe, self._traced, self.batch = probe, traced, batch
+        self._probe, self._traced, self._staggered, self.batch = probe, traced, staggered, batch
         self._dtype = jnp.float16 if half_precision else jnp.float32
         self._settings, self._stationary = self.env.settings, np.array(False)
         self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
@@ -160,15 +163,14 @@ class RolloutWorker:
             self.take_grasps()
 
     def restart(self) -> None:
-        """Fresh episodes in every environment.
-
-        They end early, each at a time of its own, so that short rollouts show all phases of the task from then on.
-        """
+        """Fresh episodes in every environment."""
         self._episode_key, key = _split(self._episode_key)
         conditions = self._sample_jit(self._bank, key, self._stationary)
-        whole = self._task.approach_steps + np.asarray(conditions.hold)
-        share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
-        self.begin(conditions._replace(hold=(conditions.hold - np.floor(share * whole)).astype(np.int32)))
+        if self._staggered:
+            whole = self._task.approach_steps + np.asarray(conditions.hold)
+            share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
+            conditions = conditions._replace(hold=_on_device(np.int32(conditions.hold - np.floor(share * whole))))
+        self.begin(conditions)
 
     def begin(self, conditions: InitialConditions) -> None:
         """Goes on with these episodes, which are about to begin, one for each environment."""

@@ -192,7 +192,7 @@ class Grasp:
             servo, most = self.meta["wrist"][kind], self.control[f"guidance_{kind}_limit"]
             steady = servo["kv"] / servo["kp"] * speed[part]
             wanted = shorten(shorten(ahead[part], most) + residual[part], most)
-            hardest = servo["inertia"] / servo["kp"] * self.control[servo["limit"]]
+            hardest = servo["inertia"] / servo["kp"] * (self.control[servo["limit"]] or np.inf)
             found.append(steady + shorten(wanted - steady, hardest))
         return np.concatenate(found)
 

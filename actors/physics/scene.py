@@ -61,7 +61,7 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     # A hundredth of a millimetre: in single precision the default of a micrometre is hardly ever reached.
     spec.option.ccd_tolerance = 1e-5
     spec.option.ccd_iterations = 16
-    add_hand(spec, hand, self_collision=task.hand_self_collision)
+    add_hand(spec, hand, self_collision=task.hand_self_collision, contact_time=task.contact_time)
     table = spec.worldbody.add_body(name="table", mocap=True)
     table.add_geom(
         name="table",

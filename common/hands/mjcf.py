@@ -6,14 +6,15 @@ import mujoco
 import numpy as np
 
 from common.hands.spec import Hand, Link, link_origin
-from common.objects.mjcf import CONTACT
 
 HAND_CONTYPE = 1
 """Collision bit of the hand: whatever collides with it has this bit in its conaffinity."""
 WRIST_JOINTS = ("wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz")
 
 
-def add_hand(spec: mujoco.MjSpec, hand: Hand, *, self_collision: bool = False) -> mujoco.MjsBody:
+def add_hand(
+    spec: mujoco.MjSpec, hand: Hand, *, self_collision: bool = False, contact_time: float = 0.006
+) -> mujoco.MjsBody:
     """Adds the hand under a fixed body `hand_base` and returns that body.
 
     The base carries three slides (x, y, z) and three hinges (intrinsic x-y-z) of the first link; their origin is the
@@ -21,6 +22,7 @@ def add_hand(spec: mujoco.MjSpec, hand: Hand, *, self_collision: bool = False) -
     compensated, because the wrist is a virtual mount.
 
     With `self_collision` links collide with one another, without friction, except neighbours and `overlapping` pairs.
+    All contacts of the hand have the time constant `contact_time` in seconds, whatever they are with.
     """
     base = spec.worldbody.add_body(name="hand_base")
     bodies: dict[str, mujoco.MjsBody] = {}
@@ -46,7 +48,7 @@ def add_hand(spec: mujoco.MjSpec, hand: Hand, *, self_collision: bool = False) -
                 armature=joint.armature,
             )
             _add_position_actuator(spec, joint.name, joint.kp, joint.kv, joint.torque_limit)
-        _add_capsules(body, link, origin, self_collision)
+        _add_capsules(body, link, origin, self_collision, contact_time)
     if self_collision:
         for first, second in overlapping(hand):
             spec.add_exclude(bodyname1=first, bodyname2=second)
@@ -68,7 +70,7 @@ def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
             body.add_freejoint()
         for joint in link.joints:
             body.add_joint(name=joint.name, axis=joint.axis, pos=joint.anchor)
-        _add_capsules(body, link, np.zeros(3), True)
+        _add_capsules(body, link, np.zeros(3), True, 0.02)
     model = spec.compile()
     data = mujoco.MjData(model)
     found: set[tuple[int, int]] = set()
@@ -112,7 +114,9 @@ def _add_position_actuator(spec: mujoco.MjSpec, joint: str, kp: float, kv: float
     actuator.set_to_position(kp, kv=kv)
 
 
-def _add_capsules(body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_collision: bool) -> None:
+def _add_capsules(
+    body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_collision: bool, contact_time: float
+) -> None:
     """Adds a link's capsules, which share its mass by their volumes."""
     lengths = [np.linalg.norm(np.subtract(c.end, c.start)) + 4 / 3 * c.radius for c in link.capsules]
     shares = np.array([length * c.radius**2 for length, c in zip(lengths, link.capsules, strict=True)])
@@ -126,6 +130,7 @@ def _add_capsules(body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_col
             contype=HAND_CONTYPE,
             conaffinity=HAND_CONTYPE if self_collision else 0,
             condim=1,  # between links; against the object the greater of two decides, which is the object's
-            solref=CONTACT.solref,
+            solref=(contact_time, 1.0),
+            solmix=1000.0,  # against others' 1, so that it decides
             friction=(0.1, 0.005, 0.0001),  # MuJoCo takes the greater of two: the object's friction decides
         )

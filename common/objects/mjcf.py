@@ -21,7 +21,7 @@ class ContactSettings:
     """Sliding (dimensionless), torsional (m) and rolling (m) friction."""
     condim: int = 3
     """Dimensions of a contact."""
-    solref: tuple[float, float] = (0.006, 1.0)
+    solref: tuple[float, float] = (0.012, 1.0)
     """Time constant (s) and damping ratio of the contact's spring."""
     solimp: tuple[float, float, float, float, float] = (0.9, 0.95, 0.001, 0.5, 2.0)
     """Impedance: MuJoCo's default."""

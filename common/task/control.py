@@ -82,10 +82,10 @@ def _lead(ahead: Array, residual: Array, steady: Array, farthest: Array | float,
       residual: (B, 3) what the action adds.
       steady: (B, 3) kv v / kp.
       farthest: length of the lead.
-      hardest: m / kp times the greatest acceleration.
+      hardest: m / kp times the greatest acceleration; 0 for any.
     """
     wanted = _limit(_limit(ahead, farthest) + residual, farthest)
-    return steady + _limit(wanted - steady, hardest)
+    return steady + _limit(wanted - steady, jnp.where(jnp.asarray(hardest) > 0, hardest, jnp.inf))
 
 
 def _finger_guidance(scene: Scene, rate: float) -> Array:

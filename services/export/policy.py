@@ -112,7 +112,7 @@ def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
             "scale": control.wrist_position_scale if i < 3 else control.wrist_rotation_scale,
             "target": "joint + lead; lead = steady + limit(limit(limit(guidance - joint, L) + scale * action, L) "
             "- steady, inertia / kp * A), steady = kv / kp * velocity, limit shortens the three slides or hinges "
-            "together; L: guidance_..._limit, A: 'limit' of 'wrist', both of the task's control",
+            "together; L: guidance_..._limit, A: 'limit' of 'wrist' (0: none), both of the task's control",
         }
         for i, name in enumerate(WRIST_JOINTS)
     ]

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 from common.config import (
+    ControlConfig,
     CurriculumConfig,
     NetworkConfig,
     ObjectsConfig,
@@ -20,6 +21,10 @@ HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
 """Families that the human hand fails most often to hold by a part; twice as many of them are trained on."""
 SMOOTH_FAMILIES = ("ellipsoid", "teapot", "mug", "cylinder")
 """Families that Allegro fails most often to hold by a part, likewise."""
+ARM = ControlConfig(wrist_acceleration=15.0, wrist_angular_acceleration=150.0)
+"""The wrist moves as an arm does."""
+CONTACT_TIME = 0.006
+"""Seconds; the task's default is what the pretrained policies learnt with."""
 
 PRESETS = {
     # Minutes on two CPU cores; `easier` lists what that takes.
@@ -28,7 +33,9 @@ PRESETS = {
         environments=64,
         updates=50,
         physics="native",
-        task=TaskConfig(headings="above", p_affordance=0.0, p_pose=0.0, p_trajectory=0.0),
+        task=TaskConfig(
+            headings="above", p_affordance=0.0, p_pose=0.0, p_trajectory=0.0, control=ARM, contact_time=CONTACT_TIME
+        ),
         objects=ObjectsConfig(count=16),
         network=NetworkConfig(hidden=(256, 128)),
         ppo=PPOConfig(minibatches=8),
@@ -38,7 +45,14 @@ PRESETS = {
         name="human",
         environments=4096,
         updates=600,
-        task=TaskConfig(hold_steps_max=200, p_affordance=0.6, mass_range=(0.8, 1.25), friction_range=(0.8, 1.2)),
+        task=TaskConfig(
+            hold_steps_max=200,
+            p_affordance=0.6,
+            mass_range=(0.8, 1.25),
+            friction_range=(0.8, 1.2),
+            control=ARM,
+            contact_time=CONTACT_TIME,
+        ),
         # Grasps first, then the precision with which constraints are met: with the second weights from the beginning
         # trajectories are not learnt.
         curriculum=CurriculumConfig(

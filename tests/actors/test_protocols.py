@@ -183,8 +183,8 @@ def lifted(action: np.ndarray, protocol: Protocol | None, steps: int):
 def test_a_lift_is_unseen_by_the_policy_and_takes_the_wrist_along():
     action = np.zeros((BATCH, len(HAND.joints) + 6), np.float32)
     masses = tuple(obj.mass for obj in OBJECTS)
-    still = lifted(action, None, 120)
-    moving = lifted(action, protocol(start=50, masses=masses), 120)  # when the wrist has come to its guidance
+    still = lifted(action, None, 150)
+    moving = lifted(action, protocol(start=80, masses=masses), 150)  # when the wrist has come to its guidance
     for (scene, features, frame, after), (other, others, none, _) in zip(moving, still, strict=True):
         assert not np.any(none.height)
         # What is seen is the same within half a millimetre: targets are held for a control step each.
@@ -268,18 +268,19 @@ def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
 
 
 def test_attempts_with_a_lift_end_higher_in_the_world():
-    task = dataclasses.replace(TASK, approach_steps=10, hold_steps=5)
+    task = dataclasses.replace(TASK, approach_steps=30, hold_steps=5)
     policy = untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,))))
     obj, count = OBJECTS[1], task.surface_points
-    goal = initial.sample(HAND, task, build_bank(HAND, task, [obj], 0), jax.random.key(0), 2).goal
+    drawn = initial.sample(HAND, task, build_bank(HAND, task, [obj], 0), jax.random.key(0), 2)
+    rest = np.concatenate([drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1)
     surface = Surface(np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1)))
     asked = {name: np.zeros(2, bool) for name in ("affordance", "pose", "trajectory")}
     attempts = Attempts(HAND, task, policy, hold=5, threads=1, lift=0.06)
-    outcome = attempts.run(obj, RequestedEpisodes(goal, asked, surface, np.tile(obj.rest_poses[0], (2, 1))))
+    outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
     attempts.close()
-    assert attempts.steps == 10 + 5 + protocols.lift_steps(task, 0.06) == len(outcome.trace.q)
+    assert attempts.steps == 30 + 5 + protocols.lift_steps(task, 0.06) == len(outcome.trace.q)
     assert set(protocols.ASSESSED) < set(outcome.metrics)
-    way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[14]
-    slid = (outcome.trace.u[-1] - outcome.trace.u[14])[:, :3]
-    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[15:, :, 2], axis=0).max() < 0.02)
+    way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[34]
+    slid = (outcome.trace.u[-1] - outcome.trace.u[34])[:, :3]
+    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[35:, :, 2], axis=0).max() < 0.02)
     np.testing.assert_allclose(np.linalg.norm(way, axis=-1), np.linalg.norm(slid, axis=-1), atol=1e-5)
