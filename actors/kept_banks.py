@@ -10,8 +10,9 @@ import numpy as np
 
 import actors
 import common
-from common.caches import cache_folder, keep, read_kept, source_digest
+from common.caches import keep, read_kept, source_digest
 from common.config import TaskConfig
+from common.files import cache_folder
 from common.hands.spec import Hand
 from common.objects import store
 from common.objects.spec import GraspObject

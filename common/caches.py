@@ -12,11 +12,6 @@ from common.files import write_atomically
 from common.wire.codec import Message, decode, encode
 
 
-def cache_folder(name: str) -> pathlib.Path:
-    """The user's folder for one subject; `XDG_CACHE_HOME` names another place for all of them."""
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / name
-
-
 @functools.cache
 def source_digest(*packages: ModuleType) -> str:
     """Sixteen hex digits of all source in these packages: what they made and is kept ends with their next change."""

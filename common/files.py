@@ -30,6 +30,11 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
         ) from None
 
 
+def cache_folder(name: str) -> pathlib.Path:
+    """The user's folder for what is kept of one subject; `XDG_CACHE_HOME` names another place for all of them."""
+    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / name
+
+
 def sync_directory(path: pathlib.Path) -> None:
     """Makes renames inside a directory survive a power cut."""
     descriptor = os.open(path, os.O_RDONLY)

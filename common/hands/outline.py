@@ -1,10 +1,10 @@
 """How far a hand reaches around its centre in a few finger poses: what decides whether a table leaves it room."""
 
+import concurrent.futures
 import functools
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from common.hands import kinematics
@@ -36,8 +36,11 @@ def outline(hand: Hand) -> Outline:
     frame = kinematics.grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
     q = np.stack([hand.q_open + share * (hand.q_closed - hand.q_open) for share in CLOSURES])
-    with jax.ensure_compile_time_eval():
-        ends, center = (np.asarray(part, np.float64) for part in _ends_and_center(hand, jnp.asarray(q)))
+    # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
+    with concurrent.futures.ThreadPoolExecutor(1) as thread:
+        ends, center = (
+            np.asarray(part, np.float64) for part in thread.submit(_ends_and_center, hand, np.float32(q)).result()
+        )
     return Outline((ends - center[:, None]) @ axes.T, np.repeat(hand.capsule_radii, 2).astype(np.float64))
 
 

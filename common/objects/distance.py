@@ -8,12 +8,9 @@ outside of the surface, where the axes of fingers are: mean error 0.01 to 0.05 m
 near edges up to 0.8 mm (`tests/common/test_distance.py`).
 """
 
-import contextlib
 import functools
 import hashlib
 import math
-import os
-import pathlib
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -24,13 +21,12 @@ import trimesh
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.inputs import read_file
+from common.caches import keep, read_kept
+from common.files import cache_folder
 from common.objects import shapes
 from common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
 from common.task.types import Array
-from common.wire.codec import Message, decode, encode
+from common.wire.codec import Message
 
 CELLS = 1 << 17
 """Grid points of an object: cells of 1.5 to 3 mm, in a quarter of a megabyte."""
@@ -38,6 +34,7 @@ MARGIN = 0.024
 """Metres around the object that its grid covers: the radius of the thickest capsule of a hand, and more."""
 _MOST = 1 << 28  # grid points of all objects together
 _SPACING, _SAMPLES = 1e-3, (4000, 120_000)  # of points on a mesh: m, and fewest and most
+_MOST_FILES = 4096  # grids of meshes that are kept
 _NEWTON = 12  # iterations to the nearest point of an ellipsoid
 
 
@@ -198,21 +195,14 @@ def _mesh_values(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.nd
     """(cells,) float16 distances from a visual mesh at the points of a grid, and zeros; from the cache if possible."""
     parts = [obj.visual_vertices.astype(np.float32), obj.visual_faces.astype(np.int32), origin, shape]
     key = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:32]
-    file = _folder() / f"{key}.safetensors"
-    with contextlib.suppress(CongraspError, OSError, KeyError):
-        kept = decode(read_file(file, 4 * CELLS)).arrays["distance"]
-        if kept.shape == (cells,) and np.isfinite(kept).all():
-            return kept
+    file = cache_folder("distances") / f"{key}.safetensors"
+    kept = message.arrays.get("distance") if (message := read_kept(file)) else None
+    if kept is not None and kept.shape == (cells,) and np.isfinite(kept).all():
+        return kept
     found = _mesh_distance(obj, origin, cell, shape).astype(np.float16)
     found = np.pad(found, (0, cells - len(found)))
-    with contextlib.suppress(CongraspError, OSError):  # without room on a disk it is made anew the next time
-        write_atomically(file, encode(Message({"distance": found}, {})))
+    keep(file, Message({"distance": found}), _MOST_FILES)
     return found
-
-
-def _folder() -> pathlib.Path:
-    """Where grids of meshes are kept."""
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "distances"
 
 
 def _mesh_distance(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ import importlib
 import inspect
 import io
 import os
-import pathlib
 import signal
 import sys
 import traceback
@@ -16,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
 from common.errors import CongraspError
+from common.files import cache_folder
 from services.ops.logs import log_error
 from services.ops.shutdown import follow_parent, on_signal
 
@@ -179,8 +179,7 @@ def usage() -> str:
 def _prepare_environment() -> None:
     """Keeps compiled programs between runs, the compilers' chatter off the screen, and OpenGL, for which MuJoCo would
     start processes, out; what the user set stays."""
-    cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "jax"
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder("jax")))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("MUJOCO_GL", "disable")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

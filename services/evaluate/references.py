@@ -5,10 +5,8 @@ graspable region; final states of its successful episodes are the references, an
 trajectories. The last fifth of each object's references is held out.
 """
 
-import contextlib
 import hashlib
 import json
-import os
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -20,10 +18,10 @@ import numpy as np
 from actors import initial
 from actors.bank import POSES, make_references
 from actors.initial import PlannedEpisodes
+from common.caches import keep, read_kept
 from common.config import TaskConfig
 from common.engines import ENGINES, PhysicsName
-from common.errors import CongraspError
-from common.files import write_atomically
+from common.files import cache_folder
 from common.hands import get_hand
 from common.objects import store
 from common.objects.spec import GraspObject
@@ -32,7 +30,7 @@ from common.policy.bundle import PolicyBundle
 from common.policy.pretrained import reference_file
 from common.task.bank import ConstraintBank
 from common.task.sampling.closed_poses import Poses
-from common.wire.codec import Message, decode, encode
+from common.wire.codec import Message, encode
 from services.evaluate.episodes import Episodes
 from services.evaluate.plan import RowPlan, batches
 from services.evaluate.protocol import protocol
@@ -44,6 +42,8 @@ _ATTEMPTS = 3 * POSES
 _SPARE = 1.25
 """Episodes for each reference that is still missing."""
 _SEED = 0
+_MOST_FILES = 256
+"""Sets of references that are kept; that of 64 objects has some 3 MB."""
 
 
 class References(NamedTuple):
@@ -88,14 +88,13 @@ def make(
       threads: threads of the `native` engine.
       progress: is told how many references there are, and how many at most.
     """
-    kept = _folder() / f"{_key(policy, task, objects, physics)}.safetensors"
+    kept = cache_folder("references") / f"{_key(policy, task, objects, physics)}.safetensors"
     if found := _read(kept, bank):
         return found
     grasps = _grasp(policy, task, objects, bank, physics, threads, progress)
     made = _filled(policy, task, bank, grasps)
     arrays = {name: np.asarray(getattr(made.bank, name)) for name in _ARRAYS}
-    with contextlib.suppress(CongraspError):  # a full disk costs the next evaluation some time
-        write_atomically(kept, encode(Message({**arrays, "grasps": made.grasps}, {"kind": "references"})))
+    keep(kept, Message({**arrays, "grasps": made.grasps}, {"kind": "references"}), _MOST_FILES)
     return made
 
 
@@ -196,11 +195,6 @@ def _arranged(count: int) -> np.ndarray:
     )
 
 
-def _folder() -> pathlib.Path:
-    """Where references are kept."""
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "references"
-
-
 def _key(policy: PolicyBundle, task: TaskConfig, objects: Sequence[GraspObject], physics: str) -> str:
     """What references depend on, as a file's name."""
     made_by = bundles.content_hash(encode(policy.to_message()))
@@ -212,10 +206,9 @@ def _key(policy: PolicyBundle, task: TaskConfig, objects: Sequence[GraspObject],
 
 def _read(path: pathlib.Path, bank: ConstraintBank) -> References | None:
     """Kept references of the bank's objects, if they are there and whole."""
-    try:
-        arrays = decode(path.read_bytes()).arrays
-    except (OSError, CongraspError):
+    if not (message := read_kept(path)):
         return None
+    arrays = message.arrays
     if any(name not in arrays or arrays[name].shape != getattr(bank, name).shape for name in _ARRAYS):
         return None
     return References(bank._replace(**{name: jnp.asarray(arrays[name]) for name in _ARRAYS}), arrays["grasps"])

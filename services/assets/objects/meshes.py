@@ -4,7 +4,6 @@ import collections
 import contextlib
 import dataclasses
 import hashlib
-import os
 import pathlib
 import queue
 import threading
@@ -15,6 +14,7 @@ import trimesh
 from scipy.spatial import QhullError, cKDTree
 
 from common.errors import CongraspError
+from common.files import cache_folder
 from common.objects import shapes, store
 from common.objects.procedural import MASS_RANGE
 from common.objects.resting import rest_poses
@@ -100,9 +100,7 @@ def import_sources(
 
 def _cache_folder(options: ImportOptions) -> pathlib.Path:
     """Where finished imports are kept."""
-    if options.cache_dir:
-        return pathlib.Path(options.cache_dir)
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / "objects"
+    return pathlib.Path(options.cache_dir) if options.cache_dir else cache_folder("objects")
 
 
 def _cache_key(source: Source, options: ImportOptions) -> str:
