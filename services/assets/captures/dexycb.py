@@ -21,7 +21,7 @@ from services.assets.captures.archive import read_archive
 from services.assets.captures.objects import Meshes
 from services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
 
-_LARGEST_YAML = 64 << 10
+_LARGEST_YAML, _DEEPEST_YAML = 64 << 10, 16
 HOLDS = "<date>-subject-01/<session>/meta.yml"
 OBJECTS = (
     *("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle"),
@@ -92,14 +92,24 @@ def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
         raise Dropped(name, "wrong layout", f"there is no {path.name} in {path.parent}")
     try:
         text = read_file(path, _LARGEST_YAML)
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
-            raise ValueError("it repeats its values")
+        _check_structure(text)
         content = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise Dropped(name, "unreadable", " ".join(str(error).split())) from None
     if not isinstance(content, dict):
         raise Dropped(name, "wrong layout", f"{path} holds no settings")
     return content
+
+
+def _check_structure(text: bytes) -> None:
+    """Refuses what takes a parser far longer than its length says: aliases, and values deep inside one another."""
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError("it repeats its values")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST_YAML:
+            raise ValueError(f"its values are more than {_DEEPEST_YAML} deep inside one another")
 
 
 def _value(name: str, meta: dict[str, Any], key: str) -> Any:
