@@ -32,7 +32,7 @@ class Scene:
     def take(self) -> "EnvInstance":
         """An instance whose data are as after a reset, made only if no spare one is left."""
         if not self.spare:
-            return EnvInstance(self)
+            return EnvInstance(self.model)
         instance = self.spare.pop()
         mujoco.mj_resetData(instance.model, instance.data)
         return instance
@@ -41,10 +41,9 @@ class Scene:
 class EnvInstance:
     """One environment: its own model (base pose, mass and friction differ) and data, with views that stay valid."""
 
-    def __init__(self, scene: Scene):
-        """A copy of the scene."""
-        self.scene = scene
-        self.model = copy.copy(scene.model)
+    def __init__(self, model: mujoco.MjModel):
+        """A copy of a scene's model."""
+        self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
         self.ctrl, self.qpos, self.qvel = self.data.ctrl, self.data.qpos, self.data.qvel
         self.sensordata = self.data.sensordata
@@ -70,7 +69,8 @@ class NativePhysics:
         self._hand, self._task, self._objects = hand, task, objects
         self.threads = max(1, threads)
         self._pool = concurrent.futures.ThreadPoolExecutor(self.threads, thread_name_prefix="physics")
-        self._scenes: dict[int, Scene] = {}
+        self._compiled: dict[int, Scene] = {}
+        self.scenes: list[Scene] = []  # of each environment
         self.instances: list[EnvInstance] = []
         self._where = addresses(self._scene(0).model, hand)
         self._physics_state = jax.jit(functools.partial(physics_state, jnp, self._where))
@@ -78,7 +78,8 @@ class NativePhysics:
     def start(self, reset_state: ResetState) -> "NativePhysics":
         """Fresh environments; see `Physics.start`."""
         batch = len(np.asarray(reset_state.object_index))
-        self.instances = [self._scene(int(index)).take() for index in np.asarray(reset_state.object_index)]
+        self.scenes = [self._scene(int(index)) for index in np.asarray(reset_state.object_index)]
+        self.instances = [scene.take() for scene in self.scenes]
         model = self.instances[0].model
         self._start = np.zeros((batch, model.nq))
         self._qpos = np.zeros((batch, model.nq), np.float32)
@@ -120,7 +121,7 @@ class NativePhysics:
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> "NativePhysics":
         """Other objects; see `Physics.replace_objects`."""
         self._objects = objects
-        self._scenes.clear()
+        self._compiled.clear()
         return self
 
     def read(self, state: Any) -> PhysicsState:
@@ -133,15 +134,16 @@ class NativePhysics:
 
     def _scene(self, index: int) -> Scene:
         """The compiled scene of an object, compiled on first use."""
-        if index not in self._scenes:
-            self._scenes[index] = Scene(compile_scene(self._hand, self._task, self._objects[index]))
-        return self._scenes[index]
+        if index not in self._compiled:
+            self._compiled[index] = Scene(compile_scene(self._hand, self._task, self._objects[index]))
+        return self._compiled[index]
 
     def _start_instance(self, i: int, reset_state: ResetState) -> None:
         """Puts environment i to row i of its reset states, in an instance of its object's scene."""
         where, scene = self._where, self._scene(int(reset_state.object_index[i]))
-        self.instances[i].scene.spare.append(self.instances[i])
-        instance = self.instances[i] = scene.take()
+        self.scenes[i].spare.append(self.instances[i])
+        self.scenes[i], instance = scene, scene.take()
+        self.instances[i] = instance
         model, data = instance.model, instance.data
         model.body_pos[where.base_body] = reset_state.base_position[i]
         model.body_quat[where.base_body] = reset_state.base_quaternion[i]

@@ -102,7 +102,7 @@ def rolled(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarr
             instance.ctrl[:] = target[i]
             mujoco.mj_getState(instance.model, instance.data, controls[i, step], given)
     controls = np.repeat(controls, substeps, 1)
-    scenes = [id(instance.scene) for instance in instances]
+    scenes = list(map(id, physics.scenes))
     groups = [np.flatnonzero(np.array(scenes) == scene) for scene in dict.fromkeys(scenes)]
     scratch = [[mujoco.MjData(instances[rows[0]].model) for _ in range(physics.threads)] for rows in groups]
 

@@ -9,7 +9,6 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import functools
-import gc
 import itertools
 import json
 import logging
@@ -152,7 +151,6 @@ def evaluate_objects(
                     running = stack.enter_context(Episodes(bundle, task, pool.objects, field=pool.field, **settings))
                 else:
                     running.replace_objects(pool.objects, pool.field)
-                    gc.collect()  # scenes and instances refer to each other, with memory that Python does not count
                 advance = functools.partial(lambda before, n: progress(before + n), done)
                 result = _simulated(running, hand, task, pool, each, seed, advance, max(0, STRESSED - done))
             if done:
