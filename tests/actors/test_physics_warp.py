@@ -191,7 +191,7 @@ def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
     native = NativePhysics(HAND, TASK, OTHERS[::-1], 1)
     new = _picked(others, [4, 3, 2, 0])._replace(object_index=jnp.array([0, 1, 2, 4]))
     state, a = warp.reset(state, table, new), native.start(new)
-    for i in range(20):
+    for i in range(18):  # until every object is touched; what slips a moment later does so in each engine by itself
         state, y = step(state, jnp.asarray(grasp(new, i)), table)
         a, x = native.step(a, grasp(new, i), np.ones(4, bool))
     assert x.contact_found.any((1, 2)).all()
