@@ -262,7 +262,7 @@ class Evaluator:
             self.task,
             self.objects,
             hold=self._hold,
-            batch=batch_of(episodes, self._batch),
+            batch=batch_of(max(episodes, len(self.objects)), self._batch),  # rows have an episode of every object
             physics=self._physics,
             threads=self._threads,
             field=self._field,

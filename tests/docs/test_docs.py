@@ -74,7 +74,7 @@ def test_the_commands_of_the_tutorials_run(tmp_path):
     ]
     for line in lines:
         done = subprocess.run(
-            re.sub(r"--episodes \d+", "--episodes 1 --pool 4", line),
+            re.sub(r"--episodes \d+", "--episodes 1 --pool 2", line),
             shell=True,
             cwd=tmp_path,
             env=environment,
