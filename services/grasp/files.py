@@ -16,10 +16,12 @@ from services.grasp.grasper import Grasp
 from services.record.channels import JsonChannels
 from services.record.scene import episode_entries
 from services.record.writer import LogWriter
-from services.viz.render import best_camera, episode_sheet, render_episode_frames, save_episode_video
+from services.viz.render import best_camera, episode_sheet, grasp_picture, render_episode_frames, save_episode_video
 from services.viz.sheets import save_png
 
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
+PORTRAIT = "portrait.png"
+"""Its last frame, 1280 x 720, with a view from the thumb's side."""
 THUMBNAIL = "thumbnail.png"
 """A picture of its last frame."""
 OBJECT = "object.png"
@@ -51,6 +53,7 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
     camera = best_camera(episode, steps) if pictures or video else None
     if pictures:
         save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera))
+        save_png(folder / PORTRAIT, grasp_picture(episode, last))
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if video:
         save_episode_video(folder / VIDEO, episode, _VIDEO, camera)
