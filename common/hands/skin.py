@@ -16,6 +16,7 @@ from common.hands.spec import Hand
 
 HUMAN_HANDS = ("human", "mano")
 """Names of the hands that have flesh."""
+_LARGEST = 0.5  # m
 _SECTIONS = 20  # of a housing
 _BEVEL = 0.45  # of a housing's ends, in radii
 _DRUM_RADIUS, _DRUM_LENGTH = 0.72, 1.04  # of a joint's drum, in radii of its link
@@ -40,13 +41,13 @@ class Skin(NamedTuple):
     """(V,) bool: part of a robot's joint, which viewers draw darker."""
 
     def influences(self) -> tuple[np.ndarray, np.ndarray]:
-        """The four links (V, 4) int that move each point most, and their weights (V, 4)."""
+        """The four links (V, 4) int that move each point most, and their weights (V, 4); link 0 where it is none."""
         links = np.argsort(-self.weights, 1, kind="stable")[:, :4]
         if links.shape[1] < 4:
             links = np.pad(links, ((0, 0), (0, 4 - links.shape[1])))
         weights = np.take_along_axis(self.weights, links, 1)
         weights[:, self.weights.shape[1] :] = 0.0
-        return links, weights
+        return np.where(weights > 0, links, 0), weights
 
     def posed(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (V, 3) and unit normals (V, 3) with the links' frames at (L, 3), turned by matrices (L, 3, 3)."""
@@ -67,7 +68,7 @@ def skin_of(hand: Hand) -> Skin:
 
 def skin_on(skeleton: Skeleton) -> Skin:
     """The surface of the hand with this skeleton."""
-    human = skeleton.hand in HUMAN_HANDS
+    human = skeleton.hand in HUMAN_HANDS and _anatomical(skeleton)
     if human:
         surface = flesh(skeleton)
         joint = np.zeros(len(surface.points), bool)
@@ -81,6 +82,18 @@ def skin_on(skeleton: Skeleton) -> Skin:
         skeleton.origins,
         human,
         joint,
+    )
+
+
+def _anatomical(skeleton: Skeleton) -> bool:
+    """Whether there is a palm with a thumb and other fingers, each link with a capsule, of a hand's size."""
+    chains, with_capsule = skeleton.chains(), set(skeleton.capsule_link.tolist())
+    return (
+        len(chains) > 2
+        and skeleton.names[chains[0][0]].startswith("thumb")
+        and all(len(chain) > 1 for chain in chains)
+        and with_capsule == set(range(len(skeleton.names)))
+        and float(np.ptp(skeleton.capsules.reshape(-1, 3), axis=0).max() + skeleton.radii.max()) < _LARGEST
     )
 
 
