@@ -33,6 +33,11 @@ _FALL = 0.1  # how far the camera follows a falling object, m
 
 def episode_shapes(episode: Message, step: int) -> list[Shape]:
     """Hand, object, table and active constraints of one control step of an episode."""
+    return _bodies(episode, step) + _constraints(known_hand(episode.meta["hand"]), episode, step)
+
+
+def _bodies(episode: Message, step: int) -> list[Shape]:
+    """Hand, object and table of one control step of an episode."""
     arrays = episode.arrays
     hand = known_hand(episode.meta["hand"])
     force = np.linalg.norm(arrays["contact_force"][step], axis=-1)
@@ -41,7 +46,7 @@ def episode_shapes(episode: Message, step: int) -> list[Shape]:
     shapes = [hand_shape(hand, *links, TOUCHING, share), _object(episode, step)]
     if arrays["table"][step]:
         shapes.append(table_shape(arrays["object_position"][0]))
-    return shapes + _constraints(hand, episode, step)
+    return shapes
 
 
 def _object(episode: Message, step: int) -> Shape:
@@ -151,10 +156,10 @@ def thumb_camera(episode: Message, step: int, aspect: float) -> Camera:
 
 
 def grasp_picture(episode: Message, step: int, size: tuple[int, int] = (1280, 720)) -> np.ndarray:
-    """A step of an episode as (height, width, 3) uint8: framed on the grasp, and from the thumb's side beside it."""
+    """A step of an episode as (height, width, 3) uint8: without constraints: framed on the grasp, and from the thumb's side."""
     width, height = size
     left = 2 * width // 3
-    shapes = episode_shapes(episode, step)
+    shapes = _bodies(episode, step)
     cameras = best_camera(episode, [step], left / height), thumb_camera(episode, step, (width - left) / height)
     widths = left, width - left
     views = [render_scene(shapes, camera, (w, height)) for camera, w in zip(cameras, widths, strict=True)]
@@ -201,8 +206,7 @@ def episode_sheet(
     """
     steps = steps or key_steps(np.asarray(episode.arrays["table"], bool), frames)
     dt = float(episode.meta["control_dt"])
-    table = np.asarray(episode.arrays["table"], bool)
-    labels = [f"{dt * step:.2f} s" + ("" if table[step] else "   table removed") for step in steps]
+    labels = [f"{dt * step:.2f} s   {_phase(episode, step)}".rstrip() for step in steps]
     images = list(render_episode_frames(episode, steps, size, camera))
     return contact_sheet(images, labels, columns=min(4, len(steps)), title=episode_title(episode))
 
@@ -236,6 +240,27 @@ def episode_strip(
     ]
 
 
+def grasp_steps(episode: Message) -> tuple[int, int]:
+    """The first step of the grasp itself, and the first one after it: of the lift, or without the table."""
+    phases, dt = episode.meta.get("phases", {}), float(episode.meta["control_dt"])
+    first = round(phases.get("grasp", 0.0) / dt)
+    if "lift" in phases:
+        return first, round(phases["lift"] / dt)
+    return first, int(np.asarray(episode.arrays["table"], bool).sum())
+
+
+def _phase(episode: Message, step: int) -> str:
+    """What a step is part of, as far as it is worth saying: approach, lift, hold, or that the table was removed."""
+    if not episode.arrays["table"][step]:
+        return "table removed"
+    phases = {name: begin for name, begin in episode.meta.get("phases", {}).items() if name != "grasp"}
+    if len(phases) < 2 and "approach" not in phases:
+        return ""
+    time = float(episode.meta["control_dt"]) * step + 1e-6
+    begun = [(begin, name) for name, begin in episode.meta["phases"].items() if begin <= time]
+    return max(begun)[1] if begun else ""
+
+
 def key_steps(table: np.ndarray, frames: int) -> list[int]:
     """Steps spread evenly over an episode whose `table` (T,) is present at first; the removal's step is among them."""
     steps = sorted({round(x) for x in np.linspace(0, len(table) - 1, frames)})
@@ -262,9 +287,9 @@ def episode_title(episode: Message) -> str:
 def save_episode_video(
     path: pathlib.Path, episode: Message, size: tuple[int, int] = (640, 480), camera: Camera | None = None
 ) -> None:
-    """An episode as MP4: at half its speed while the table stands, then in real time."""
-    table = np.asarray(episode.arrays["table"], bool)
+    """An episode as MP4: in real time, the grasp itself (before the lift or the table's removal) at half its speed."""
     step = max(1, round(_FRAME_SECONDS / 2 / float(episode.meta["control_dt"])))
-    removal = int(table.sum())
-    steps = [*range(0, removal, step), *range(removal, len(table), 2 * step)]
+    first, end = grasp_steps(episode)
+    last = len(episode.arrays["table"])
+    steps = [*range(0, first, 2 * step), *range(first, end, step), *range(end, last, 2 * step)]
     save_video(path, render_episode_frames(episode, steps, size, camera), size, 1 / _FRAME_SECONDS)
