@@ -56,8 +56,8 @@ def grasp(
     grasp.png, portrait.png, object.png (before and after its import, beside a hand at true scale) and result.json.
     Examples: congrasp grasp mug.obj --approach 1 --lift 0.15 --video; congrasp grasp mug:7 --rest upright
 
-    Several attempts are simulated at once, and the best is kept: first one that holds the object for two seconds without
-    the table, then small errors, a quiet object and gentle forces. Interrupted runs resume where they stopped.
+    Several attempts are simulated at once, and the best is kept: first one that holds the object for two seconds
+    without the table, then small errors, a quiet object and gentle forces. Interrupted runs resume where they stopped.
 
     Args:
       objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, FAMILY:SEED of the generator (mug:7), or

@@ -68,7 +68,7 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
 
 
 def _steps_to_draw(first: int, end: int, last: int) -> list[int]:
-    """Up to eight steps worth seeing: of the way to a grasp that begins at `first`, of it, after its `end`, the last."""
+    """Up to eight steps worth seeing: before a grasp begins at `first`, of it, after its `end`, and the last."""
     reach = [0, first / 2] if first else []
     grasp = np.linspace(first, min(end, last), 6 - len(reach))
     return sorted({round(step) for step in [*reach, *grasp, (end + last) / 2, last]})

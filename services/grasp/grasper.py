@@ -86,7 +86,7 @@ class Grasp:
             "held_quarter_second": self.motion.success,
             "tries": self.attempts,
             "tries_held": self.held,
-            "rest": self.rest,
+            "rest": self.rest + 1,
             "phases": self.motion.about.get("phases", {}),
             "constraints": list(self.motion.constraints),
             "links_at_removal": self.motion.metrics["links_at_removal"],

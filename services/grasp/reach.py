@@ -9,12 +9,14 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from common import rotations
 from common.errors import CongraspError
-from common.hands.spec import Hand
+from common.hands.spec import Hand, link_origin
 from common.objects.distance import DistanceField, distance_field
 from common.objects.spec import GraspObject
 from common.wire.codec import Message
@@ -26,7 +28,7 @@ SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
 CLEARANCE = 0.01
 """m between the hand and object or table, as long as the start of the grasp is not nearer and not far."""
 _NEAR_END = 0.8  # share of the curve from which the hand may come as near as the grasp begins
-_BESIDE, _HEIGHT = 0.34, 0.14  # of the wrist from the object's centre, and above the table, before it sets out, m
+_BESIDE, _ABOVE = 0.34, 0.04  # of the wrist from the object's centre, of the hand above the table, at first, m
 _RELAXED = 0.15  # share of the way from the open to the closed pose, before it sets out
 _CHECKED, _ALONG = 25, 5  # poses of the curve that are checked, and points on a capsule's axis
 _AZIMUTHS = np.radians([0, 30, -30, 60, -60, 100, -100, 140, -140, 180])
@@ -83,9 +85,13 @@ def plan_reach(
     checked = np.linspace(0, 1, _CHECKED)
     near = np.where(checked > _NEAR_END, 0.0, CLEARANCE)
     field = distance_field([obj])
-    end = clearances(hand, field, rest, first)[:, 0]
-    for curve in _curves(hand, rest, heading, first):
-        found = clearances(hand, field, rest, curve.at(checked))
+    relaxed = hand.q_open + _RELAXED * (hand.q_closed - hand.q_open)
+    fingers = np.stack([relaxed, first.q[0]])
+    axes = axes_in_wrist(hand, (1 - checked[:, None]) * fingers[0] + checked[:, None] * fingers[1])
+    end = clearances(hand, field, rest, axes[-1:], first)[:, 0]
+    lowest = (_palm_down(hand, np.array([1.0, 0.0, 0.0])).apply(axes[0])[:, 2] - _radii(hand)).min()
+    for curve in _curves(hand, rest, heading, first, fingers, _ABOVE - float(lowest)):
+        found = clearances(hand, field, rest, axes, curve.at(checked))
         needed = np.where(near > 0, CLEARANCE, np.minimum(CLEARANCE, end[:, None])) - _TOLERANCE
         if (found >= needed).all():
             steps = math.ceil(max(seconds, _shortest(curve)) / dt)
@@ -97,15 +103,16 @@ def plan_reach(
     )
 
 
-def _curves(hand: Hand, rest: np.ndarray, heading: np.ndarray, first: Reach) -> Iterator[_Curve]:
-    """Ways to try, the plainest first."""
-    end, relaxed = first.position[0], hand.q_open + _RELAXED * (hand.q_closed - hand.q_open)
+def _curves(
+    hand: Hand, rest: np.ndarray, heading: np.ndarray, first: Reach, fingers: np.ndarray, height: float
+) -> Iterator[_Curve]:
+    """Ways to try, the plainest first; `fingers` (2, F) where they begin and end, `height` (m) where the wrist does."""
+    end = first.position[0]
     aside = end - rest[:3] if np.linalg.norm((end - rest[:3])[:2]) > 0.03 else -heading
     side = math.atan2(aside[1], aside[0])
-    fingers = np.stack([relaxed, first.q[0]])
     for up, azimuth, back in itertools.product(_UP, _AZIMUTHS, _BACK):
         out = np.array([np.cos(side + azimuth), np.sin(side + azimuth), 0.0])
-        begin = np.array([*(rest[:3] + _BESIDE * out)[:2], _HEIGHT])
+        begin = np.array([*(rest[:3] + _BESIDE * out)[:2], height])
         middle = end - back * heading + [0.0, 0.0, up]
         middle[2] = max(middle[2], 0.06)
         turns = Rotation.concatenate([_palm_down(hand, -out), first.rotation[0]])
@@ -119,24 +126,47 @@ def _palm_down(hand: Hand, forward: np.ndarray) -> Rotation:
     return lying * upright(hand)
 
 
-def clearances(hand: Hand, field: DistanceField, rest: np.ndarray, poses: Reach) -> np.ndarray:
-    """(2, N) m between the hand's capsules and the object (pose (7,), first grid of `field`), and the table."""
-    origins = np.array([link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0) for link in hand.links])
+def axes_in_wrist(hand: Hand, q: np.ndarray) -> np.ndarray:
+    """(N, P, 3) points on the axes of the hand's capsules in the wrist frame, at finger angles (N, F)."""
     share = np.linspace(0, 1, _ALONG)[:, None]
-    axes = hand.capsules[:, :1] + share * (hand.capsules[:, 1:] - hand.capsules[:, :1])  # (C, _ALONG, 3)
-    local = axes - origins[hand.capsule_links][:, None]
-    points = []
-    for q, turn, place in zip(poses.q, poses.rotation, poses.position, strict=True):
-        position, quaternion = mujoco_link_poses(hand, q)
-        matrices = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()[hand.capsule_links]
-        wrist = np.einsum("cij,cpj->cpi", matrices, local) + position[hand.capsule_links][:, None]
-        points.append(turn.apply(wrist.reshape(-1, 3)) + place)
-    world = np.array(points)
-    radii = np.repeat(hand.capsule_radii, _ALONG)
+    along = hand.capsules[:, :1] + share * (hand.capsules[:, 1:] - hand.capsules[:, :1])  # (C, _ALONG, 3)
+    origins = np.array([link_origin(link) for link in hand.links])
+    local, links = along - origins[hand.capsule_links][:, None], hand.capsule_links
+    found = []
+    for angles in q:
+        position, quaternion = mujoco_link_poses(hand, angles)
+        matrices = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()[links]
+        found.append((np.einsum("cij,cpj->cpi", matrices, local) + position[links][:, None]).reshape(-1, 3))
+    return np.array(found)
+
+
+def clearances(hand: Hand, field: DistanceField, rest: np.ndarray, axes: np.ndarray, poses: Reach) -> np.ndarray:
+    """(2, N) m between the hand's capsules and the object, and the table.
+
+    Args:
+      hand: the hand.
+      field: whose first grid is the object's.
+      rest: (7,) the object's pose.
+      axes: (N, P, 3) from `axes_in_wrist`, at the poses' finger angles.
+      poses: N of the wrist.
+    """
+    radii = _radii(hand)
+    world = np.einsum("nij,npj->npi", poses.rotation.as_matrix(), axes) + poses.position[:, None]
     back = Rotation.from_quat(rest[3:], scalar_first=True).inv()
     inside = back.apply(world.reshape(-1, 3) - rest[:3]).astype(np.float32)
-    distance = np.asarray(field.at(np.zeros(1, int), inside[None]))[0].reshape(len(world), -1)
+    distance = np.asarray(_at(field, inside)).reshape(len(world), -1)
     return np.stack([(distance - radii).min(1), (world[..., 2] - radii).min(1)])
+
+
+def _radii(hand: Hand) -> np.ndarray:
+    """(P,) m, of the capsules of `axes_in_wrist`."""
+    return np.repeat(hand.capsule_radii, _ALONG)
+
+
+@jax.jit
+def _at(field: DistanceField, points: np.ndarray) -> jax.Array:
+    """(n,) signed distances of points (n, 3) of the object frame, in one program."""
+    return field.at(jnp.zeros(1, int), points[None])[0]
 
 
 def _shortest(curve: _Curve) -> float:

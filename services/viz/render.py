@@ -156,7 +156,7 @@ def thumb_camera(episode: Message, step: int, aspect: float) -> Camera:
 
 
 def grasp_picture(episode: Message, step: int, size: tuple[int, int] = (1280, 720)) -> np.ndarray:
-    """A step of an episode as (height, width, 3) uint8: without constraints: framed on the grasp, and from the thumb's side."""
+    """A step as (height, width, 3) uint8, without constraints: framed on the grasp, and from the thumb's side."""
     width, height = size
     left = 2 * width // 3
     shapes = _bodies(episode, step)
