@@ -17,6 +17,7 @@ from common.hands.skeleton import Skeleton
 _CELL = 0.0039  # side of a cell of the grid that the surface is cut from, m
 _PALM_BLEND, _FINGER_BLEND, _THUMB_BLEND = 0.014, 0.008, 0.020  # m over which parts run into one another
 _WRIST, _WIDTH = 0.040, 1.9  # how far the wrist goes back, m; how much wider it is than where the palm begins
+_CUT = 0.012  # m over which the wrist's end is rounded
 _BALL = ((0.10, 0.75, 0.0120, 0.0105), (0.45, 0.55, 0.0090, 0.0080))
 """The ball of the thumb and the fold between thumb and index finger: shares of the way along the nearest metacarpal and
 along the thumb's where they begin and end, and radii there (m)."""
@@ -110,7 +111,7 @@ def _palm(skeleton: Skeleton) -> list[Cone]:
     thumb, *others = (_of_link(skeleton, chain[0]) for chain in skeleton.chains())
     root = metacarpals[:, 0].mean(0)
     back = root - np.mean([start for start, _ in others], 0)
-    back = _WRIST * back / np.linalg.norm(back)
+    back = _WRIST * _unit(back)
     palm = []
     for (start, end), radius in zip(metacarpals, radii, strict=True):
         palm.append(Cone(start, end, (radius, radius), (0,)))
@@ -144,7 +145,7 @@ def _to(points: np.ndarray, cone: Cone) -> np.ndarray:
 
 
 def _blend(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """The smaller of two distances, rounded where they differ by less than a width (the polynomial smooth minimum)."""
+    """The smaller of two distances, rounded where they differ by less than a width (polynomial smooth minimum)."""
     share = np.clip(0.5 + 0.5 * (b - a) / width, 0, 1)
     return b + share * (a - b) - width * share * (1 - share)
 
@@ -154,11 +155,18 @@ def _distance(points: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequen
     body = _to(points, palm[0])
     for cone in palm[1:]:
         body = _blend(body, _to(points, cone), _PALM_BLEND)
+    beyond = (points - palm[1].end) @ _unit(palm[1].end - palm[1].start)  # palm[1] is part of the wrist
+    body = -_blend(-body, -beyond, _CUT)  # which ends flat
     found = body
     for i, finger in enumerate(fingers):
         mine = np.min([_to(points, cone) for cone in finger], 0)
         found = np.minimum(found, _blend(body, mine, _FINGER_BLEND if i else _THUMB_BLEND))
     return found
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    """A vector of length one."""
+    return vector / np.linalg.norm(vector)
 
 
 def _gradient(points: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]) -> np.ndarray:

@@ -5,13 +5,16 @@ import numpy as np
 from services.viz.spans import spans
 from services.viz.triangles import Triangles
 
-_KEY_LAMPS, _SKY_LAMPS = 16, 32
+MANY, FEW = (24, 48), (10, 20)
+"""Lamps of the key light and of the sky: for large pictures, and for small ones and videos."""
 _KEY_SIZE = 0.12  # radius of the key light at a distance of one
 _GRID = 160  # samples along each side of what a lamp sees
 _SKIN = 1.5  # how far above the surface its light is looked up, in samples
 
 
-def light_on(points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np.ndarray) -> np.ndarray:
+def light_on(
+    points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np.ndarray, lamps: tuple[int, int]
+) -> np.ndarray:
     """(n, 2) shares of the key light and of the sky that bodies let through to points of surfaces.
 
     Args:
@@ -19,12 +22,13 @@ def light_on(points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np
       normals: (n, 3) of the surfaces there.
       bodies: what casts shadows.
       key: (3,) unit direction towards the key light.
+      lamps: how many stand for the key light and for the sky.
     """
     light = np.zeros((len(points), 2), np.float32)
-    for lamp in _disc(key, _KEY_LAMPS, _KEY_SIZE).astype(np.float32):
-        light[:, 0] += _reached(points, normals, bodies, lamp) / np.float32(_KEY_LAMPS)
+    for lamp in _disc(key, lamps[0], _KEY_SIZE).astype(np.float32):
+        light[:, 0] += _reached(points, normals, bodies, lamp) / np.float32(lamps[0])
     whole = np.full(len(points), 1e-6, np.float32)
-    for lamp in _dome(_SKY_LAMPS).astype(np.float32):
+    for lamp in _dome(lamps[1]).astype(np.float32):
         facing = np.clip(0.75 * (normals @ lamp) + 0.25, 0, None)  # a lamp of the sky stands for a patch of it
         light[:, 1] += facing * _reached(points, normals, bodies, lamp)
         whole += facing

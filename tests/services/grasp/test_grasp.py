@@ -67,6 +67,24 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     np.testing.assert_array_equal(again.joint_position, motion.joint_position)
 
 
+def test_a_grasp_lifts_the_block_off_a_table_that_stays(block):
+    """By physics: the hand goes up and the block with it, because the hand holds it."""
+    lifting = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, approach=0.3, lift=0.1, threads=2)
+    upright = int(np.argmax(block.rest_poses[:, 2]))
+    found = lifting.grasp(block, GraspRequest(rest=upright))
+    lifting.close()
+    motion, phases = found.motion, found.facts()["phases"]
+    assert list(phases) == ["approach", "grasp", "lift", "hold"] and found.rest == upright
+    assert phases["grasp"] >= 0.3 and phases["lift"] == pytest.approx(phases["grasp"] + 0.5)
+    assert motion.table.all() and found.success
+    grasped, lifted, held = (round(phases[name] / motion.control_dt) for name in ("grasp", "lift", "hold"))
+    assert len(motion.time) == held + 25
+    np.testing.assert_allclose(motion.object_position[:grasped, 2], SIDES[2] / 2, atol=2e-3)
+    assert motion.object_position[-1, 2] - motion.object_position[lifted, 2] == pytest.approx(0.1, abs=0.02)
+    assert (np.linalg.norm(motion.link_force[held:], axis=-1).sum(-1) > 0.5).all()
+    assert np.linalg.norm(np.diff(motion.wrist_position[lifted:held], axis=0), axis=-1).max() < 0.6 * motion.control_dt
+
+
 def test_what_cannot_be_is_said_before_anything_is_simulated(block, grasper):
     lying = dataclasses.replace(block, rest_poses=block.rest_poses[:1])
     down = -np.asarray(rotate(block.rest_poses[0][3:] * [1, -1, -1, -1], np.array([0.0, 0.0, 1.0])))
