@@ -25,7 +25,6 @@ _TOUCH = 1e-3  # force from which a link touches, N
 _FULL_CONTACT = 2.0  # force at which a link takes most of the contact colour, N
 _ELEVATION = 24.0  # degrees
 _ARROW_SEARCH, _ARROW_GAP = 0.012, 0.004  # radius in which the approach looks for the object, space before it, m
-_THIN = 5  # of so many points of the skin, one counts for the camera
 _GAP = 3  # between two views of a picture, pixels
 _FRAME_SECONDS = 0.04  # between two frames of a video
 _FALL = 0.1  # how far the camera follows a falling object, m
@@ -128,11 +127,9 @@ def _extent(episode: Message, step: int) -> np.ndarray:
     An object that has fallen far may leave the picture.
     """
     arrays = episode.arrays
-    hand, turns = (
-        known_hand(episode.meta["hand"]),
-        Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True),
-    )
-    around = skin_of(hand).posed(arrays["link_position"][step], turns.as_matrix())[0][::_THIN]
+    hand = known_hand(episode.meta["hand"])
+    turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True)
+    around = skin_of(hand).posed(arrays["link_position"][step], turns.as_matrix())[0]
     if arrays["object_position"][step, 2] < arrays["object_position"][0, 2] - _FALL:
         return around
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
