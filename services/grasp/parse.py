@@ -27,6 +27,7 @@ from services.assets.objects.headers import check_header
 from services.assets.objects.sizes import size_in_words
 from services.export.frames import continuous_quaternions
 from services.export.motion_file import GraspMotion, load_motion
+from services.record.goals import phases_of
 
 ABOVE = "above"
 """The heading straight down, whatever the object's pose."""
@@ -271,10 +272,10 @@ def _motion(path: pathlib.Path, hand: Hand) -> GraspMotion:
 
 def grasp_part(motion: GraspMotion) -> tuple[int, int]:
     """The first frame of the grasp itself, and the last one before the lift or the table's removal."""
-    phases = motion.about.get("phases", {})
-    if "lift" not in phases:
-        return round(phases.get("grasp", 0.0) / motion.control_dt), max(int(motion.table.sum()) - 1, 0)
-    return tuple(round(phases[name] / motion.control_dt) - late for name, late in (("grasp", 0), ("lift", 1)))
+    phases, last = phases_of(motion.about), len(motion.time) - 1
+    end = round(phases["lift"] / motion.control_dt) if "lift" in phases else int(motion.table.sum())
+    end = min(max(end - 1, 0), last)
+    return min(round(phases.get("grasp", 0.0) / motion.control_dt), end), end
 
 
 def _wrist_on_object(motion: GraspMotion, frame: int) -> tuple[np.ndarray, np.ndarray]:

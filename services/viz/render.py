@@ -12,7 +12,7 @@ from common.hands.skin import skin_of
 from common.hands.spec import Hand
 from common.parallel import cores
 from common.wire.codec import Message
-from services.record.goals import active_blocks
+from services.record.goals import active_blocks, phases_of
 from services.record.palette import HEADING, OBJECT, WAYPOINT
 from services.viz.raster import render_scene, visible
 from services.viz.scene import Camera, Shape
@@ -239,22 +239,21 @@ def episode_strip(
 
 def grasp_steps(episode: Message) -> tuple[int, int]:
     """The first step of the grasp itself, and the first one after it: of the lift, or without the table."""
-    phases, dt = episode.meta.get("phases", {}), float(episode.meta["control_dt"])
-    first = round(phases.get("grasp", 0.0) / dt)
-    if "lift" in phases:
-        return first, round(phases["lift"] / dt)
-    return first, int(np.asarray(episode.arrays["table"], bool).sum())
+    phases, dt = phases_of(episode.meta), float(episode.meta["control_dt"])
+    table = np.asarray(episode.arrays["table"], bool)
+    end = min(round(phases["lift"] / dt), len(table)) if "lift" in phases else int(table.sum())
+    return min(round(phases.get("grasp", 0.0) / dt), end), end
 
 
 def _phase(episode: Message, step: int) -> str:
     """What a step is part of, as far as it is worth saying: approach, lift, hold, or that the table was removed."""
     if not episode.arrays["table"][step]:
         return "table removed"
-    phases = {name: begin for name, begin in episode.meta.get("phases", {}).items() if name != "grasp"}
-    if len(phases) < 2 and "approach" not in phases:
+    phases = phases_of(episode.meta)
+    if not {"approach", "lift"} & phases.keys():
         return ""
     time = float(episode.meta["control_dt"]) * step + 1e-6
-    begun = [(begin, name) for name, begin in episode.meta["phases"].items() if begin <= time]
+    begun = [(begin, name) for name, begin in phases.items() if begin <= time]
     return max(begun)[1] if begun else ""
 
 

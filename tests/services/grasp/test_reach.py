@@ -113,6 +113,12 @@ def test_an_episode_with_a_reach_says_when_its_phases_begin() -> None:
     assert grasp_part(motion) == (3, 10) and grasp_steps(longer) == (3, 11)
     lifted = dataclasses.replace(motion, about={"phases": {"grasp": 0.03, "lift": 0.08, "hold": 0.1}})
     assert grasp_part(lifted) == (3, 7)
+    # Files of others may say anything.
+    for odd in ("soon", {"lift": "soon", "grasp": -1.0}, {"lift": 1e300, "grasp": float("nan")}, {"grasp": 9e3}):
+        first, end = grasp_part(dataclasses.replace(motion, about={"phases": odd}))
+        assert 0 <= first <= end < len(motion.time)
+        longer.meta["phases"] = odd
+        assert 0 <= grasp_steps(longer)[0] <= grasp_steps(longer)[1] <= len(motion.time)
     drawn = _steps_to_draw(100, 150, 400)
     assert drawn[0] == 0 and {100, 150, 400} < set(drawn) and len(drawn) == 8
 
