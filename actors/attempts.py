@@ -53,21 +53,29 @@ class Attempts:
           hand: the hand.
           task: the task; of its hold only the part that counts for success is taken.
           bundle: the policy.
-          hold: control steps without the table.
+          hold: control steps without the table, or after the lift.
           threads: threads of the physics.
-          lift: metres by which the hand goes up after the hold, as part of the episode.
+          lift: metres by which the hand goes up after the approach; the table then stands to the end.
         """
         self._lift = lift
         self._hand, self._task, self._bundle = hand, task, bundle
-        self._hold, self._threads = hold, threads
+        self._hold, self._threads = protocols.lift_steps(task, lift) + hold, threads
         self._worker: RolloutWorker | None = None
-        self._initial = jax.jit(functools.partial(initial.given, hand, task, hold=hold))
+        self._initial = jax.jit(functools.partial(initial.given, hand, task, hold=self._hold))
 
     @property
     def steps(self) -> int:
         """T, control steps of an episode."""
-        lift = protocols.lift_steps(self._task, self._lift) if self._lift else 0
-        return self._task.approach_steps + self._hold + lift
+        return self._task.approach_steps + self._hold
+
+    @property
+    def phases(self) -> dict[str, float]:
+        """When the grasp, a lift and the hold begin, seconds from the first step."""
+        removal = self._task.approach_steps
+        begins = {"grasp": 0, "hold": removal + protocols.lift_steps(self._task, self._lift)}
+        if self._lift:
+            begins["lift"] = removal
+        return {name: step * self._task.control_dt for name, step in sorted(begins.items(), key=lambda item: item[1])}
 
     def run(
         self, obj: GraspObject, request: RequestedEpisodes, progress: Callable[[int], None] = lambda step: None
@@ -84,9 +92,13 @@ class Attempts:
         if self._worker is None or self._worker.batch != batch:
             self.close()
             self._worker = self._new_worker(obj, batch)
-        task, hold, height = self._task, self._hold, self._lift or protocols.LIFT_HEIGHT
+        task, hold = self._task, self._hold
+        height = 0.0 if self._lift else protocols.LIFT_HEIGHT  # of the lift that follows the hold
+        protocol = protocols.stress(task, [obj], hold, height)
+        if self._lift:
+            protocol = protocols.lift_first(task, [obj], hold, self._lift)
         self._worker.replace_objects([obj], None)
-        self._worker.adjust(protocol=protocols.stress(task, [obj], hold, height), probe_data=distance_field([obj]))
+        self._worker.adjust(protocol=protocol, probe_data=distance_field([obj]))
         self._worker.begin(conditions)
         parameters = self._bundle.inference_parameters
         rollout = self._worker.collect(parameters, task.approach_steps + hold, progress)
@@ -97,7 +109,10 @@ class Attempts:
         metrics = dict(zip(names, np.asarray(rollout.episodes)[:, : len(names)].T, strict=True))
         metrics |= protocols.assess(samples, metrics["held"] > 0, task, hold, height)
         flags = (np.asarray(resolution.redirected), np.asarray(resolution.aligned))
-        return Outcome(resolution.goal, *flags, metrics, Trace(*(field[: self.steps] for field in trace)))
+        trace = Trace(*(field[: self.steps] for field in trace))
+        if self._lift:
+            trace = trace._replace(table=np.ones_like(trace.table))
+        return Outcome(resolution.goal, *flags, metrics, trace)
 
     def episode(
         self, outcome: Outcome, index: int, surface: Surface, obj: GraspObject, about: dict[str, Any]
@@ -105,7 +120,8 @@ class Attempts:
         """One attempt as an episode for logs and pictures; `about` has what else its meta data says."""
         metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
         trace = Trace(*(field[:, index] for field in outcome.trace))
-        meta = {"version": self._bundle.version, "success": metrics["success"] > 0, "metrics": metrics, **about}
+        meta = {"version": self._bundle.version, "success": metrics["success"] > 0, "metrics": metrics}
+        meta |= {"phases": self.phases, **about}
         return episode_message(self._hand, self._task, trace, outcome.goal.row(index), surface, obj, meta)
 
     def renew(self, bundle: PolicyBundle) -> None:

@@ -172,6 +172,7 @@ class GraspEnv:
             return target, (jnp.concatenate([target.u_target, target.q_target], -1), table)
         start, time = state.reset_state, state.time
         frame = protocols.frame(settings.protocol, self.task, time + 0.5)
+        table = table | settings.protocol.table
         u_target = protocols.carried_targets(target.u_target, self.hand, start.base_quaternion, frame)
         force = protocols.push(settings.protocol, self.task, time, start.object_index, start.mass_scale)
         return target, (jnp.concatenate([u_target, target.q_target], -1), table, force)

@@ -58,6 +58,8 @@ class Protocol(NamedTuple):
     """() control steps."""
     masses: Array
     """(N,) kg, of the engine's objects."""
+    table: Array | bool = False
+    """() bool: the table stands on; that the policy sees it gone is what it knows a lift by."""
 
 
 class Frame(NamedTuple):
@@ -78,8 +80,16 @@ def stress(task: TaskConfig, objects: Sequence[GraspObject], start: int, height:
     return Protocol(np.float32(start), np.float32(height), push_start, masses)
 
 
+def lift_first(task: TaskConfig, objects: Sequence[GraspObject], hold: int, height: float) -> Protocol:
+    """The lift by `height` metres off the table, which stands on, instead of its removal; all pushes after `hold`."""
+    protocol = stress(task, objects, hold, 0.0)
+    return protocol._replace(lift_start=np.float32(0), lift_height=np.float32(height), table=True)
+
+
 def lift_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
-    """Control steps of a lift and of the moment after it in which the hand comes to rest."""
+    """Control steps of a lift and of the moment after it in which the hand comes to rest; none without a height."""
+    if not height:
+        return 0
     seconds = height / LIFT_SPEED + LIFT_SPEED / LIFT_ACCELERATION + _STILL_SECONDS
     return math.ceil(round(seconds / task.control_dt, 6))
 

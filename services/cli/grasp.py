@@ -43,18 +43,25 @@ def grasp(
     hand: str = "human",
     tries: int = 16,
     seed: int = 0,
+    approach: float = 0.0,
+    lift: float = 0.0,
+    rest: str = "",
+    folder: str = "objects",
     again: bool = False,
     options: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
 ) -> int:
     """Make grasp motions for objects of your own.
 
     Every object gets a folder in --out: grasp.npz (arrays that say what they mean), grasp.mcap (Foxglove, Rerun),
-    grasp.png, object.png (before and after its import, beside a hand at true scale) and result.json. Several attempts
-    are simulated at once, and the best is kept: first one that holds the object for two seconds without the table,
-    then small errors, a quiet object and gentle forces. Interrupted runs resume where they stopped.
+    grasp.png, portrait.png, object.png (before and after its import, beside a hand at true scale) and result.json.
+    Examples: congrasp grasp mug.obj --approach 1 --lift 0.15 --video; congrasp grasp mug:7 --rest upright
+
+    Several attempts are simulated at once, and the best is kept: first one that holds the object for two seconds
+    without the table, then small errors, a quiet object and gentle forces. Interrupted runs resume where they stopped.
 
     Args:
-      objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, or FAMILY:SEED of the generator (mug:7).
+      objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, FAMILY:SEED of the generator (mug:7), or
+        names in --folder.
       out: Folder for the results.
       constraints: What the grasp must keep to.
       video: Also write grasp.mp4, at half speed, with the constraints drawn.
@@ -63,6 +70,10 @@ def grasp(
       hand: Hand whose pretrained policy is taken.
       tries: Attempts that are simulated side by side.
       seed: Draws what is attempted.
+      approach: Seconds in which the hand first comes from beside the table; longer where an arm needs it (1 m/s).
+      lift: Metres by which the hand then lifts the object, which stands on the table until then; 0 removes the table.
+      rest: How the object lies on the table: upright, or a number from 1 on (congrasp objects rests shows them).
+      folder: Folder of objects, whose names can stand for files.
       again: Also redo finished objects.
       options: How meshes become objects.
     """
@@ -75,14 +86,18 @@ def grasp(
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
     at_least(1, tries=tries)
+    for name, value, most in (("approach", approach, 10.0), ("lift", lift, 0.5)):
+        if not 0 <= value <= most:
+            unit = "seconds" if name == "approach" else "metres"
+            raise CongraspError(f"--{name} is {value}.", f"It is from 0 to {most:g} {unit}.")
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
     file = policy_file(policy, hand)
     loaded = bundles.load(file)
-    found, results = find_objects(objects)
-    identity = (bundles.content_hash(file.read_bytes()), tries, seed)
-    settings = Settings(out, options, dataclasses.asdict(constraints), identity, video, pictures, again)
-    grasper = Grasper(loaded, attempts=tries, seed=seed)
+    found, results = find_objects(objects, folder)
+    identity = (bundles.content_hash(file.read_bytes()), tries, seed, approach, lift)
+    settings = Settings(out, options, dataclasses.asdict(constraints), identity, video, pictures, again, rest)
+    grasper = Grasper(loaded, attempts=tries, approach=approach, lift=lift, seed=seed)
 
     for result in results:
         _show(result)

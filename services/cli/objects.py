@@ -187,6 +187,40 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     return 0
 
 
+def rests(
+    object: Annotated[str, tyro.conf.Positional], folder: str = "objects", png: pathlib.Path | None = None
+) -> int:
+    """List an object's resting poses, the likeliest first, and draw them: what `congrasp grasp --rest` takes.
+
+    Examples: congrasp objects rests mug:7 --png rests.png; congrasp objects rests mug.obj
+
+    Args:
+      object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
+      folder: Folder of objects.
+      png: Picture to write: a thumbnail of each.
+    """
+    import numpy as np
+
+    from common.objects.shapes import matrix
+    from services.assets.objects.named import find_object
+    from services.cli.console import show_table
+
+    obj = find_object(object, folder)
+    tilts = [np.degrees(np.arccos(np.clip(matrix(np.asarray(pose[3:]))[2, 2], -1, 1))) for pose in obj.rest_poses]
+    rows = [
+        (str(i), f"{100 * pose[2]:.1f}", f"{tilt:.0f}")
+        for i, (pose, tilt) in enumerate(zip(obj.rest_poses, tilts, strict=True), 1)
+    ]
+    show_table(("--rest", "centre of mass (cm)", "z axis from up (°)"), rows)
+    if png is not None:
+        from services.viz.object_sheet import rests_sheet
+        from services.viz.sheets import save_png
+
+        save_png(png, rests_sheet(obj))
+        print(f"The picture is {png}.")
+    return 0
+
+
 def _reach(obj: "GraspObject", headings: "Headings | None") -> list[str]:
     """For each resting pose, what share of the headings the table leaves the human hand."""
     from common.hands.human import HUMAN
@@ -300,5 +334,6 @@ COMMANDS = {
     "import": import_meshes,
     "list": list_objects,
     "show": show,
+    "rests": rests,
     "affordance": set_affordance,
 }

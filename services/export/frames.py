@@ -8,13 +8,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
+from common.hands.skeleton import Skeleton
+from common.hands.skin import Skin, skin_on
 from services.export.motion_file import GraspMotion
 from services.record import palette
 
 OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""
-COLOURS = {"hand": palette.SKIN, OBJECT: palette.OBJECT}
-"""Of links, and of the object."""
+SKIN = "skin"
+"""Name of the hand's surface."""
+COLOURS = {"flesh": palette.FLESH, "link": palette.SKIN, "joint": palette.JOINT, OBJECT: palette.OBJECT}
+"""Of a human hand, of a robot's links and joints, and of the object."""
 TOLERANCE_MM = 0.1
 """Files whose kinematics differ by more than this are not kept."""
 _LEVER = 0.1  # m; a point this far from a frame's origin shows its rotation
@@ -73,6 +77,26 @@ def capsules(motion: GraspMotion, link: int) -> Iterator[Capsule]:
         length = float(np.linalg.norm(end - start))
         turn = Rotation.align_vectors([end - start], [[0, 0, 1]])[0] if length else Rotation.identity()
         yield Capsule(int(k), length, float(motion.capsule_radius[k]), (start + end) / 2, turn)
+
+
+def skin_of_motion(motion: GraspMotion) -> Skin:
+    """The surface of the motion's hand."""
+    origins = np.zeros((len(motion.link_names), 3))
+    first = np.unique(motion.joint_link, return_index=True)[1]
+    origins[motion.joint_link[first]] = motion.joint_anchor[first]
+    skeleton = Skeleton(
+        motion.hand,
+        tuple(map(str, motion.link_names)),
+        motion.link_parent,
+        origins,
+        motion.capsule_ends + origins[motion.capsule_link][:, None],
+        motion.capsule_radius,
+        motion.capsule_link,
+        motion.joint_anchor,
+        motion.joint_axis,
+        motion.joint_link,
+    )
+    return skin_on(skeleton)
 
 
 def bodies(motion: GraspMotion) -> list[Body]:

@@ -1,35 +1,36 @@
 """Binary glTF 2.0 with an animation; written by pygltflib, read back as the standard says and, its meshes, by trimesh.
 
-One node a link, nested as the hand is, with translation and rotation (glTF forbids matrices on animated nodes). glTF
-is y-up: a root node turns the world, so that everything below it keeps congrasp's z-up coordinates.
+One node a link, nested as the hand is, with translation and rotation (glTF forbids matrices on animated nodes); these
+are the joints of a skin, by which the hand's surface follows them. glTF is y-up: a root node turns the world, so that
+everything below it keeps congrasp's z-up coordinates.
 """
 
 import json
 import pathlib
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pygltflib as gltf
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from common.hands.skin import Skin
 from services.export.frames import (
     COLOURS,
     FROM_Y_UP,
     OBJECT,
+    SKIN,
     TO_Y_UP,
     Track,
     bodies,
-    capsules,
     continuous_quaternions,
     facts,
     pose_matrices,
+    skin_of_motion,
 )
 from services.export.motion_file import GraspMotion
 
-_SECTIONS = (12, 12)
-_KINDS = {1: gltf.SCALAR, 3: gltf.VEC3, 4: gltf.VEC4}
+_KINDS = {1: gltf.SCALAR, 3: gltf.VEC3, 4: gltf.VEC4, 16: gltf.MAT4}
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
@@ -39,23 +40,20 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     about = facts(motion, frame="this node's frame: z up", unit="m", quaternion="x, y, z, w")
     file.asset.generator = "congrasp"
     file.nodes.append(gltf.Node(name="world", rotation=TO_Y_UP.as_quat().tolist(), extras=about))
-    file.materials = [
-        gltf.Material(
-            name=name,
-            pbrMetallicRoughness=gltf.PbrMetallicRoughness(baseColorFactor=[*colour, 1.0], metallicFactor=0.0),
-        )
-        for name, colour in COLOURS.items()
-    ]
+    skin = skin_of_motion(motion)
+    for name in (*(("flesh",) if skin.flesh else ("link", "joint")), OBJECT):
+        surface = gltf.PbrMetallicRoughness(baseColorFactor=[*COLOURS[name], 1.0], metallicFactor=0.0)
+        file.materials.append(gltf.Material(name=name, pbrMetallicRoughness=surface))
     time = _add(file, data, motion.time, bounds=True)
-    for i, body in enumerate(bodies(motion)):
+    for body in bodies(motion):
         number, first = len(file.nodes), body.rotation[0].as_quat()
         node = gltf.Node(name=body.name, translation=body.translation[0].tolist(), rotation=first.tolist())
         file.nodes.append(node)
         file.nodes[body.parent + 1].children.append(number)
-        shape = _object_mesh(motion) if body.name == OBJECT else _link_mesh(motion, i)
-        if shape is not None:
+        if body.name == OBJECT:
             node.mesh = len(file.meshes)
-            file.meshes.append(gltf.Mesh(name=body.name, primitives=[_primitive(file, data, body.name, shape)]))
+            mesh = trimesh.Trimesh(motion.object_vertices, motion.object_faces, process=False)
+            file.meshes.append(gltf.Mesh(name=OBJECT, primitives=[_primitive(file, data, mesh)]))
         tracks = {"rotation": continuous_quaternions(body.rotation, scalar_first=False)}
         if len(body.translation) > 1:
             tracks["translation"] = body.translation
@@ -63,8 +61,10 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
             target = gltf.AnimationChannelTarget(node=number, path=name)
             grasp.channels.append(gltf.AnimationChannel(sampler=len(grasp.samplers), target=target))
             grasp.samplers.append(gltf.AnimationSampler(input=time, output=_add(file, data, values)))
+    _add_skin(file, data, skin)
     file.animations = [grasp]
-    file.scene, file.scenes = 0, [gltf.Scene(name=motion.object, nodes=[0])]
+    # A skinned mesh follows its joints alone: its own node stands at the root.
+    file.scene, file.scenes = 0, [gltf.Scene(name=motion.object, nodes=[0, len(file.nodes) - 1])]
     file.buffers = [gltf.Buffer(byteLength=len(data))]
     file.set_binary_blob(bytes(data))
     file.save_binary(str(path))
@@ -73,13 +73,20 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 def _add(
     file: gltf.GLTF2, data: bytearray, values: np.ndarray, target: int | None = None, *, bounds: bool = False
 ) -> int:
-    """Appends values (n,), (n, 3) or (n, 4) to the buffer; integers are indices. Returns the new accessor's number."""
+    """Appends values (n,), (n, 3), (n, 4) or (n, 4, 4) to the buffer; returns the new accessor's number.
+
+    Integers (n,) are indices, (n, 4) numbers of joints; matrices are given by rows.
+    """
     whole = np.issubdtype(values.dtype, np.integer)
-    values = np.ascontiguousarray(values, "<u4" if whole else "<f4")
+    kind = ("<u4", gltf.UNSIGNED_INT) if whole and values.ndim == 1 else ("<u2", gltf.UNSIGNED_SHORT)
+    kind = kind if whole else ("<f4", gltf.FLOAT)
+    if values.ndim == 3:
+        values = values.swapaxes(1, 2).reshape(-1, 16)  # by columns
+    values = np.ascontiguousarray(values, kind[0])
     view = gltf.BufferView(buffer=0, byteOffset=len(data), byteLength=values.nbytes, target=target)
     accessor = gltf.Accessor(
         bufferView=len(file.bufferViews),
-        componentType=gltf.UNSIGNED_INT if whole else gltf.FLOAT,
+        componentType=kind[1],
         count=len(values),
         type=_KINDS[1 if values.ndim == 1 else values.shape[1]],
     )
@@ -91,8 +98,8 @@ def _add(
     return len(file.accessors) - 1
 
 
-def _primitive(file: gltf.GLTF2, data: bytearray, name: str, mesh: trimesh.Trimesh) -> gltf.Primitive:
-    """A body's mesh with normals and its material."""
+def _primitive(file: gltf.GLTF2, data: bytearray, mesh: trimesh.Trimesh) -> gltf.Primitive:
+    """The object's mesh with normals and its material."""
     normals = mesh.vertex_normals
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(lengths > 0.5, normals / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])  # of unused vertices
@@ -101,23 +108,30 @@ def _primitive(file: gltf.GLTF2, data: bytearray, name: str, mesh: trimesh.Trime
         NORMAL=_add(file, data, normals, gltf.ARRAY_BUFFER),
     )
     indices = _add(file, data, mesh.faces.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
-    material = list(COLOURS).index(OBJECT if name == OBJECT else "hand")
-    return gltf.Primitive(attributes=attributes, indices=indices, material=material)
+    return gltf.Primitive(attributes=attributes, indices=indices, material=len(file.materials) - 1)
 
 
-def _link_mesh(motion: GraspMotion, link: int) -> Any:
-    """The link's capsules in its frame; None if it has none."""
-    parts = []
-    for _, length, radius, middle, turn in capsules(motion, link):
-        part = trimesh.creation.capsule(length, radius, _SECTIONS)
-        part.apply_translation(-part.bounds.mean(0))
-        parts.append(part.apply_transform(pose_matrices(middle[None], turn)[0]))
-    return trimesh.util.concatenate(parts) if parts else None
-
-
-def _object_mesh(motion: GraspMotion) -> trimesh.Trimesh:
-    """The object's mesh in its frame."""
-    return trimesh.Trimesh(motion.object_vertices, motion.object_faces, process=False)
+def _add_skin(file: gltf.GLTF2, data: bytearray, skin: Skin) -> None:
+    """Adds the hand's surface as a node of its own, whose skin has the links' nodes (from 1 on) as joints."""
+    links, weights = skin.influences()
+    attributes = gltf.Attributes(
+        POSITION=_add(file, data, skin.points, gltf.ARRAY_BUFFER, bounds=True),
+        NORMAL=_add(file, data, skin.normals, gltf.ARRAY_BUFFER),
+        JOINTS_0=_add(file, data, links, gltf.ARRAY_BUFFER),
+        WEIGHTS_0=_add(file, data, weights, gltf.ARRAY_BUFFER),
+    )
+    of_joints = skin.joint[skin.faces[:, 0]]
+    primitives = []
+    for material, part in enumerate((skin.faces[~of_joints], skin.faces[of_joints])):
+        if len(part):
+            indices = _add(file, data, part.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
+            primitives.append(gltf.Primitive(attributes=attributes, indices=indices, material=material))
+    inverse = np.tile(np.eye(4), (len(skin.origins), 1, 1))
+    inverse[:, :3, 3] = -skin.origins
+    joints = [1 + link for link in range(len(skin.origins))]
+    file.skins = [gltf.Skin(name=SKIN, joints=joints, inverseBindMatrices=_add(file, data, inverse))]
+    file.nodes.append(gltf.Node(name=SKIN, mesh=len(file.meshes), skin=0))
+    file.meshes.append(gltf.Mesh(name=SKIN, primitives=primitives))
 
 
 def read(path: pathlib.Path) -> list[Track]:
@@ -137,7 +151,10 @@ def read(path: pathlib.Path) -> list[Track]:
 
     time = values(animation["samplers"][0]["input"])[:, 0]
     local = [
-        {"translation": np.array([node.get("translation", [0, 0, 0])]), "rotation": np.array([node["rotation"]])}
+        {
+            "translation": np.array([node.get("translation", [0, 0, 0])]),
+            "rotation": np.array([node.get("rotation", [0, 0, 0, 1])]),
+        }
         for node in nodes
     ]
     for channel in animation["channels"]:
@@ -154,7 +171,8 @@ def read(path: pathlib.Path) -> list[Track]:
             visit(child, poses[name])
 
     for root in document["scenes"][document["scene"]]["nodes"]:
-        visit(root, FROM_Y_UP)
+        if "skin" not in nodes[root]:
+            visit(root, FROM_Y_UP)
     del poses["world"]
     mesh = trimesh.load_scene(path, process=False).geometry[OBJECT]
     return [Track(time, poses, np.asarray(mesh.triangles))]

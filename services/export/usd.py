@@ -1,6 +1,7 @@
 """USD as text (.usda) with time samples; written by Pixar's own library, read back from the text without it.
 
-One Xform a link, nested as the hand is; capsules are USD's own, the object is a mesh.
+One Xform a link, nested as the hand is, with USD's own capsules as guides; the object is a mesh. The hand's surface is
+skinned: a skeleton of the links with an animation moves it (UsdSkel).
 """
 
 import ast
@@ -11,12 +12,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 
+from common.hands.skin import Skin
 from services.export.frames import (
     COLOURS,
     OBJECT,
+    SKIN,
+    Body,
     Track,
     bodies,
     capsules,
@@ -24,6 +28,7 @@ from services.export.frames import (
     facts,
     identifiers,
     pose_matrices,
+    skin_of_motion,
 )
 from services.export.motion_file import GraspMotion
 
@@ -46,7 +51,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     root = UsdGeom.Xform.Define(stage, "/grasp")
     stage.SetDefaultPrim(root.GetPrim())
     found, paths = bodies(motion), [root.GetPath()]
-    for i, (body, name) in enumerate(zip(found, identifiers([body.name for body in found]), strict=True)):
+    for i, (body, name) in enumerate(zip(found, identifiers([SKIN, *(body.name for body in found)])[1:], strict=True)):
         xform = UsdGeom.Xform.Define(stage, paths[body.parent + 1].AppendChild(name))
         paths.append(xform.GetPath())
         xform.GetPrim().CreateAttribute(_NAME, Sdf.ValueTypeNames.String, True).Set(body.name)
@@ -61,32 +66,82 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
             _add_mesh(stage, paths[-1], motion)
         else:
             _add_capsules(stage, paths[-1], motion, i)
+    _add_skin(stage, root.GetPath().AppendChild(SKIN), skin_of_motion(motion), found[:-1])
     stage.Save()
 
 
 def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link: int) -> None:
-    """The link's capsules in its frame."""
+    """The link's capsules in its frame, what physics knows of it; viewers hide guides."""
     for number, length, radius, middle, turn in capsules(motion, link):
         capsule = UsdGeom.Capsule.Define(stage, parent.AppendChild(f"capsule_{number}"))
+        capsule.CreatePurposeAttr(UsdGeom.Tokens.guide)
         capsule.CreateAxisAttr(UsdGeom.Tokens.z)
         capsule.CreateHeightAttr(length)
         capsule.CreateRadiusAttr(radius)
         capsule.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(capsule, Usd.TimeCode.Default()))
-        capsule.CreateDisplayColorAttr([COLOURS["hand"]])
+        capsule.CreateDisplayColorAttr([COLOURS["link"]])
         capsule.AddTranslateOp(_DOUBLE).Set(Gf.Vec3d(*middle))
         capsule.AddOrientOp(_DOUBLE).Set(Gf.Quatd(*turn.as_quat(scalar_first=True)))
 
 
 def _add_mesh(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion) -> None:
     """The object's mesh in its frame."""
-    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(motion.object_vertices, np.float32))
-    mesh = UsdGeom.Mesh.Define(stage, parent.AppendChild("mesh"))
+    mesh = _new_mesh(stage, parent.AppendChild("mesh"), motion.object_vertices, motion.object_faces)
+    mesh.CreateDisplayColorAttr([COLOURS[OBJECT]])
+
+
+def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body]) -> None:
+    """The hand's surface, a skeleton of its links, and the animation of these."""
+    root = UsdSkel.Root.Define(stage, path)
+    skeleton = UsdSkel.Skeleton.Define(stage, path.AppendChild("skeleton"))
+    animation = UsdSkel.Animation.Define(stage, path.AppendChild("animation"))
+    names: list[str] = []
+    for link, name in zip(links, identifiers([link.name for link in links]), strict=True):
+        names.append(f"{names[link.parent]}/{name}" if link.parent >= 0 else name)
+    parents = np.array([skin.origins[link.parent] if link.parent >= 0 else np.zeros(3) for link in links])
+    skeleton.CreateJointsAttr(names)
+    skeleton.CreateBindTransformsAttr([Gf.Matrix4d().SetTranslate(Gf.Vec3d(*o)) for o in skin.origins])
+    skeleton.CreateRestTransformsAttr([Gf.Matrix4d().SetTranslate(Gf.Vec3d(*o)) for o in skin.origins - parents])
+    animation.CreateJointsAttr(names)
+    animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)] * len(links))
+    turns = np.stack([continuous_quaternions(link.rotation, scalar_first=True) for link in links], 1)
+    places = np.stack([np.broadcast_to(link.translation, (len(turns), 3)) for link in links], 1)
+    rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
+    for t, (turn, place) in enumerate(zip(turns, places, strict=True)):
+        rotations.Set([Gf.Quatf(*map(float, q)) for q in turn], t)
+        translations.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(place, np.float32)), t)
+    _add_surface(stage, path.AppendChild("mesh"), skin, skeleton)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    UsdSkel.BindingAPI.Apply(root.GetPrim())
+
+
+def _add_surface(stage: Usd.Stage, path: Sdf.Path, skin: Skin, skeleton: UsdSkel.Skeleton) -> None:
+    """The hand's surface, bound to a skeleton of its links."""
+    mesh = _new_mesh(stage, path, skin.points, skin.faces)
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(skin.normals))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    own = COLOURS["flesh" if skin.flesh else "link"]
+    colours = np.where(skin.joint[:, None], COLOURS["joint"], own).astype(np.float32)
+    colour = mesh.CreateDisplayColorAttr(Vt.Vec3fArray.FromNumpy(colours))
+    UsdGeom.Primvar(colour).SetInterpolation(UsdGeom.Tokens.vertex)
+    influences, weights = skin.influences()
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateJointIndicesPrimvar(False, 4).Set(influences.ravel().tolist())
+    binding.CreateJointWeightsPrimvar(False, 4).Set(weights.ravel().tolist())
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+
+
+def _new_mesh(stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.ndarray) -> UsdGeom.Mesh:
+    """A mesh of triangles, not subdivided."""
+    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, np.float32))
+    mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreatePointsAttr(points)
-    mesh.CreateFaceVertexCountsAttr([3] * len(motion.object_faces))
-    mesh.CreateFaceVertexIndicesAttr(motion.object_faces.ravel().tolist())
+    mesh.CreateFaceVertexCountsAttr([3] * len(faces))
+    mesh.CreateFaceVertexIndicesAttr(faces.ravel().tolist())
     mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
-    mesh.CreateDisplayColorAttr([COLOURS[OBJECT]])
+    return mesh
 
 
 def read(path: pathlib.Path) -> list[Track]:
@@ -103,7 +158,7 @@ def read(path: pathlib.Path) -> list[Track]:
             assert prim["xformOpOrder"] == ["xformOp:translate", "xformOp:orient"]
             place, turn = (_samples(prim, name, len(codes)) for name in prim["xformOpOrder"])
             parent = poses[prim[_NAME]] = parent @ pose_matrices(place, Rotation.from_quat(turn, scalar_first=True))
-        elif "faceVertexIndices" in prim:
+        elif "faceVertexIndices" in prim and "skel:skeleton" not in prim:
             corners.append(np.array(prim["points"])[prim["faceVertexIndices"]].reshape(-1, 3, 3))
         for name, child in prim.items():
             if name.startswith("/"):
@@ -134,5 +189,6 @@ def _parse(text: str) -> dict[str, Any]:
             open_blocks[-1][found[1] if found else prim] = block
             open_blocks.append(block)
         elif found:
-            open_blocks[-1][found[1]] = ast.literal_eval(found[2])
+            value = found[2].removesuffix(" (")  # meta data of the attribute follow
+            open_blocks[-1][found[1]] = value if value.startswith("<") else ast.literal_eval(value)
     return layer

@@ -34,6 +34,8 @@ def headings(
     for r, (cleared, room) in enumerate(
         zip(*within_reach(found, obj.rest_poses, outline(hand), back_off), strict=True)
     ):
+        if request.rest not in (None, r):
+            continue
         if request.above:
             room &= above(cleared, obj.rest_poses[r])
         for h in np.flatnonzero(room):
@@ -49,6 +51,11 @@ def headings(
 
 def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
     """Error and remedy where the table leaves room for no approach."""
+    if request.rest is not None:
+        return (
+            f"'{obj.name}' cannot be approached as it is asked for in resting pose {request.rest + 1}.",
+            "Leave out --rest, or set another --heading.",
+        )
     if request.given("heading", "direction") is None:
         return (
             f"'{obj.name}' cannot be approached in any of its resting poses.",

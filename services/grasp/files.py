@@ -16,17 +16,26 @@ from services.grasp.grasper import Grasp
 from services.record.channels import JsonChannels
 from services.record.scene import episode_entries
 from services.record.writer import LogWriter
-from services.viz.render import best_camera, episode_sheet, render_episode_frames, save_episode_video
+from services.viz.render import (
+    best_camera,
+    episode_sheet,
+    grasp_picture,
+    grasp_steps,
+    render_episode_frames,
+    save_episode_video,
+)
 from services.viz.sheets import save_png
 
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
+PORTRAIT = "portrait.png"
+"""Its last frame, 1280 x 720, with a view from the thumb's side."""
 THUMBNAIL = "thumbnail.png"
 """A picture of its last frame."""
 OBJECT = "object.png"
 """Pictures of the object before and after its import."""
 
 
-_SMALL, _VIDEO = (320, 240), (480, 360)  # pixels
+_SMALL, _VIDEO = (320, 240), (854, 480)  # pixels
 
 
 def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: bool, about: dict[str, Any]) -> None:
@@ -46,22 +55,23 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
     save_motion(folder / MOTION, found.motion)
     save_recording(folder / RECORDING, found.episode)
     episode = found.episode
-    steps = _steps_to_draw(np.asarray(episode.arrays["table"], bool))
+    steps = _steps_to_draw(*grasp_steps(episode), len(episode.arrays["table"]) - 1)
     last = steps[-1]
     camera = best_camera(episode, steps) if pictures or video else None
     if pictures:
         save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera))
+        save_png(folder / PORTRAIT, grasp_picture(episode, last))
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if video:
         save_episode_video(folder / VIDEO, episode, _VIDEO, camera)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 
 
-def _steps_to_draw(table: np.ndarray) -> list[int]:
-    """Steps of a grasp worth seeing: six of the approach, one while it is held, and the last."""
-    removal, last = int(table.sum()), len(table) - 1
-    approach = np.linspace(0, min(removal, last), 6)
-    return sorted({round(step) for step in [*approach, (removal + last) / 2, last]})
+def _steps_to_draw(first: int, end: int, last: int) -> list[int]:
+    """Up to eight steps worth seeing: before a grasp begins at `first`, of it, after its `end`, and the last."""
+    reach = [0, first / 2] if first else []
+    grasp = np.linspace(first, min(end, last), 6 - len(reach))
+    return sorted({round(step) for step in [*reach, *grasp, (end + last) / 2, last]})
 
 
 def save_recording(path: pathlib.Path, episode: Message) -> None:

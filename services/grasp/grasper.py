@@ -9,12 +9,13 @@ from typing import Any
 
 import jax
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from actors.attempts import Attempts, Outcome
 from actors.initial import RequestedEpisodes
 from actors.protocols import ASSESSED
 from common.config import TaskConfig
-from common.errors import ContradictionError
+from common.errors import CongraspError, ContradictionError
 from common.hands import get_hand
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
@@ -32,6 +33,7 @@ from services.assets.objects.options import ImportOptions
 from services.export.motion_file import GraspMotion, motion_of_episode
 from services.grasp.approaches import headings, prescribed, valid_rests
 from services.grasp.parse import read_request
+from services.grasp.reach import Reach, plan_reach, with_reach
 
 ATTEMPTS = 16
 """Grasps that are simulated side by side."""
@@ -48,6 +50,7 @@ _UNLIKELY = 0.5
 _TOUCHED = 0.2
 """Share of touches on what must not be touched from which others are attempted."""
 
+_BEGIN = ("object_position", "object_quaternion", "link_position", "link_quaternion", "q", "goal/heading_direction")
 Progress = Callable[[str, int, int], None]
 """Told what is done, how much of it, and of how much."""
 
@@ -83,7 +86,8 @@ class Grasp:
             "held_quarter_second": self.motion.success,
             "tries": self.attempts,
             "tries_held": self.held,
-            "rest": self.rest,
+            "rest": self.rest + 1,
+            "phases": self.motion.about.get("phases", {}),
             "constraints": list(self.motion.constraints),
             "links_at_removal": self.motion.metrics["links_at_removal"],
             **{name: value for name, value in self.motion.metrics.items() if name in ASSESSED},
@@ -101,6 +105,8 @@ class Grasper:
         attempts: int = ATTEMPTS,
         rounds: int = ROUNDS,
         seconds: float = HOLD_SECONDS,
+        approach: float = 0.0,
+        lift: float = 0.0,
         threads: int = 0,
         seed: int = 0,
     ):
@@ -110,7 +116,9 @@ class Grasper:
           policy: the policy, which names the hand.
           attempts: grasps side by side.
           rounds: how often that many others are attempted while none holds.
-          seconds: how long the object should be held without the table.
+          seconds: how long the object should be held without the table, or after the lift.
+          approach: seconds in which the hand comes from beside the table to where the grasp begins, before it.
+          lift: metres by which the hand lifts the object off the table, which then stands to the end.
           threads: of the physics; 0 takes one a core.
           seed: draws what is attempted.
         """
@@ -118,8 +126,9 @@ class Grasper:
         self.task = dataclasses.replace(policy.task, end_when_fallen=False)
         self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
         self._compiled = False
+        self._approach, self._lift = approach, lift
         hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
-        self._attempts = Attempts(self.hand, self.task, policy, hold=hold, threads=threads or cores())
+        self._attempts = Attempts(self.hand, self.task, policy, hold=hold, lift=lift, threads=threads or cores())
 
     def grasp(
         self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
@@ -149,7 +158,9 @@ class Grasper:
                 obj, episodes, functools.partial(lambda what, step: progress(what, step, self._attempts.steps), what)
             )
             _check_aligned(outcome)
-            cost = (costs(outcome, tuple(request.constraints)) + _UNLIKELY * rests)[:different]
+            removal = self.task.approach_steps - 1
+            cost = costs(outcome, tuple(request.constraints), removal, self._lift)
+            cost = (cost + _UNLIKELY * _places(rests, request))[:different]
             attempted += different
             holds = outcome.metrics["held"][:different] > 0
             held += int(holds.sum())
@@ -184,6 +195,13 @@ class Grasper:
             different = batch
         else:
             reference = valid_rests(self.hand, obj, *path)
+            if request.rest is not None:
+                reference = reference[reference == request.rest]
+            if not len(reference):
+                raise CongraspError(
+                    f"With this reference the hand would be in the table in resting pose {(request.rest or 0) + 1}.",
+                    "Leave out --rest.",
+                )
             rests, different = np.resize(reference, batch), min(batch, len(reference))
         return episodes._replace(rest=np.asarray(obj.rest_poses, np.float32)[rests]), rests, different
 
@@ -208,12 +226,23 @@ class Grasper:
             "object_file_origin": [-x for x in obj.origin],
         }
         episode = self._attempts.episode(outcome, index, surface_of(self.task, labelled), obj, about)
+        if self._approach:
+            episode = with_reach(episode, self.hand, self._reach(obj, episode))
         asked = tuple(request.constraints)
         active = explain(asked, bool(outcome.redirected[index]))
         written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
         avoid = labelled.non_graspable_points
         active += [found.message for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
         return Grasp(episode, motion_of_episode(episode), attempts, held, rest, tuple(active))
+
+    def _reach(self, obj: GraspObject, episode: Message) -> Reach:
+        """The way from beside the table to where an episode begins."""
+        arrays = {name: np.asarray(value, float) for name, value in episode.arrays.items() if name in _BEGIN}
+        rest = np.concatenate([arrays["object_position"][0], arrays["object_quaternion"][0]])
+        turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
+        first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
+        heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(arrays["goal/heading_direction"])
+        return plan_reach(self.hand, obj, rest, heading, first, self._approach, self.task.control_dt)
 
 
 def grasp(
@@ -286,13 +315,25 @@ def _errors_of(constraints: tuple[str, ...]) -> list[str]:
     return [*names, "moved_at_removal", "force_link_max"]
 
 
-def costs(outcome: Outcome, constraints: tuple[str, ...]) -> np.ndarray:
-    """(B,) cost of each attempt: first whether it held, then whether it did for a while, then all the rest."""
+def costs(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float = 0.0) -> np.ndarray:
+    """(B,) cost of each attempt: first whether it held, then whether it did for a while, then all the rest.
+
+    Args:
+      outcome: of the attempts.
+      constraints: names of those that were asked for.
+      removal: the last control step of the approach.
+      lift: metres by which the hand went up after it.
+    """
     place = outcome.trace.object_position
-    removal = int(np.asarray(outcome.trace.table[:, 0]).sum()) - 1
-    values = {**outcome.metrics, "slip": np.linalg.norm(place[-1] - place[removal], axis=-1)}
+    way = place[-1] - place[removal] - [0.0, 0.0, lift]
+    values = {**outcome.metrics, "slip": np.linalg.norm(way, axis=-1)}
     cost = sum(np.minimum(values[name] / _SCALES[name], 10.0) for name in [*_errors_of(constraints), "slip"])
     return np.asarray(cost) + 1e3 * (values["success"] == 0) + 1e4 * (values["held"] == 0)
+
+
+def _places(rests: np.ndarray, request: GraspRequest) -> np.ndarray:
+    """(B,) places down the list of likely resting poses; none where one was asked for."""
+    return rests if request.rest is None else np.zeros_like(rests)
 
 
 def _check_aligned(outcome: Outcome) -> None:

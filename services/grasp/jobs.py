@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 import pathlib
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -13,7 +14,10 @@ from PIL import Image
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.inputs import file_name
+from common.objects.procedural import MASS_RANGE
+from common.objects.shapes import matrix
 from common.objects.spec import GraspObject
+from common.objects.store import Catalogue
 from services.assets.objects.named import ObjectAt, objects_at
 from services.assets.objects.options import ImportOptions, check_options
 from services.assets.objects.sizes import size_in_words
@@ -25,6 +29,7 @@ from services.viz.sheets import contact_sheet, save_png
 
 SHEET, SUMMARY = "summary.png", "summary.json"
 _COLUMNS = 6
+_UPRIGHT = 0.87  # cosine of the angle between the file's z axis and the vertical, at least
 
 
 class Settings(NamedTuple):
@@ -40,6 +45,8 @@ class Settings(NamedTuple):
     pictures: bool
     again: bool
     """Whether to redo finished objects."""
+    rest: str = ""
+    """Resting pose: `upright` or a number from 1 on; any where empty."""
 
 
 class Result(NamedTuple):
@@ -73,8 +80,10 @@ def _shown(facts: dict[str, Any], stem: str) -> str:
     return f"{np.degrees(facts[f'{stem}_rad']):.0f}° and {1000 * facts[f'{stem}_m']:.0f} mm"
 
 
-def find_objects(paths: Sequence[pathlib.Path]) -> tuple[list[ObjectAt], list[Result]]:
+def find_objects(paths: Sequence[pathlib.Path], folder: str = "objects") -> tuple[list[ObjectAt], list[Result]]:
     """The objects of some paths (meshes, object files, folders of either), and errors of paths that hold none.
+
+    A path that is not there may be the name of an object in `folder`.
 
     The objects have different names, which become those of their folders.
     """
@@ -82,10 +91,16 @@ def find_objects(paths: Sequence[pathlib.Path]) -> tuple[list[ObjectAt], list[Re
     errors: list[Result] = []
     for path in paths:
         try:
-            found += objects_at(path)
+            stored = Catalogue(folder).path(str(path)) if _is_name(path) else path
+            found += objects_at(stored if stored.is_file() else path)
         except CongraspError as error:
             errors.append(Result(path.name, {}, str(error)))
     return [one._replace(name=name) for one, name in zip(found, _distinct(found), strict=True)], errors
+
+
+def _is_name(path: pathlib.Path) -> bool:
+    """Whether a path may be an object's name: there is no such file, and it has neither a folder nor a suffix."""
+    return not path.exists() and path.name == str(path) and not path.suffix and ":" not in path.name
 
 
 def _distinct(found: Sequence[ObjectAt]) -> Iterator[str]:
@@ -106,13 +121,15 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             if text
         }
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
-        key = key_of(_content(at), options, given, settings.identity)
+        key = key_of(_content(at), options, given, settings.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
         if before is not None and ((folder / VIDEO).exists() or not settings.video):
             return Result(at.name, before, skipped=True)
         progress("Importing", 0, 1)
         obj = _load(at, settings.options)
         request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **settings.constraints)
+        if settings.rest:
+            request = dataclasses.replace(request, rest=rest_pose(obj, settings.rest))
         if settings.pictures and at.source:
             save_png(folder / OBJECT, import_sheet(grasper.hand, obj, mesh_of_file(at.source)))
         found = grasper.grasp(obj, request, progress)
@@ -122,13 +139,45 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "file": str(at.path),
             "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
             "mass": obj.mass,
-            "notes": list(obj.notes),
+            "notes": [*obj.notes, *_notes(at, obj, settings.options)],
             "rules": list(found.active),
         }
         save_grasp(folder, found, video=settings.video, pictures=settings.pictures, about=about)
         return Result(at.name, {**found.facts(), **about})
     except CongraspError as error:
         return Result(at.name, {}, str(error))
+
+
+def rest_pose(obj: GraspObject, text: str) -> int:
+    """The resting pose that a user means: its number from 1 on, or `upright`, with the file's z axis up.
+
+    Raises:
+      CongraspError: the object has none of the kind.
+    """
+    count = len(obj.rest_poses)
+    if text == "upright":
+        up = [float(matrix(np.asarray(pose[3:]))[2, 2]) for pose in obj.rest_poses]
+        best = int(np.argmax(up))
+        if up[best] < _UPRIGHT:
+            raise CongraspError(
+                f"'{obj.name}' does not rest with its z axis up in any of its {count} resting poses.",
+                f"Set --rest to a number from 1 to {count}: congrasp objects rests {obj.name} --png rests.png",
+            )
+        return best
+    if not text.isdigit() or not 1 <= int(text) <= count:
+        raise CongraspError(f"--rest is '{text}'.", f"'{obj.name}' has resting poses 1 to {count}; or set upright.")
+    return int(text) - 1
+
+
+def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
+    """What is said of a mesh's mass, beside the notes of its import."""
+    if not at.source or options.mass is not None:
+        return []
+    grams = f"{1000 * obj.mass:.0f} g"
+    bound = next((limit for limit in MASS_RANGE if math.isclose(obj.mass, limit, rel_tol=1e-3)), None)
+    if bound is None:
+        return [f"its mass is {grams} (--density {options.density:g} kg/m³; --mass sets another)"]
+    return [f"its mass is {grams}, a limit for masses from --density {options.density:g} kg/m³; --mass sets another"]
 
 
 def _content(at: ObjectAt) -> str:

@@ -27,6 +27,7 @@ from services.assets.objects.headers import check_header
 from services.assets.objects.sizes import size_in_words
 from services.export.frames import continuous_quaternions
 from services.export.motion_file import GraspMotion, load_motion
+from services.record.goals import phases_of
 
 ABOVE = "above"
 """The heading straight down, whatever the object's pose."""
@@ -196,7 +197,7 @@ def _pose(written: Written) -> dict[str, np.ndarray] | None:
     path, index = numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand)
-        last = _removal(motion)
+        last = grasp_part(motion)[1]
         position, quaternion = _wrist_on_object(motion, last)
         return _reference(motion.joint_position[last], position[last], quaternion[last])
     if path.name.endswith(constraint_sets.SUFFIX):
@@ -231,9 +232,9 @@ def _trajectory(written: Written) -> dict[str, np.ndarray] | None:
     path, index = numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand)
-        position, quaternion = _wrist_on_object(motion, 0)
-        last = _removal(motion) + 1
-        return _resampled(position[:last], quaternion[:last], waypoints, str(path))
+        first, last = grasp_part(motion)
+        position, quaternion = _wrist_on_object(motion, first)
+        return _resampled(position[first : last + 1], quaternion[first : last + 1], waypoints, str(path))
     if path.name.endswith(constraint_sets.SUFFIX):
         arrays = _set_of(path, hand, obj, index).arrays
         position, quaternion = (arrays[f"trajectory/{name}"][0, index] for name in ("position", "quaternion"))
@@ -269,9 +270,12 @@ def _motion(path: pathlib.Path, hand: Hand) -> GraspMotion:
     return motion
 
 
-def _removal(motion: GraspMotion) -> int:
-    """The last frame with the table."""
-    return max(int(motion.table.sum()) - 1, 0)
+def grasp_part(motion: GraspMotion) -> tuple[int, int]:
+    """The first frame of the grasp itself, and the last one before the lift or the table's removal."""
+    phases, last = phases_of(motion.about), len(motion.time) - 1
+    end = round(phases["lift"] / motion.control_dt) if "lift" in phases else int(motion.table.sum())
+    end = min(max(end - 1, 0), last)
+    return min(round(phases.get("grasp", 0.0) / motion.control_dt), end), end
 
 
 def _wrist_on_object(motion: GraspMotion, frame: int) -> tuple[np.ndarray, np.ndarray]:

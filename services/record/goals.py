@@ -1,11 +1,13 @@
-"""What an episode's message says about its constraints."""
+"""What an episode's message says about its constraints and its phases."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from common.task.constraints import CONSTRAINTS
 
+_LATEST = 1e4  # s
 _OLDER = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 """Blocks of the `goal/mask` of recordings that name none."""
 
@@ -22,3 +24,10 @@ def active_constraints(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
     """Names of the active constraints, weakest first; the heading always is."""
     blocks = active_blocks(arrays)
     return tuple(c.name for c in CONSTRAINTS if not c.optional or any(blocks.get(block) for block in c.blocks))
+
+
+def phases_of(meta: Mapping[str, Any]) -> dict[str, float]:
+    """When phases of an episode or a motion begin (approach, grasp, lift, hold), s; what is no time is left out."""
+    found = meta.get("phases")
+    times = found.items() if isinstance(found, dict) else ()
+    return {str(name): float(time) for name, time in times if isinstance(time, int | float) and 0 <= time < _LATEST}

@@ -3,6 +3,10 @@
 Colour = tuple[float, float, float]
 
 SKIN: Colour = (0.70, 0.73, 0.79)
+"""Of robots' links, and of capsules."""
+FLESH: Colour = (0.86, 0.65, 0.54)
+JOINT: Colour = (0.30, 0.32, 0.37)
+"""Of robots' joints."""
 OBJECT: Colour = (0.95, 0.62, 0.24)
 TABLE: Colour = (0.80, 0.79, 0.77)
 HEADING: Colour = (0.22, 0.40, 0.86)

@@ -58,7 +58,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
         for m in chosen:
             wrist = turn * Rotation.from_quat(arrays["pose/quaternion"][v, m], scalar_first=True)
             position = turn.apply(arrays["pose/position"][v, m]) + place[:3]
-            shapes += posed_hand(hand, arrays["pose/q"][v, m], position, wrist)
+            shapes.append(posed_hand(hand, arrays["pose/q"][v, m], position, wrist))
         return shapes
 
     avoid = arrays["surface/minus"]

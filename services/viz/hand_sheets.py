@@ -6,7 +6,7 @@ import numpy as np
 
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand, link_origin
-from services.record.palette import HEADING, OBJECT, SKIN, WAYPOINT
+from services.record.palette import HEADING, OBJECT, WAYPOINT
 from services.viz.raster import render_scene
 from services.viz.scene import Shape
 from services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, upright
@@ -17,8 +17,8 @@ _VIEW = np.array([0.75, 0.65, 0.35])
 
 def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = ()) -> list[Shape]:
     """The hand upright with finger angles (F,), some of its links in another colour."""
-    colours = [OBJECT if i in moved else SKIN for i in range(len(hand.links))]
-    return posed_hand(hand, q, np.zeros(3), upright(hand), colours)
+    shares = np.isin(np.arange(len(hand.links)), moved)
+    return [posed_hand(hand, q, np.zeros(3), upright(hand), OBJECT, shares)]
 
 
 def _poses(hand: Hand) -> dict[str, list[Shape]]:

@@ -82,7 +82,7 @@ def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
     ]
     turn = upright(hand)
     standing = posed_hand(hand, hand.q_open, np.zeros(3), turn)
-    own = np.concatenate([shape_points(shape) for shape in standing])
+    own = shape_points(standing)
     side = (high[1] - low[1]) / 2 + _GAP - own[:, 1].min()
     place = np.array([-own[:, 0].mean(), side, -own[:, 2].min()])
-    return shapes + posed_hand(hand, hand.q_open, place, turn)
+    return [*shapes, posed_hand(hand, hand.q_open, place, turn)]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.viz.light import light_on
+from services.viz.light import FEW, MANY, light_on
 from services.viz.scene import Camera, Shape
 from services.viz.spans import Spans, spans
 from services.viz.triangles import GAMMA, Triangles, joined, triangles_of
@@ -13,6 +13,7 @@ SAMPLES = 2
 """Samples along each side of a pixel."""
 _KEY_STRENGTH, _SKY_STRENGTH, _BOUNCE = 0.70, 0.50, 0.05
 _NEAR = 0.01  # m
+_LARGE = 500_000  # pixels
 _TOP, _BOTTOM = np.array([0.93, 0.945, 0.965]), np.array([0.80, 0.82, 0.85])  # background, sRGB
 
 
@@ -32,7 +33,8 @@ def render_scene(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int] 
     bodies = _turned(triangles_of(shape for shape in solid if shape.kind != "cylinder"), camera)
     casting = triangles_of((shape for shape in solid if shape.shadow), fine=False)
     lit = joined([table, bodies])
-    light = light_on(lit.points, lit.normals, casting, camera.key_light())
+    lamps = MANY if size[0] * size[1] > _LARGE else FEW
+    light = light_on(lit.points, lit.normals, casting, camera.key_light(), lamps)
     coarse = _Picture(camera, *size)  # the table has hardly an edge: one sample a pixel is enough
     coarse.add(table, light[: len(table.points)])
     picture = coarse.finer()

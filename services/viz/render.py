@@ -8,38 +8,44 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.hands import known_hand
+from common.hands.skin import skin_of
 from common.hands.spec import Hand
 from common.parallel import cores
 from common.wire.codec import Message
-from services.record.goals import active_blocks
-from services.record.palette import HEADING, OBJECT, SKIN, WAYPOINT
+from services.record.goals import active_blocks, phases_of
+from services.record.palette import HEADING, OBJECT, WAYPOINT
 from services.viz.raster import render_scene, visible
 from services.viz.scene import Camera, Shape
-from services.viz.shapes import arrow, beads, fit, hand_shapes, posed_hand, table_shape
+from services.viz.shapes import arrow, beads, capsule_shapes, fit, hand_shape, posed_hand, table_shape
 from services.viz.sheets import contact_sheet, save_video
 
 TOUCHING = (0.13, 0.74, 0.63)
 OBJECT_AVOID = (0.72, 0.23, 0.22)
-_FULL_CONTACT = 2.0  # force at which a link takes the full contact colour, N
+_TOUCH = 1e-3  # force from which a link touches, N
+_FULL_CONTACT = 2.0  # force at which a link takes most of the contact colour, N
 _ELEVATION = 24.0  # degrees
 _ARROW_SEARCH, _ARROW_GAP = 0.012, 0.004  # radius in which the approach looks for the object, space before it, m
-_LINK_SPACE = 0.03  # how far a link reaches around its origin, m
+_GAP = 3  # between two views of a picture, pixels
 _FRAME_SECONDS = 0.04  # between two frames of a video
 _FALL = 0.1  # how far the camera follows a falling object, m
 
 
 def episode_shapes(episode: Message, step: int) -> list[Shape]:
     """Hand, object, table and active constraints of one control step of an episode."""
+    return _bodies(episode, step) + _constraints(known_hand(episode.meta["hand"]), episode, step)
+
+
+def _bodies(episode: Message, step: int) -> list[Shape]:
+    """Hand, object and table of one control step of an episode."""
     arrays = episode.arrays
     hand = known_hand(episode.meta["hand"])
     force = np.linalg.norm(arrays["contact_force"][step], axis=-1)
-    share = np.where(force > 1e-3, 0.5 + 0.5 * np.minimum(force / _FULL_CONTACT, 1.0), 0.0)[:, None]
-    colours = [tuple(colour) for colour in share * TOUCHING + (1 - share) * SKIN]
-    shapes = hand_shapes(hand, arrays["link_position"][step], arrays["link_quaternion"][step], colours)
-    shapes.append(_object(episode, step))
+    share = np.where(force > _TOUCH, 0.3 + 0.3 * np.minimum(force / _FULL_CONTACT, 1.0), 0.0)
+    links = arrays["link_position"][step], arrays["link_quaternion"][step]
+    shapes = [hand_shape(hand, *links, TOUCHING, share), _object(episode, step)]
     if arrays["table"][step]:
         shapes.append(table_shape(arrays["object_position"][0]))
-    return shapes + _constraints(hand, episode, step)
+    return shapes
 
 
 def _object(episode: Message, step: int) -> Shape:
@@ -81,22 +87,20 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
     if active.get("pose_finger"):
         wrist = turn * Rotation.from_quat(arrays["goal/pose_quaternion"], scalar_first=True)
         position = turn.apply(arrays["goal/pose_position"]) + origin
-        shapes += posed_hand(hand, arrays["goal/pose_q"], position, wrist, [HEADING] * len(hand.links), alpha=0.25)
+        ghost = posed_hand(hand, arrays["goal/pose_q"], position, wrist, HEADING, np.ones(len(hand.links)), alpha=0.25)
+        shapes.append(ghost)
     return shapes
 
 
 def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -> Camera:
     """A camera that holds everything that happens in the steps, from where object and touching links show most."""
     points = np.concatenate([_extent(episode, step) for step in steps])
-    pictured = [episode_shapes(episode, steps[i]) for i in sorted({len(steps) // 2, len(steps) - 1})]
-    links = sum(len(link.capsules) for link in known_hand(episode.meta["hand"]).links)
+    pictured = [_worths(episode, steps[i]) for i in sorted({len(steps) // 2, len(steps) - 1})]
 
     def score(camera: Camera) -> float:
         """How much of object, touching links and constraints a camera shows."""
         total = 0.0
-        for shapes in pictured:
-            worth = [0.2 if shape.colour == SKIN else 1.0 for shape in shapes[: links + 1]]
-            worth += [0.0 if shape.kind == "cylinder" else 0.5 for shape in shapes[links + 1 :]]
+        for shapes, worth in pictured:
             seen = visible(shapes, camera, (round(72 * aspect), 72))
             total += float(np.array(worth)[seen[seen >= 0]].sum())
         return total
@@ -106,14 +110,26 @@ def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -
     return max((fit(points, direction, aspect) for direction in directions), key=score)
 
 
+def _worths(episode: Message, step: int) -> tuple[list[Shape], list[float]]:
+    """What there is at a step, the hand as capsules, and what a sample of each is worth to a picture."""
+    arrays = episode.arrays
+    hand = known_hand(episode.meta["hand"])
+    capsules = capsule_shapes(hand, arrays["link_position"][step], arrays["link_quaternion"][step])
+    touching = np.linalg.norm(arrays["contact_force"][step], axis=-1)[hand.capsule_links] > _TOUCH
+    rest = episode_shapes(episode, step)[1:]
+    worth = [1.0 if touches else 0.2 for touches in touching]
+    return [*capsules, *rest], [*worth, 1.0, *(0.0 if shape.kind == "cylinder" else 0.5 for shape in rest[1:])]
+
+
 def _extent(episode: Message, step: int) -> np.ndarray:
-    """(N, 3) points that a picture of a step must hold: the links, the corners of the object's box and a trajectory.
+    """(N, 3) points that a picture of a step must hold: the skin, the corners of the object's box and a trajectory.
 
     An object that has fallen far may leave the picture.
     """
     arrays = episode.arrays
-    links = np.asarray(arrays["link_position"][step], float)
-    around = (links[:, None] + _LINK_SPACE * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
+    hand = known_hand(episode.meta["hand"])
+    turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True)
+    around = skin_of(hand).posed(arrays["link_position"][step], turns.as_matrix())[0]
     if arrays["object_position"][step, 2] < arrays["object_position"][0, 2] - _FALL:
         return around
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
@@ -122,6 +138,30 @@ def _extent(episode: Message, step: int) -> np.ndarray:
     if active_blocks(arrays).get("trajectory"):
         points.append(arrays["goal/trajectory_position"])
     return np.concatenate([around, turn.apply(np.concatenate(points)) + arrays["object_position"][step]])
+
+
+def thumb_camera(episode: Message, step: int, aspect: float) -> Camera:
+    """A camera that looks at hand and object of a step from the thumb's side."""
+    hand = known_hand(episode.meta["hand"])
+    wrist = Rotation.from_quat(episode.arrays["link_quaternion"][step, 0], scalar_first=True)
+    knuckles = [hand.keypoints[[link.name for link in hand.links].index(root)] for root in hand.finger_roots]
+    side = wrist.apply(knuckles[0] - np.mean(knuckles[1:], 0)) * [1.0, 1.0, 0.0]
+    if np.linalg.norm(side) < 1e-6:
+        side = np.array([1.0, 0.0, 0.0])
+    direction = side / np.linalg.norm(side) + [0.0, 0.0, np.tan(np.radians(_ELEVATION))]
+    return fit(_extent(episode, step), direction, aspect)
+
+
+def grasp_picture(episode: Message, step: int, size: tuple[int, int] = (1280, 720)) -> np.ndarray:
+    """A step as (height, width, 3) uint8, without constraints: framed on the grasp, and from the thumb's side."""
+    width, height = size
+    left = 2 * width // 3
+    shapes = _bodies(episode, step)
+    cameras = best_camera(episode, [step], left / height), thumb_camera(episode, step, (width - left) / height)
+    widths = left, width - left
+    views = [render_scene(shapes, camera, (w, height)) for camera, w in zip(cameras, widths, strict=True)]
+    views[1][:, :_GAP] = 255
+    return np.concatenate(views, 1)
 
 
 def render_episode_frames(
@@ -163,8 +203,7 @@ def episode_sheet(
     """
     steps = steps or key_steps(np.asarray(episode.arrays["table"], bool), frames)
     dt = float(episode.meta["control_dt"])
-    table = np.asarray(episode.arrays["table"], bool)
-    labels = [f"{dt * step:.2f} s" + ("" if table[step] else "   table removed") for step in steps]
+    labels = [f"{dt * step:.2f} s   {_phase(episode, step)}".rstrip() for step in steps]
     images = list(render_episode_frames(episode, steps, size, camera))
     return contact_sheet(images, labels, columns=min(4, len(steps)), title=episode_title(episode))
 
@@ -198,6 +237,26 @@ def episode_strip(
     ]
 
 
+def grasp_steps(episode: Message) -> tuple[int, int]:
+    """The first step of the grasp itself, and the first one after it: of the lift, or without the table."""
+    phases, dt = phases_of(episode.meta), float(episode.meta["control_dt"])
+    table = np.asarray(episode.arrays["table"], bool)
+    end = min(round(phases["lift"] / dt), len(table)) if "lift" in phases else int(table.sum())
+    return min(round(phases.get("grasp", 0.0) / dt), end), end
+
+
+def _phase(episode: Message, step: int) -> str:
+    """What a step is part of, as far as it is worth saying: approach, lift, hold, or that the table was removed."""
+    if not episode.arrays["table"][step]:
+        return "table removed"
+    phases = phases_of(episode.meta)
+    if not {"approach", "lift"} & phases.keys():
+        return ""
+    time = float(episode.meta["control_dt"]) * step + 1e-6
+    begun = [(begin, name) for name, begin in phases.items() if begin <= time]
+    return max(begun)[1] if begun else ""
+
+
 def key_steps(table: np.ndarray, frames: int) -> list[int]:
     """Steps spread evenly over an episode whose `table` (T,) is present at first; the removal's step is among them."""
     steps = sorted({round(x) for x in np.linspace(0, len(table) - 1, frames)})
@@ -224,9 +283,9 @@ def episode_title(episode: Message) -> str:
 def save_episode_video(
     path: pathlib.Path, episode: Message, size: tuple[int, int] = (640, 480), camera: Camera | None = None
 ) -> None:
-    """An episode as MP4: at half its speed while the table stands, then in real time."""
-    table = np.asarray(episode.arrays["table"], bool)
+    """An episode as MP4: in real time, the grasp itself (before the lift or the table's removal) at half its speed."""
     step = max(1, round(_FRAME_SECONDS / 2 / float(episode.meta["control_dt"])))
-    removal = int(table.sum())
-    steps = [*range(0, removal, step), *range(removal, len(table), 2 * step)]
+    first, end = grasp_steps(episode)
+    last = len(episode.arrays["table"])
+    steps = [*range(0, first, 2 * step), *range(first, end, step), *range(end, last, 2 * step)]
     save_video(path, render_episode_frames(episode, steps, size, camera), size, 1 / _FRAME_SECONDS)

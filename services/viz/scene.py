@@ -18,7 +18,8 @@ class Shape:
     `size` is a radius and a half length along z, zeros for a mesh; `position` (3,) and `quaternion` (4,) are in the
     world. `colour` is sRGB in [0, 1]. With `alpha` below one the shape is seen through, and never casts a `shadow`.
     `vertices` (V, 3) and `faces` (F, 3) belong to a mesh. Where `paint_points` (N, 3) and `paint_colours` (N, 3) are
-    given, each point of a mesh takes the colours of the nearest of them, in the shape's frame.
+    given, each point of a mesh takes the colours of the nearest of them, in the shape's frame. Where `normals` (V, 3)
+    and `colours` (V, 3) are given, the mesh is drawn with these as it is: closed, wound outwards, and fine enough.
     """
 
     kind: Kind
@@ -33,6 +34,8 @@ class Shape:
     faces: np.ndarray | None = None
     paint_points: np.ndarray | None = None
     paint_colours: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    colours: np.ndarray | None = None
 
 
 @dataclasses.dataclass(frozen=True)

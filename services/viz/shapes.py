@@ -8,9 +8,10 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from common.hands.skin import Skin, skin_of
 from common.hands.spec import Hand, capsule_ends
 from services.assets.hands.kinematics import mujoco_link_poses
-from services.record.palette import SKIN, TABLE, Colour
+from services.record.palette import FLESH, JOINT, SKIN, TABLE, Colour
 from services.viz.scene import Camera, Shape, between
 
 _TABLE_RADIUS, _TABLE_HALF_HEIGHT = 0.28, 0.008  # m
@@ -19,28 +20,54 @@ FIELD_OF_VIEW = 26.0
 _SPACE = 1.06  # free space at the picture's edges
 
 
-def hand_shapes(
+def hand_shape(
     hand: Hand,
     position: np.ndarray,
     quaternion: np.ndarray,
-    colours: Sequence[Colour] | None = None,
+    tint: Colour = SKIN,
+    shares: Sequence[float] | np.ndarray | None = None,
     alpha: float = 1.0,
-) -> list[Shape]:
-    """The hand's capsules.
+) -> Shape:
+    """The hand's skin.
 
     Args:
       hand: the hand.
       position: (L, 3) origins of the links' frames in the world.
       quaternion: (L, 4) their orientations.
-      colours: one for each link; skin otherwise.
+      tint: a colour besides the hand's own.
+      shares: (L,) of that colour on each link; none by default.
       alpha: below one the hand is seen through.
     """
+    skin = skin_of(hand)
+    points, normals = skin.posed(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
+    own = skin_colours(skin)
+    share = (skin.weights @ np.asarray(shares, np.float32))[:, None] if shares is not None else 0.0
+    return Shape(
+        "mesh",
+        (0, 0),
+        SKIN,
+        alpha=alpha,
+        shine=0.12,
+        vertices=points,
+        faces=skin.faces,
+        normals=normals,
+        colours=own + share * (np.array(tint) - own),
+    )
+
+
+def skin_colours(skin: Skin) -> np.ndarray:
+    """(V, 3) a skin's own colours."""
+    return np.where(skin.joint[:, None], JOINT, FLESH if skin.flesh else SKIN).astype(np.float32)
+
+
+def capsule_shapes(hand: Hand, position: np.ndarray, quaternion: np.ndarray) -> list[Shape]:
+    """The hand's capsules with its links' frames at positions (L, 3) and orientations (L, 4) in the world."""
     shapes = []
     for i, link in enumerate(hand.links):
         turn = Rotation.from_quat(quaternion[i], scalar_first=True)
         for capsule, ends in zip(link.capsules, capsule_ends(link), strict=True):
             start, end = turn.apply(ends) + position[i]
-            shapes.append(between(start, end, capsule.radius, colours[i] if colours else SKIN, alpha=alpha))
+            shapes.append(between(start, end, capsule.radius, SKIN))
     return shapes
 
 
@@ -49,16 +76,17 @@ def posed_hand(
     q: np.ndarray,
     position: np.ndarray,
     wrist: Rotation,
-    colours: Sequence[Colour] | None = None,
+    tint: Colour = SKIN,
+    shares: Sequence[float] | np.ndarray | None = None,
     alpha: float = 1.0,
-) -> list[Shape]:
+) -> Shape:
     """The hand with finger angles (F,) and its wrist at a position (3,) m and orientation in the world.
 
-    Colours and alpha are those of `hand_shapes`.
+    Tint, shares and alpha are those of `hand_shape`.
     """
     links, quaternion = mujoco_link_poses(hand, q)
     turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
-    return hand_shapes(hand, wrist.apply(links) + position, turned, colours, alpha)
+    return hand_shape(hand, wrist.apply(links) + position, turned, tint, shares, alpha)
 
 
 def table_shape(below: np.ndarray) -> Shape:

@@ -17,7 +17,7 @@ CREASE = np.cos(np.radians(35.0))
 """Faces whose normals differ by more than this angle (given as its cosine) meet in a sharp edge."""
 _SIDE = 0.005  # longest side of a mesh's triangles, m
 _MOST = 12_000  # about how many triangles a mesh is cut into; those of a larger one stay longer
-_RINGS, _SECTIONS = 56, 128  # of a cylinder's faces
+_RINGS, _SECTIONS = 110, 256  # of a cylinder's faces
 
 
 class Triangles(NamedTuple):
@@ -69,7 +69,10 @@ def joined(parts: Sequence[Triangles]) -> Triangles:
 
 def _triangles(shape: Shape, fine: bool) -> Triangles:
     """The triangles of one shape in the world."""
-    if shape.kind == "mesh":
+    if shape.normals is not None and shape.colours is not None:
+        points, normals = (np.asarray(part, np.float32) for part in (shape.vertices, shape.normals))
+        surface = _Surface(points, normals, np.asarray(shape.faces), True, _linear(np.asarray(shape.colours)))
+    elif shape.kind == "mesh":
         surface = _mesh(
             _content(shape.vertices, float),
             _content(shape.faces, int),

@@ -278,9 +278,15 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     attempts = Attempts(HAND, task, policy, hold=5, threads=1, lift=0.06)
     outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
     attempts.close()
-    assert attempts.steps == 30 + 5 + protocols.lift_steps(task, 0.06) == len(outcome.trace.q)
+    lift = protocols.lift_steps(task, 0.06)
+    assert attempts.steps == 30 + lift + 5 == len(outcome.trace.q)
+    dt = task.control_dt
+    assert attempts.phases == {"grasp": 0.0, "lift": 30 * dt, "hold": pytest.approx((30 + lift) * dt)}
     assert set(protocols.ASSESSED) < set(outcome.metrics)
-    way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[34]
-    slid = (outcome.trace.u[-1] - outcome.trace.u[34])[:, :3]
-    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[35:, :, 2], axis=0).max() < 0.02)
+    way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[29]
+    slid = (outcome.trace.u[-1] - outcome.trace.u[29])[:, :3]
+    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[30:, :, 2], axis=0).max() < 0.02)
+    # The untrained hand leaves the object, and the table under it stands: it is where it was, and not held.
+    assert outcome.trace.table.all() and not outcome.metrics["held"].any()
+    assert (outcome.trace.object_position[-1, :, 2] > 0.5 * rest[:, 2]).all()
     np.testing.assert_allclose(np.linalg.norm(way, axis=-1), np.linalg.norm(slid, axis=-1), atol=1e-5)

@@ -41,6 +41,16 @@ def test_generate_list_and_show(tmp_path, capsys):
     assert red.sum() > 100
 
 
+def test_resting_poses_are_listed_and_drawn(tmp_path, capsys):
+    poses = find_object("mug:7").rest_poses
+    assert parse(["rests", "mug:7", "--png", str(tmp_path / "rests.png")])() == 0
+    rows = [line.strip("│ ").split("│") for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    assert [int(row[0]) for row in rows] == list(range(1, len(poses) + 1))
+    assert float(rows[0][1]) == pytest.approx(100 * poses[0][2], abs=0.05)
+    assert {0, 180} < {int(row[2]) for row in rows}  # it stands on its bottom, and on its rim
+    assert Image.open(tmp_path / "rests.png").width == len(poses) * (240 + 10) + 10
+
+
 def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, capsys):
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "good.stl")
     trimesh.creation.box((40, 50, 60)).export(tmp_path / "big.stl")

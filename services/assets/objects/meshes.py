@@ -212,6 +212,8 @@ def _pieces(
             surface, given = _joined(meshes), [_corners(file) * factor for file in source.pieces]
             volume = float(surface.volume) if closed else sum(shapes.hull_of(piece).volume for piece in given)
             groups = [merge(given, options.max_pieces, np.asarray(surface.triangles), volume)]
+            if len(groups[0]) < len(given):
+                notes.append(f"its {len(given)} convex pieces were merged into {len(groups[0])} (--max-pieces)")
         else:
             volumes = np.array([shapes.hull_of(mesh.vertices).volume for mesh in meshes])
             limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]

@@ -87,7 +87,7 @@ class PolicyGrasping:
         steps = self._attempts.steps
         outcome = self._attempts.run(obj, episodes, lambda step: progress("grasping", step / steps))
         self._compiled = True
-        index = _best(outcome, tuple(request.constraints))
+        index = _best(outcome, tuple(request.constraints), self.task.approach_steps - 1)
         about = {"actor": "studio", "note": _note(outcome, index, aside)}
         return self._attempts.episode(outcome, index, surface_of(self.task, obj), obj, about)
 
@@ -116,9 +116,9 @@ def _episodes(
     return drawn._replace(goal=goal), np.linalg.norm(shift, axis=-1)
 
 
-def _best(outcome: Outcome, constraints: tuple[str, ...]) -> int:
+def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int) -> int:
     """The one that was drawn, unless another is clearly better: it holds, or keeps to the constraints."""
-    return int(np.argmin(costs(outcome, constraints) + _OTHER * (np.arange(ATTEMPTS) > 0)))
+    return int(np.argmin(costs(outcome, constraints, removal) + _OTHER * (np.arange(ATTEMPTS) > 0)))
 
 
 def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:

@@ -13,15 +13,17 @@ import numpy as np
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
+from common.hands.skin import skin_of
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.wire.codec import Message
-from services.export.motion_file import hand_arrays, motion_of_episode, save_motion
+from services.export.motion_file import motion_of_episode, save_motion
 from services.export.motion_formats import FORMATS, export_motions
 from services.record.channels import JsonChannels
 from services.record.scene import episode_entries
 from services.record.writer import LogWriter
+from services.viz.shapes import skin_colours
 from services.viz.studio.jobs import Jobs, Progress
 from services.viz.studio.lanes import for_page
 from services.viz.studio.recordings import Recordings
@@ -333,10 +335,19 @@ _ACTIONS = (
 
 
 def hand_message(name: str) -> Message:
-    """A hand's capsules in their links' frames, and its links' names."""
+    """A hand's skin (see `common.hands.skin`), and its links' names."""
     hand = get_hand(name)
-    shape = {key: value for key, value in hand_arrays(hand).items() if key.startswith("capsule_")}
-    arrays = {key: value.astype(np.int32 if key == "capsule_link" else np.float32) for key, value in shape.items()}
+    skin = skin_of(hand)
+    links, weights = skin.influences()
+    arrays = {
+        "skin_points": skin.points,
+        "skin_normals": skin.normals,
+        "skin_faces": skin.faces,
+        "skin_joints": links.astype(np.int32),
+        "skin_weights": weights,
+        "skin_origins": skin.origins.astype(np.float32),
+        "skin_colours": skin_colours(skin),
+    }
     return Message(arrays, {"hand": name, "links": [link.name for link in hand.links]})
 
 

@@ -7,13 +7,15 @@ from collections.abc import Callable, Sequence
 from types import ModuleType
 
 import numpy as np
+import pygltflib
 import pytest
 import trimesh
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdSkel
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands import get_hand
+from common.hands.skin import skin_of
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.cli.main import main
 from services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
@@ -170,7 +172,8 @@ def test_a_glb_is_y_up_for_others_and_names_its_units(human: GraspMotion, tmp_pa
     content = path.read_bytes()
     assert content[:8] == b"glTF\x02\0\0\0" and int.from_bytes(content[8:12], "little") == len(content)
     file = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
-    (root,) = [file["nodes"][i] for i in file["scenes"][0]["nodes"]]
+    root, skinned = [file["nodes"][i] for i in file["scenes"][0]["nodes"]]
+    assert set(skinned) == {"name", "mesh", "skin"}  # it stands at the origin, and its joints move it
     np.testing.assert_allclose(Rotation.from_quat(root["rotation"]).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
     assert root["extras"]["unit"] == "m" and root["extras"]["quaternion"] == "x, y, z, w"
     assert root["extras"]["joints"] == human.joint_names.tolist()
@@ -186,11 +189,78 @@ def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pa
         np.testing.assert_allclose(pose[:3, 3], human.link_position[0, i], atol=1e-6)
         turn = Rotation.from_quat(human.link_quaternion[0, i], scalar_first=True)
         np.testing.assert_allclose(pose[:3, :3], turn.as_matrix(), atol=1e-6)
-    for k in (0, 9):
-        link = str(human.link_names[human.capsule_link[k]])
-        distance = np.linalg.norm(scene.geometry[link].vertices - human.capsule_ends[k].mean(0), axis=1)
-        half = np.linalg.norm(np.diff(human.capsule_ends[k], axis=0)) / 2 + human.capsule_radius[k]
-        assert np.isclose(distance, half, atol=1e-6).any()  # the pole of the capsule is a vertex
+    np.testing.assert_allclose(scene.geometry[frames.SKIN].vertices, skin_of(get_hand("human")).points, atol=1e-6)
+
+
+def expected_surface(motion: GraspMotion, t: int) -> np.ndarray:
+    """(V, 3) where the hand's surface is at a frame."""
+    turns = Rotation.from_quat(motion.link_quaternion[t], scalar_first=True)
+    return skin_of(get_hand(motion.hand)).posed(motion.link_position[t], turns.as_matrix())[0]
+
+
+@pytest.mark.parametrize("which", ["human", "robot"])
+def test_the_skin_of_a_glb_follows_its_joints(
+    which: str, request: pytest.FixtureRequest, tmp_path: pathlib.Path
+) -> None:
+    """By the standard's formula (glTF 2.0, 3.7.3.2), from what pygltflib reads."""
+    motion = request.getfixturevalue(which)
+    path, _ = export([motion], "glb", tmp_path)
+    file = pygltflib.GLTF2().load(str(path))
+    blob = file.binary_blob()
+
+    def values(index: int) -> np.ndarray:
+        accessor = file.accessors[index]
+        width = {"VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor.type]
+        kind = {pygltflib.FLOAT: "<f4", pygltflib.UNSIGNED_SHORT: "<u2"}[accessor.componentType]
+        start = file.bufferViews[accessor.bufferView].byteOffset
+        return np.frombuffer(blob, kind, accessor.count * width, start).reshape(-1, width)
+
+    (skin,), mesh = file.skins, file.meshes[file.nodes[-1].mesh]
+    attributes = mesh.primitives[0].attributes
+    joints, weights = values(attributes.JOINTS_0), values(attributes.WEIGHTS_0)
+    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-5)
+    inverse = values(skin.inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
+    points = np.pad(values(attributes.POSITION), ((0, 0), (0, 1)), constant_values=1)
+    (track,) = glb.read(path)
+    names = [file.nodes[joint].name for joint in skin.joints]
+    assert names == motion.link_names.tolist()
+    for t in (0, T - 1):
+        matrices = np.stack([track.poses[name][t] for name in names]) @ inverse
+        mixed = np.einsum("vk,vkij->vij", weights, matrices[joints])
+        found = np.einsum("vij,vj->vi", mixed, points)[:, :3]
+        np.testing.assert_allclose(found, expected_surface(motion, t), atol=2e-6)
+
+
+@pytest.mark.parametrize("which", ["human", "robot"])
+def test_pixars_library_moves_the_skin_of_a_usd(
+    which: str, request: pytest.FixtureRequest, tmp_path: pathlib.Path
+) -> None:
+    motion = request.getfixturevalue(which)
+    path, _ = export([motion], "usd", tmp_path)
+    stage = Usd.Stage.Open(str(path))
+    root = UsdSkel.Root(stage.GetPrimAtPath("/grasp/skin"))
+    cache = UsdSkel.Cache()
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    (binding,) = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
+    skeleton, (target,) = cache.GetSkelQuery(binding.GetSkeleton()), binding.GetSkinningTargets()
+    mesh = UsdGeom.Mesh(target.GetPrim())
+    for t in (0, T - 1):
+        points = mesh.GetPointsAttr().Get()
+        assert target.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(float(t)), points, float(t))
+        np.testing.assert_allclose(np.array(points), expected_surface(motion, t), atol=2e-6)
+
+
+def test_a_bvh_has_the_skeleton_of_the_skin(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    path, _ = export([human], "bvh", tmp_path)
+    lines = [line.split() for line in path.read_text().splitlines()]
+    offsets = {
+        line[1]: np.array(lines[i + 2][1:], float) for i, line in enumerate(lines) if line and line[0] == "JOINT"
+    }
+    assert list(offsets) == [*human.link_names, "object"]
+    origins = skin_of(get_hand("human")).origins
+    for i, parent in enumerate(human.link_parent[1:], 1):
+        expected = 100 * (origins[i] - origins[parent])  # cm; a link's frame is turned as its parent's at zero
+        np.testing.assert_allclose(offsets[human.link_names[i]], expected, atol=1e-4)
 
 
 def test_neighbouring_quaternions_do_not_jump() -> None:

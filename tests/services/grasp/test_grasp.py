@@ -18,7 +18,7 @@ from services.assets.objects.named import one_object
 from services.assets.objects.options import ImportOptions
 from services.cli.main import load
 from services.export.motion_file import load_motion, motion_of_episode
-from services.grasp.files import MOTION, OBJECT, PICTURE, RECORDING, RESULT, save_grasp
+from services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
 from services.grasp.grasper import Grasp, Grasper
 from services.grasp.parse import read_request
 from services.record.reader import read_episodes
@@ -65,6 +65,24 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
 
     again = grasper.grasp(block, request).motion
     np.testing.assert_array_equal(again.joint_position, motion.joint_position)
+
+
+def test_a_grasp_lifts_the_block_off_a_table_that_stays(block):
+    """By physics: the hand goes up and the block with it, because the hand holds it."""
+    lifting = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, approach=0.3, lift=0.1, threads=2)
+    upright = int(np.argmax(block.rest_poses[:, 2]))
+    found = lifting.grasp(block, GraspRequest(rest=upright))
+    lifting.close()
+    motion, phases = found.motion, found.facts()["phases"]
+    assert list(phases) == ["approach", "grasp", "lift", "hold"] and found.rest == upright
+    assert phases["grasp"] >= 0.3 and phases["lift"] == pytest.approx(phases["grasp"] + 0.5)
+    assert motion.table.all() and found.success
+    grasped, lifted, held = (round(phases[name] / motion.control_dt) for name in ("grasp", "lift", "hold"))
+    assert len(motion.time) == held + 25
+    np.testing.assert_allclose(motion.object_position[:grasped, 2], SIDES[2] / 2, atol=2e-3)
+    assert motion.object_position[-1, 2] - motion.object_position[lifted, 2] == pytest.approx(0.1, abs=0.02)
+    assert (np.linalg.norm(motion.link_force[held:], axis=-1).sum(-1) > 0.5).all()
+    assert np.linalg.norm(np.diff(motion.wrist_position[lifted:held], axis=0), axis=-1).max() < 0.6 * motion.control_dt
 
 
 def test_what_cannot_be_is_said_before_anything_is_simulated(block, grasper):
@@ -156,10 +174,11 @@ def test_pictures_show_the_import_beside_a_hand_and_the_grasp(tmp_path, monkeypa
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     path = meshes(tmp_path / "things", "a") / "a.stl"
     assert load("grasp")([str(path), "--out", str(tmp_path / "out")])() == 0
+    assert Image.open(tmp_path / "out" / "a" / PORTRAIT).size == (1280, 720)
     for name, columns in ((OBJECT, 3), (PICTURE, 4)):
         image = np.asarray(Image.open(tmp_path / "out" / "a" / name).convert("RGB")).astype(int)
-        orange = (image[..., 0] - image[..., 2] > 80) & (image[..., 1] > 60)
-        skin = (np.ptp(image, axis=-1) < 45) & (image[..., 2] > image[..., 0] + 8) & (image[..., 0] < 200)
+        red, _, blue = np.moveaxis(image, -1, 0)
+        orange, skin = (red > 90) & (blue < 0.5 * red), (red > 80) & (red > 1.2 * blue) & (blue > 0.5 * red)
         for part in np.array_split(np.arange(image.shape[1]), columns)[: 2 if name == OBJECT else columns]:
             assert orange[:, part].sum() > 400 and skin[:, part].sum() > 400, name
     assert (tmp_path / "out" / "summary.png").exists()
@@ -168,6 +187,9 @@ def test_pictures_show_the_import_beside_a_hand_and_the_grasp(tmp_path, monkeypa
 def test_nothing_to_grasp(tmp_path):
     with pytest.raises(CongraspError, match="nothing to grasp"):
         command()
+    for option, value in (("--approach", "-1"), ("--approach", "11"), ("--lift", "0.6"), ("--lift", "nan")):
+        with pytest.raises(CongraspError, match=f"{option} is .* It is from 0 to"):
+            command(tmp_path, option, value)
     with pytest.raises(CongraspError, match="--tries is 0"):
         command(tmp_path, "--tries", "0")
 

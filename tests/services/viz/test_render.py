@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands import get_hand
+from common.hands.skin import skin_of
 from common.wire.codec import encode
 from services.cli.main import load
 from services.record.channels import Entry, opaque_channel
-from services.record.palette import OBJECT
+from services.record.palette import FLESH, OBJECT
 from services.record.reader import pick_episode
 from services.record.writer import LogWriter
 from services.viz.hand_sheets import hand_sheet
@@ -27,8 +28,10 @@ from services.viz.render import (
     episode_shapes,
     episode_sheet,
     episode_title,
+    grasp_picture,
     key_steps,
     render_episode_frames,
+    thumb_camera,
 )
 from services.viz.scene import Camera, Shape, between
 from services.viz.shapes import arrow, beads, fit
@@ -191,18 +194,19 @@ def test_steps_of_a_sheet_include_the_ends_and_the_removal() -> None:
 
 
 def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
-    shapes = episode_shapes(episode(), 11)
+    skinned, body, *_ = episode_shapes(episode(), 11)
     hand = get_hand("human")
-    capsules = [link.name for link in hand.links for _ in link.capsules]
-    touching = {name for name, shape in zip(capsules, shapes, strict=False) if shape.colour != shapes[0].colour}
-    assert touching == {hand.links[i].name for i in hand.tip_links}
-    tip = shapes[capsules.index("thumb_distal")].colour
-    assert np.linalg.norm(np.subtract(tip, TOUCHING)) < 0.2
-    body = shapes[len(capsules)]
+    assert skinned.colours is not None
+    changed = np.abs(skinned.colours - FLESH).max(-1) > 1e-3
+    owner = skin_of(hand).weights.argmax(1)
+    assert set(owner[changed & (skin_of(hand).weights.max(1) > 0.9)]) == set(hand.tip_links)
+    thumb = skinned.colours[skin_of(hand).weights[:, hand.tip_links[0]] > 0.99]
+    # FORCE of 1.5 N is three quarters of the full contact colour's 2 N: 0.3 + 0.3 * 0.75 of it.
+    np.testing.assert_allclose(thumb[0], np.array(FLESH) + 0.525 * np.subtract(TOUCHING, FLESH), atol=0.01)
     assert body.paint_colours is not None
     minus = episode().arrays["surface_minus"]
     np.testing.assert_allclose(body.paint_colours, np.where(minus[:, None], OBJECT_AVOID, OBJECT))
-    assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[len(capsules)].paint_points is None
+    assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint_points is None
 
 
 def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_through() -> None:
@@ -210,11 +214,9 @@ def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_thr
         return any(shape.kind == "cylinder" for shape in episode_shapes(episode(), step))
 
     assert flat(7) and not flat(8)
-    ghosts = [shape for shape in episode_shapes(episode(mask=(0, 1, 1, 0)), 11) if shape.alpha < 1]
-    solid = [shape for shape in episode_shapes(episode(), 11) if shape.alpha == 1][: len(ghosts)]
+    (ghost,) = [shape for shape in episode_shapes(episode(mask=(0, 1, 1, 0)), 11) if shape.alpha < 1]
     # The last step has reached the pose: ghost and hand coincide.
-    for ghost, link in zip(ghosts, solid, strict=True):
-        np.testing.assert_allclose(ghost.position, link.position, atol=1e-5)
+    np.testing.assert_allclose(ghost.vertices, episode_shapes(episode(), 11)[0].vertices, atol=1e-5)
 
 
 def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
@@ -228,6 +230,14 @@ def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
         best_camera(fallen, [0, 11]).target[2], best_camera(episode(), [0, 11]).target[2], atol=0.1
     )
     assert [frame.shape for frame in frames] == [(48, 64, 3)] * 2
+    picture = grasp_picture(episode(), 11, (96, 54))
+    assert picture.shape == (54, 96, 3)
+    side = thumb_camera(episode(), 11, 32 / 54)
+    hand = get_hand("human")
+    names = [link.name for link in hand.links]
+    roots = episode().arrays["link_position"][11][[names.index(root) for root in hand.finger_roots]]
+    depth = (roots - side.position) @ side.axes()[2]
+    assert depth[0] < depth[1:].min()  # the thumb is nearest
     assert np.abs(frames[0].astype(int) - frames[1]).max() > 50
 
 

@@ -87,6 +87,14 @@ export class Renderer {
     return { array, buffers, indexed: Boolean(indices), count: indices ? indices.length : positions.length / 3 };
   }
 
+  move(mesh, positions, normals) {
+    const gl = this.gl;
+    [positions, normals].forEach((data, place) => {
+      gl.bindBuffer(gl.ARRAY_BUFFER, mesh.buffers[place]);
+      gl.bufferSubData(gl.ARRAY_BUFFER, 0, data);
+    });
+  }
+
   recolour(mesh, colours) {
     const gl = this.gl;
     gl.bindBuffer(gl.ARRAY_BUFFER, mesh.buffers[2]);

@@ -2,8 +2,8 @@
 
 import { add, cross, dot, norm, pose, rotate, scale, sub, toWorld, unit, perpendicular, IDENTITY } from "./math.js";
 import * as shapes from "./shapes.js";
+import { Skin } from "./skin.js";
 
-const SKIN = [0.72, 0.75, 0.81];
 const OBJECT = [0.95, 0.64, 0.28];
 const AVOID = [0.8, 0.22, 0.22];
 const TOUCHING = [0.13, 0.74, 0.63];
@@ -14,7 +14,7 @@ const FORCE = [0.93, 0.26, 0.21];
 const GHOST = [0.22, 0.4, 0.86];
 
 export const ARROW = 0.1; // length of the approach arrow, m
-const FULL = 2; // N at which a link has its full colour
+const FULL = 2; // N at which a link has most of its colour
 const LEAST = 0.05; // N from which a force is drawn
 const FORCE_LENGTH = 0.015; // m per newton
 const LONGEST = 0.09; // m
@@ -98,7 +98,7 @@ export class Body {
 export class Scene {
   constructor(renderer) {
     this.renderer = renderer;
-    this.hands = new Map(); // link meshes by hand
+    this.hands = new Map(); // skins by hand
     this.body = null;
     this.table = renderer.mesh(shapes.table(TABLE));
     this.shaft = renderer.mesh(shapes.arrow(ARROW, 0.0028));
@@ -108,12 +108,8 @@ export class Scene {
     this.drawnPath = "";
   }
 
-  setHand(name, { arrays, meta }) {
-    const lists = meta.links.map(() => []);
-    const { data: links } = arrays.capsule_link;
-    const { data: ends } = arrays.capsule_ends;
-    links.forEach((link, i) => lists[link].push({ start: [...ends.slice(6 * i, 6 * i + 3)], end: [...ends.slice(6 * i + 3, 6 * i + 6)], radius: arrays.capsule_radius.data[i] }));
-    this.hands.set(name, lists.map((list) => this.renderer.mesh(shapes.capsules(list))));
+  setHand(name, message) {
+    this.hands.set(name, new Skin(this.renderer, message));
   }
 
   setObject(vertices, faces) {
@@ -121,9 +117,10 @@ export class Scene {
     this.body = new Body(this.renderer, vertices, faces);
   }
 
-  #links(hand, poses, style) {
-    const meshes = this.hands.get(hand) ?? [];
-    return meshes.map((mesh, i) => ({ mesh, model: pose(poses.position[i], poses.quaternion[i]), tint: SKIN, ...style(i) }));
+  // The hand, with shares of a colour on its links.
+  #hand(use, hand, poses, tint, shares) {
+    const skin = this.hands.get(hand);
+    return skin ? [skin.thing(use, poses, tint, shares ?? new Array(skin.links).fill(0))] : [];
   }
 
   #arrow(tip, direction, tint, alpha) {
@@ -150,7 +147,8 @@ export class Scene {
       position: links.position.map((point) => toWorld(place, point)),
       quaternion: links.quaternion.map((turn) => product(place.quaternion, turn)),
     };
-    return this.#links(hand, turned, () => ({ tint: GHOST, alpha: 0.28 }));
+    const whole = new Array(links.position.length).fill(1);
+    return this.#hand("ghost", hand, turned, GHOST, whole).map((thing) => ({ ...thing, alpha: 0.28 }));
   }
 
   // Things while constraints are edited. `arrow`: {tip, direction} in the world.
@@ -158,7 +156,7 @@ export class Scene {
     const place = state.rest;
     const things = [this.#table(place.position)];
     if (this.body) things.push({ mesh: this.body.mesh, model: pose(place.position, place.quaternion) });
-    things.push(...this.#links(state.hand, state.start, () => ({})));
+    things.push(...this.#hand("hand", state.hand, state.start, TOUCHING));
     // An arrow that the rules overrule is faint, and beside it is the one that counts.
     const counts = toWorld(place, state.active.position);
     things.push(this.#arrow(arrow.tip, arrow.direction, HEADING, state.active.overruled ? 0.3 : 1));
@@ -176,11 +174,9 @@ export class Scene {
     const things = [];
     if (frame.table) things.push(this.#table(motion.center));
     things.push({ mesh: body.mesh, model: pose(place.position, place.quaternion) });
-    const share = frame.forces.map((force) => Math.min(norm(force) / FULL, 1));
-    things.push(...this.#links(motion.hand, frame.links, (i) => {
-      const touch = share[i] * FULL > LEAST ? 0.45 + 0.55 * share[i] : 0;
-      return { tint: SKIN.map((c, k) => c + (TOUCHING[k] - c) * touch) };
-    }));
+    const strengths = frame.forces.map(norm);
+    const shares = strengths.map((strength) => (strength > LEAST ? 0.3 + 0.3 * Math.min(strength / FULL, 1) : 0));
+    things.push(...this.#hand("hand", motion.hand, frame.links, TOUCHING, shares));
     frame.forces.forEach((force, i) => {
       const strength = norm(force);
       if (strength > LEAST) things.push({ mesh: this.force, model: along(frame.links.position[i], scale(force, 1 / strength), Math.min(FORCE_LENGTH * strength, LONGEST)).map((x, k) => (k < 8 ? 0.09 * x : x)), tint: FORCE });

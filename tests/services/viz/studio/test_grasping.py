@@ -94,6 +94,7 @@ def test_what_was_drawn_is_shown_unless_another_is_clearly_better(
     held: list[int], error: list[float], index: int, says: str
 ) -> None:
     found = outcome(held, error)
-    assert grasping._best(found, ()) == index
+    removal = int(found.trace.table[:, 0].sum()) - 1
+    assert grasping._best(found, (), removal) == index
     assert says in grasping._note(found, index, np.full(ATTEMPTS, 0.004))
     assert bool(says) == bool(grasping._note(found, index, np.full(ATTEMPTS, 0.004)))

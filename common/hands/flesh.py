@@ -1,0 +1,248 @@
+"""The surface of a human hand as an implicit function: where it is, and which links it goes with.
+
+Each finger is a chain of round cones about its links' capsules, the palm a smooth union of its capsules with a wrist
+and the ball of the thumb. A finger blends with the palm, but not with another finger, so that closed fingers stay
+apart. Everything is in the wrist frame with every joint at zero, in metres.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial.transform import Rotation
+
+from common.hands.skeleton import Skeleton
+
+_CELL = 0.0039  # side of a cell of the grid that the surface is cut from, m
+_PALM_BLEND, _FINGER_BLEND, _THUMB_BLEND = 0.014, 0.008, 0.020  # m over which parts run into one another
+_WRIST, _WIDTH = 0.040, 1.9  # how far the wrist goes back, m; how much wider it is than where the palm begins
+_CUT = 0.012  # m over which the wrist's end is rounded
+_BALL = ((0.10, 0.75, 0.0120, 0.0105), (0.45, 0.55, 0.0090, 0.0080))
+"""The ball of the thumb and the fold between thumb and index finger: shares of the way along the nearest metacarpal and
+along the thumb's where they begin and end, and radii there (m)."""
+_SPREAD = 0.0035  # m of difference between the distances to two links, over which their weights change by a factor e
+_SPREADING = 9.0  # rad for each metre between knuckles, by which fingers are spread while their surface is made
+_FOLD = 0.004  # m; a point whose distances to two fingers differ by less belongs more to the palm
+_INFLUENCES, _LEAST = 4, 0.01  # most links that move a point, and the least weight that counts
+_ROUNDS = 4  # of smoothing weights over neighbours
+
+
+class Cone(NamedTuple):
+    """A round cone from `start` to `end` (3,) with a radius at each, that goes with some links."""
+
+    start: np.ndarray
+    end: np.ndarray
+    radii: tuple[float, float]
+    links: tuple[int, ...]
+
+
+class Surface(NamedTuple):
+    """V points of a closed surface with unit normals, F triangles that wind outwards, and weights of L links."""
+
+    points: np.ndarray
+    """(V, 3) m."""
+    normals: np.ndarray
+    """(V, 3) unit."""
+    faces: np.ndarray
+    """(F, 3)."""
+    weights: np.ndarray
+    """(V, L), at most four of a point above zero; they sum to one."""
+
+
+def flesh(skeleton: Skeleton) -> Surface:
+    """The surface of a human hand whose links' capsules are phalanges and metacarpals."""
+    palm, together = _palm(skeleton), _fingers(skeleton)
+    turns = _spread(together)
+    fingers = [[_turned(cone, turn) for cone in finger] for finger, turn in zip(together, turns, strict=True)]
+    low, high = _bounds([*palm, *(cone for finger in fingers for cone in finger)])
+    axes = [np.arange(a, b + _CELL, _CELL) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    cells, faces = surface_net(_distance(grid.reshape(-1, 3), palm, fingers).reshape(grid.shape[:3]))
+    points = low + _CELL * cells
+    for _ in range(3):  # from the middle of a cell onto the surface
+        points = points - _distance(points, palm, fingers)[:, None] * _gradient(points, palm, fingers)
+    normals = _gradient(points, palm, fingers)
+    weights = _weights(len(skeleton.names), points, faces, palm, fingers)
+    for finger, (anchor, turn) in zip(fingers, turns, strict=True):  # and together again
+        share = weights[:, [cone.links[0] for cone in finger]].sum(1)[:, None]
+        points = points + share * ((points - anchor) @ turn + anchor - points)
+        normals = normals + share * (normals @ turn - normals)
+    return Surface(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), faces, weights)
+
+
+def _spread(fingers: Sequence[Sequence[Cone]]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Where (3,) and how (3, 3) each finger turns away from its neighbours, so that no cell of the grid joins two."""
+    others = fingers[1:]
+    roots, tips = (np.array(ends) for ends in zip(*((f[0].start, f[-1].end) for f in others), strict=True))
+    across = np.linalg.svd(roots - roots.mean(0))[2][0]
+    up = np.cross(across, (tips - roots).mean(0))
+    turns = [(fingers[0][0].start, np.eye(3))]
+    for root, place in zip(roots, (roots - roots.mean(0)) @ across, strict=True):
+        # Along `across` is to the right of `up x across`: a turn about `up` by a negative angle.
+        angle = -_SPREADING * place / np.linalg.norm(up)
+        turns.append((root, Rotation.from_rotvec(angle * up).as_matrix()))
+    return turns
+
+
+def _turned(cone: Cone, turn: tuple[np.ndarray, np.ndarray]) -> Cone:
+    """The cone turned about a point (3,) by a matrix (3, 3)."""
+    anchor, matrix = turn
+    start, end = (anchor + matrix @ (point - anchor) for point in (cone.start, cone.end))
+    return cone._replace(start=start, end=end)
+
+
+def _fingers(skeleton: Skeleton) -> list[list[Cone]]:
+    """The cones of each finger, thumb first; their radii run from link to link."""
+    fingers = []
+    for chain in skeleton.chains():
+        first = [int(np.flatnonzero(skeleton.capsule_link == link)[0]) for link in chain]
+        radii = skeleton.radii[first]
+        joints = [radii[0], *((radii[1:] + radii[:-1]) / 2), radii[-1]]
+        cones = zip(skeleton.capsules[first], joints[:-1], joints[1:], chain, strict=True)
+        fingers.append([Cone(start, end, (float(a), float(b)), (link,)) for (start, end), a, b, link in cones])
+    return fingers
+
+
+def _palm(skeleton: Skeleton) -> list[Cone]:
+    """The cones of metacarpals, wrist and the ball of the thumb."""
+    mine = skeleton.capsule_link == 0
+    metacarpals, radii = skeleton.capsules[mine], skeleton.radii[mine]
+    thumb, *others = (_of_link(skeleton, chain[0]) for chain in skeleton.chains())
+    root = metacarpals[:, 0].mean(0)
+    back = root - np.mean([start for start, _ in others], 0)
+    back = _WRIST * _unit(back)
+    palm = []
+    for (start, end), radius in zip(metacarpals, radii, strict=True):
+        palm.append(Cone(start, end, (radius, radius), (0,)))
+        wide = root + _WIDTH * (start - root)
+        palm.append(Cone(wide - 0.2 * back, wide + back, (1.1 * radius, 1.3 * radius), (0,)))
+    start, end = min(metacarpals, key=lambda ends: float(np.linalg.norm(ends.mean(0) - thumb[1])))
+    for near, far, first, last in _BALL:
+        along = start + near * (end - start), thumb[0] + far * (thumb[1] - thumb[0])
+        palm.append(Cone(*along, (first, last), (0, skeleton.chains()[0][0])))
+    return palm
+
+
+def _of_link(skeleton: Skeleton, link: int) -> np.ndarray:
+    """(2, 3) the ends of a link's first capsule."""
+    return skeleton.capsules[np.flatnonzero(skeleton.capsule_link == link)[0]]
+
+
+def _bounds(cones: Sequence[Cone]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box around cones, with space for what blends."""
+    reach = np.array([max(cone.radii) for cone in cones for _ in range(2)])[:, None] + 2 * _CELL + 0.004
+    ends = np.array([end for cone in cones for end in (cone.start, cone.end)])
+    return (ends - reach).min(0), (ends + reach).max(0)
+
+
+def _to(points: np.ndarray, cone: Cone) -> np.ndarray:
+    """(n,) about the signed distances of points (n, 3) to a cone."""
+    along = cone.end - cone.start
+    share = np.clip((points - cone.start) @ along / (along @ along), 0, 1)
+    first, last = cone.radii
+    return np.linalg.norm(points - cone.start - share[:, None] * along, axis=-1) - (first + share * (last - first))
+
+
+def _blend(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
+    """The smaller of two distances, rounded where they differ by less than a width (polynomial smooth minimum)."""
+    share = np.clip(0.5 + 0.5 * (b - a) / width, 0, 1)
+    return b + share * (a - b) - width * share * (1 - share)
+
+
+def _distance(points: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]) -> np.ndarray:
+    """(n,) about the signed distances of points (n, 3) to the hand."""
+    body = _to(points, palm[0])
+    for cone in palm[1:]:
+        body = _blend(body, _to(points, cone), _PALM_BLEND)
+    beyond = (points - palm[1].end) @ _unit(palm[1].end - palm[1].start)  # palm[1] is part of the wrist
+    body = -_blend(-body, -beyond, _CUT)  # which ends flat
+    found = body
+    for i, finger in enumerate(fingers):
+        mine = np.min([_to(points, cone) for cone in finger], 0)
+        found = np.minimum(found, _blend(body, mine, _FINGER_BLEND if i else _THUMB_BLEND))
+    return found
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    """A vector of length one."""
+    return vector / np.linalg.norm(vector)
+
+
+def _gradient(points: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]) -> np.ndarray:
+    """(n, 3) unit directions in which the distances grow."""
+    step = 2e-4
+    moved = (points[:, None] + step * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
+    values = _distance(moved, palm, fingers).reshape(-1, 6)
+    rise = values[:, :3] - values[:, 3:]
+    return rise / (np.linalg.norm(rise, axis=-1, keepdims=True) + 1e-12)
+
+
+def surface_net(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The surface on which values (X, Y, Z) of a grid are zero, by naive surface nets (Gibson 1998).
+
+    Args:
+      values: negative inside; positive at the border of the grid.
+
+    Returns:
+      (V, 3) points in units of cells, one in each cell that the surface crosses, at the mean of its crossings; and
+      (F, 3) triangles that wind outwards.
+    """
+    inside = values < 0
+    sums, counts = np.zeros((*np.subtract(values.shape, 1), 3)), np.zeros(np.subtract(values.shape, 1), int)
+    quads = []
+    number = np.arange(counts.size).reshape(counts.shape)
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        first, second = (np.moveaxis(values, axis, 0)[part] for part in (slice(-1), slice(1, None)))
+        crossed = np.argwhere(np.moveaxis((first < 0) != (second < 0), 0, axis))
+        at = tuple(crossed.T)
+        after = tuple((crossed + np.eye(3, dtype=int)[axis]).T)
+        place = crossed + np.eye(3)[axis] * (values[at] / (values[at] - values[after]))[:, None]
+        around = []
+        for du, dv in ((0, 0), (-1, 0), (-1, -1), (0, -1)):
+            cell = crossed + du * np.eye(3, dtype=int)[u] + dv * np.eye(3, dtype=int)[v]
+            np.add.at(sums, tuple(cell.T), place)
+            np.add.at(counts, tuple(cell.T), 1)
+            around.append(number[tuple(cell.T)])
+        quad = np.stack(around, -1)
+        quads.append(np.where(inside[at][:, None], quad, quad[:, ::-1]))
+    used = counts.ravel() > 0
+    index = np.cumsum(used) - 1
+    corners = index[np.concatenate(quads)]
+    points = sums.reshape(-1, 3)[used] / counts.ravel()[used, None]
+    return points, np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+
+
+def _weights(
+    links: int, points: np.ndarray, faces: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]
+) -> np.ndarray:
+    """(V, L) weights by the distances to the links' cones, smoothed; of the fingers only the nearest counts."""
+    far = np.full((len(points), links), np.inf)
+    palm = [*palm, fingers[0][0]]  # the thumb's metacarpal is part of the palm
+    fingers = [fingers[0][1:], *fingers[1:]]
+    distances = np.stack([np.min([_to(points, cone) for cone in finger], 0) for finger in fingers], 1)
+    nearest, (first, second) = distances.argmin(1), np.sort(distances, 1).T[:2]
+    for cone in palm:
+        for link in cone.links:
+            far[:, link] = np.minimum(far[:, link], _to(points, cone))
+    for i, finger in enumerate(fingers):
+        mine = nearest == i
+        for cone in finger:
+            (link,) = cone.links
+            far[mine, link] = np.minimum(far[mine, link], _to(points[mine], cone))
+    weights = np.exp((far.min(1, keepdims=True) - far) / _SPREAD)
+    weights /= weights.sum(1, keepdims=True)
+    weights[:, 1:] *= np.clip((second - first) / _FOLD, 0, 1)[:, None]
+    weights[:, 0] = 1 - weights[:, 1:].sum(1)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    pairs = np.concatenate([edges, edges[:, ::-1]]).T
+    around = sparse.csr_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), (len(points), len(points)))
+    others = [(nearest != i, [cone.links[0] for cone in finger]) for i, finger in enumerate(fingers)]
+    for _ in range(_ROUNDS):
+        weights = 0.5 * weights + 0.5 * (around @ weights) / around.sum(1)[:, None]
+        for beyond, theirs in others:
+            weights[np.ix_(beyond, theirs)] = 0.0
+        weights[:, 0] = 1 - weights[:, 1:].sum(1)
+    weights[weights < np.maximum(np.sort(weights, 1)[:, -_INFLUENCES, None], _LEAST)] = 0.0
+    return weights / weights.sum(1, keepdims=True)

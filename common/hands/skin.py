@@ -1,0 +1,153 @@
+"""A surface for every hand: flesh for human hands, bevelled housings for the links of robots.
+
+A surface is made once, with every joint at zero, and follows the links by linear blend skinning.
+"""
+
+import functools
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+
+from common.hands.flesh import Surface, flesh
+from common.hands.skeleton import Skeleton, skeleton_of
+from common.hands.spec import Hand
+
+HUMAN_HANDS = ("human", "mano")
+"""Names of the hands that have flesh."""
+_LARGEST = 0.5  # m
+_SECTIONS = 20  # of a housing
+_BEVEL = 0.45  # of a housing's ends, in radii
+_DRUM_RADIUS, _DRUM_LENGTH = 0.72, 1.04  # of a joint's drum, in radii of its link
+
+
+class Skin(NamedTuple):
+    """V points and F triangles around L links, in the wrist frame with every joint at zero, metres."""
+
+    points: np.ndarray
+    """(V, 3) float32."""
+    normals: np.ndarray
+    """(V, 3) float32 unit."""
+    faces: np.ndarray
+    """(F, 3) int32; they wind outwards."""
+    weights: np.ndarray
+    """(V, L) float32, at most four of a point above zero; they sum to one."""
+    origins: np.ndarray
+    """(L, 3) of the links' frames, which are turned as the wrist's."""
+    flesh: bool
+    """Whether it is that of a human hand."""
+    joint: np.ndarray
+    """(V,) bool: part of a robot's joint, which viewers draw darker."""
+
+    def influences(self) -> tuple[np.ndarray, np.ndarray]:
+        """The four links (V, 4) int that move each point most, and their weights (V, 4); link 0 where it is none."""
+        links = np.argsort(-self.weights, 1, kind="stable")[:, :4]
+        if links.shape[1] < 4:
+            links = np.pad(links, ((0, 0), (0, 4 - links.shape[1])))
+        weights = np.take_along_axis(self.weights, links, 1)
+        weights[:, self.weights.shape[1] :] = 0.0
+        return np.where(weights > 0, links, 0), weights
+
+    def posed(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (V, 3) and unit normals (V, 3) with the links' frames at (L, 3), turned by matrices (L, 3, 3)."""
+        matrices = np.concatenate(
+            [rotation, (position - np.einsum("lij,lj->li", rotation, self.origins))[..., None]], -1
+        )
+        mixed = (self.weights @ matrices.reshape(len(matrices), 12).astype(np.float32)).reshape(-1, 3, 4)
+        points = np.einsum("vij,vj->vi", mixed[..., :3], self.points) + mixed[..., 3]
+        normals = np.einsum("vij,vj->vi", mixed[..., :3], self.normals)
+        return points, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+@functools.lru_cache(maxsize=16)
+def skin_of(hand: Hand) -> Skin:
+    """The surface of a hand."""
+    return skin_on(skeleton_of(hand))
+
+
+def skin_on(skeleton: Skeleton) -> Skin:
+    """The surface of the hand with this skeleton."""
+    human = skeleton.hand in HUMAN_HANDS and _anatomical(skeleton)
+    if human:
+        surface = flesh(skeleton)
+        joint = np.zeros(len(surface.points), bool)
+    else:
+        surface, joint = _housings(skeleton)
+    return Skin(
+        surface.points.astype(np.float32),
+        surface.normals.astype(np.float32),
+        surface.faces.astype(np.int32),
+        surface.weights.astype(np.float32),
+        skeleton.origins,
+        human,
+        joint,
+    )
+
+
+def _anatomical(skeleton: Skeleton) -> bool:
+    """Whether there is a palm with a thumb and other fingers, each link with a capsule, of a hand's size."""
+    chains, with_capsule = skeleton.chains(), set(skeleton.capsule_link.tolist())
+    return (
+        len(chains) > 2
+        and skeleton.names[chains[0][0]].startswith("thumb")
+        and all(len(chain) > 1 for chain in chains)
+        and with_capsule == set(range(len(skeleton.names)))
+        and float(np.ptp(skeleton.capsules.reshape(-1, 3), axis=0).max() + skeleton.radii.max()) < _LARGEST
+    )
+
+
+def _housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
+    """A bevelled housing around every capsule, a drum at every joint, and (V,) bool what is a joint's."""
+    parts, links, joints = [], [], []
+    for (start, end), radius, link in zip(skeleton.capsules, skeleton.radii, skeleton.capsule_link, strict=True):
+        parts.append(_bevelled(start, end, radius, radius))
+        links.append(link)
+        joints.append(False)
+    for anchor, axis, link in zip(skeleton.anchors, skeleton.axes, skeleton.joint_link, strict=True):
+        mine = skeleton.radii[skeleton.capsule_link == link]
+        if len(mine):
+            half = _DRUM_LENGTH * mine[0] * axis - 0.2 * mine[0] * axis
+            parts.append(_bevelled(anchor - half, anchor + half, _DRUM_RADIUS * mine[0], 0.2 * mine[0]))
+            links.append(skeleton.parents[link])
+            joints.append(True)
+    counts = [len(points) for points, _, _ in parts]
+    firsts = np.cumsum([0, *counts[:-1]])
+    weights = np.eye(len(skeleton.names))[np.repeat(links, counts)]
+    faces = np.concatenate([part[2] + first for part, first in zip(parts, firsts, strict=True)])
+    points, normals = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    return Surface(points, normals, faces, weights), np.repeat(joints, counts)
+
+
+def _bevelled(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -> tuple[np.ndarray, ...]:
+    """Points, normals and faces of a cylinder with bevelled ends that reaches beyond both points (3,)."""
+    length, bevel = float(np.linalg.norm(end - start)), _BEVEL * min(radius, reach)
+    outline = [
+        (0.0, -reach),
+        (radius - bevel, -reach),
+        (radius, bevel - reach),
+        (radius, length + reach - bevel),
+        (radius - bevel, length + reach),
+        (0.0, length + reach),
+    ]
+    points: list[np.ndarray] = []
+    normals: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
+    turn = np.eye(3)
+    if length > 1e-9:
+        turn = trimesh.geometry.align_vectors([0, 0, 1], (end - start) / length)[:3, :3]
+    angles = 2 * np.pi * np.arange(_SECTIONS) / _SECTIONS
+    around = np.stack([np.cos(angles), np.sin(angles)], -1)
+    for (r0, z0), (r1, z1) in itertools.pairwise(outline):  # each strip has points of its own: sharp edges
+        out = np.array([z1 - z0, r0 - r1]) / np.hypot(z1 - z0, r0 - r1)
+        first = _SECTIONS * len(points)
+        for r, z in ((r0, z0), (r1, z1)):
+            points.append(np.column_stack([r * around, np.full(_SECTIONS, z)]))
+            normals.append(np.column_stack([out[0] * around, np.full(_SECTIONS, out[1])]))
+        here = first + np.arange(_SECTIONS)
+        after = first + (np.arange(_SECTIONS) + 1) % _SECTIONS
+        if r0 > 0:
+            faces.append(np.column_stack([here, after, after + _SECTIONS]))
+        if r1 > 0:
+            faces.append(np.column_stack([here, after + _SECTIONS, here + _SECTIONS]))
+    return start + np.concatenate(points) @ turn.T, np.concatenate(normals) @ turn.T, np.concatenate(faces)

@@ -1,0 +1,230 @@
+"""The way of the hand from beside the table to where a grasp begins: planned, free of contact, as smooth as an arm.
+
+The wrist follows a quadratic Bezier curve and the shortest turn, both by the minimum-jerk profile
+s = 10 x^3 - 15 x^4 + 6 x^5 (Flash and Hogan 1985), so that it begins and ends at rest.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from common import rotations
+from common.errors import CongraspError
+from common.hands.spec import Hand, link_origin
+from common.objects.distance import DistanceField, distance_field
+from common.objects.spec import GraspObject
+from common.wire.codec import Message
+from services.assets.hands.kinematics import mujoco_link_poses
+from services.viz.shapes import upright
+
+SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
+"""m/s, m/s^2 and rad/s that the wrist does not exceed."""
+CLEARANCE = 0.01
+"""m between the hand and object or table, as long as the start of the grasp is not nearer and not far."""
+_NEAR_END = 0.8  # share of the curve from which the hand may come as near as the grasp begins
+_BESIDE, _ABOVE = 0.34, 0.04  # of the wrist from the object's centre, of the hand above the table, at first, m
+_RELAXED = 0.15  # share of the way from the open to the closed pose, before it sets out
+_CHECKED, _ALONG = 25, 5  # poses of the curve that are checked, and points on a capsule's axis
+_AZIMUTHS = np.radians([0, 30, -30, 60, -60, 100, -100, 140, -140, 180])
+_BACK = (0.08, 0.15, 0.22)  # of the curve's middle point from its end, against the heading, m
+_UP = (0.0, 0.10, 0.20, 0.32)  # and upwards, m
+_TOLERANCE = 1e-3  # m
+
+
+class Reach(NamedTuple):
+    """N poses of a hand, a control step apart; the next one is where the grasp begins."""
+
+    position: np.ndarray
+    """(N, 3) m, wrist, world."""
+    rotation: Rotation
+    """N of the wrist, to the world."""
+    q: np.ndarray
+    """(N, F) rad."""
+
+
+class _Curve(NamedTuple):
+    """A way of the wrist and fingers."""
+
+    points: np.ndarray
+    """(3, 3) where it begins, is drawn to, and ends, m."""
+    turns: Slerp
+    fingers: np.ndarray
+    """(2, F) rad."""
+
+    def at(self, share: np.ndarray) -> Reach:
+        """Poses at shares (N,) of the way."""
+        a, b, c = self.points
+        s = share[:, None]
+        position = (1 - s) ** 2 * a + 2 * s * (1 - s) * b + s**2 * c
+        return Reach(position, self.turns(share), (1 - s) * self.fingers[0] + s * self.fingers[1])
+
+
+def plan_reach(
+    hand: Hand, obj: GraspObject, rest: np.ndarray, heading: np.ndarray, first: Reach, seconds: float, dt: float
+) -> Reach:
+    """The way to where a grasp begins.
+
+    Args:
+      hand: the hand.
+      obj: the object.
+      rest: (7,) its pose on the table.
+      heading: (3,) unit, the way that the hand comes, world.
+      first: the one pose in which the grasp begins.
+      seconds: how long it takes; longer where the wrist would be faster than `SPEED`, `ACCELERATION` or `TURNING`.
+      dt: length of a control step, s.
+
+    Raises:
+      CongraspError: every way that was tried touches the object or the table.
+    """
+    checked = np.linspace(0, 1, _CHECKED)
+    near = np.where(checked > _NEAR_END, 0.0, CLEARANCE)
+    field = distance_field([obj])
+    relaxed = hand.q_open + _RELAXED * (hand.q_closed - hand.q_open)
+    fingers = np.stack([relaxed, first.q[0]])
+    axes = axes_in_wrist(hand, (1 - checked[:, None]) * fingers[0] + checked[:, None] * fingers[1])
+    end = clearances(hand, field, rest, axes[-1:], first)[:, 0]
+    lowest = (_palm_down(hand, np.array([1.0, 0.0, 0.0])).apply(axes[0])[:, 2] - _radii(hand)).min()
+    for curve in _curves(hand, rest, heading, first, fingers, _ABOVE - float(lowest)):
+        found = clearances(hand, field, rest, axes, curve.at(checked))
+        needed = np.where(near > 0, CLEARANCE, np.minimum(CLEARANCE, end[:, None])) - _TOLERANCE
+        if (found >= needed).all():
+            steps = math.ceil(max(seconds, _shortest(curve)) / dt)
+            x = np.arange(steps) / steps
+            return curve.at(10 * x**3 - 15 * x**4 + 6 * x**5)
+    raise CongraspError(
+        f"From beside the table no way leads to a grasp of '{obj.name}' without touching it or the table.",
+        "Leave out --approach, or set another --heading.",
+    )
+
+
+def _curves(
+    hand: Hand, rest: np.ndarray, heading: np.ndarray, first: Reach, fingers: np.ndarray, height: float
+) -> Iterator[_Curve]:
+    """Ways to try, the plainest first; `fingers` (2, F) where they begin and end, `height` (m) where the wrist does."""
+    end = first.position[0]
+    aside = end - rest[:3] if np.linalg.norm((end - rest[:3])[:2]) > 0.03 else -heading
+    side = math.atan2(aside[1], aside[0])
+    for up, azimuth, back in itertools.product(_UP, _AZIMUTHS, _BACK):
+        out = np.array([np.cos(side + azimuth), np.sin(side + azimuth), 0.0])
+        begin = np.array([*(rest[:3] + _BESIDE * out)[:2], height])
+        middle = end - back * heading + [0.0, 0.0, up]
+        middle[2] = max(middle[2], 0.06)
+        turns = Rotation.concatenate([_palm_down(hand, -out), first.rotation[0]])
+        yield _Curve(np.stack([begin, middle, end]), Slerp([0, 1], turns), fingers)
+
+
+def _palm_down(hand: Hand, forward: np.ndarray) -> Rotation:
+    """The wrist with its fingers along a level direction (3,) and its palm down."""
+    # `upright` has the fingers up and the palm towards +x.
+    lying = Rotation.from_matrix(np.stack([[0.0, 0.0, -1.0], np.cross(forward, [0.0, 0.0, -1.0]), forward], -1))
+    return lying * upright(hand)
+
+
+def axes_in_wrist(hand: Hand, q: np.ndarray) -> np.ndarray:
+    """(N, P, 3) points on the axes of the hand's capsules in the wrist frame, at finger angles (N, F)."""
+    share = np.linspace(0, 1, _ALONG)[:, None]
+    along = hand.capsules[:, :1] + share * (hand.capsules[:, 1:] - hand.capsules[:, :1])  # (C, _ALONG, 3)
+    origins = np.array([link_origin(link) for link in hand.links])
+    local, links = along - origins[hand.capsule_links][:, None], hand.capsule_links
+    found = []
+    for angles in q:
+        position, quaternion = mujoco_link_poses(hand, angles)
+        matrices = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()[links]
+        found.append((np.einsum("cij,cpj->cpi", matrices, local) + position[links][:, None]).reshape(-1, 3))
+    return np.array(found)
+
+
+def clearances(hand: Hand, field: DistanceField, rest: np.ndarray, axes: np.ndarray, poses: Reach) -> np.ndarray:
+    """(2, N) m between the hand's capsules and the object, and the table.
+
+    Args:
+      hand: the hand.
+      field: whose first grid is the object's.
+      rest: (7,) the object's pose.
+      axes: (N, P, 3) from `axes_in_wrist`, at the poses' finger angles.
+      poses: N of the wrist.
+    """
+    radii = _radii(hand)
+    world = np.einsum("nij,npj->npi", poses.rotation.as_matrix(), axes) + poses.position[:, None]
+    back = Rotation.from_quat(rest[3:], scalar_first=True).inv()
+    inside = back.apply(world.reshape(-1, 3) - rest[:3]).astype(np.float32)
+    distance = np.asarray(_at(field, inside)).reshape(len(world), -1)
+    return np.stack([(distance - radii).min(1), (world[..., 2] - radii).min(1)])
+
+
+def _radii(hand: Hand) -> np.ndarray:
+    """(P,) m, of the capsules of `axes_in_wrist`."""
+    return np.repeat(hand.capsule_radii, _ALONG)
+
+
+@jax.jit
+def _at(field: DistanceField, points: np.ndarray) -> jax.Array:
+    """(n,) signed distances of points (n, 3) of the object frame, in one program."""
+    return field.at(jnp.zeros(1, int), points[None])[0]
+
+
+def _shortest(curve: _Curve) -> float:
+    """Seconds that the way takes at least, so that the wrist keeps to its limits."""
+    x = np.linspace(0, 1, 201)
+    poses, h = curve.at(10 * x**3 - 15 * x**4 + 6 * x**5), x[1]
+    velocity = np.diff(poses.position, axis=0) / h
+    speed = float(np.linalg.norm(velocity, axis=1).max())
+    acceleration = float(np.linalg.norm(np.diff(velocity, axis=0) / h, axis=1).max())
+    turning = float((poses.rotation[:-1].inv() * poses.rotation[1:]).magnitude().max() / h)
+    return max(speed / SPEED, math.sqrt(acceleration / ACCELERATION), turning / TURNING)
+
+
+def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:
+    """The episode with the way of the hand before it, and `phases` of its meta data that begin so much later.
+
+    Before the grasp the object rests, nothing is touched, and errors are those of the first step.
+    """
+    arrays, steps = episode.arrays, len(reach.q)
+    count = len(arrays["table"])
+    before = {name: np.repeat(value[:1], steps, 0) for name, value in arrays.items() if _of_steps(name, value, count)}
+    for name in before:
+        if name.startswith("reward/") or name in ("action", "contact_force"):
+            before[name] = np.zeros_like(before[name])
+    local = [mujoco_link_poses(hand, q) for q in reach.q]
+    before["link_position"] = np.stack(
+        [turn.apply(links) + at for (links, _), turn, at in zip(local, reach.rotation, reach.position, strict=True)]
+    )
+    before["link_quaternion"] = np.stack(
+        [
+            (turn * Rotation.from_quat(links, scalar_first=True)).as_quat(scalar_first=True)
+            for (_, links), turn in zip(local, reach.rotation, strict=True)
+        ]
+    )
+    before["q"] = before["q_target"] = reach.q
+    before["u"] = before["u_target"] = _wrist_joints(episode, reach)
+    joined = {name: np.concatenate([part.astype(arrays[name].dtype), arrays[name]]) for name, part in before.items()}
+    later = steps * episode.meta["control_dt"]
+    phases = {"approach": 0.0, **{name: begin + later for name, begin in episode.meta["phases"].items()}}
+    return Message({**arrays, **joined}, {**episode.meta, "phases": phases})
+
+
+def _of_steps(name: str, value: np.ndarray, steps: int) -> bool:
+    """Whether an array of an episode has a row for each control step."""
+    kinds = ("reward/", "error/", "link_", "object_position", "object_quaternion", "q_target", "u_target")
+    named = name.startswith(kinds) or name in ("contact_force", "q", "u", "action", "table")
+    return named and value.ndim > 0 and len(value) == steps
+
+
+def _wrist_joints(episode: Message, reach: Reach) -> np.ndarray:
+    """(N, 6) virtual wrist joints, from the base that the first step's joints and pose tell of."""
+    first = np.asarray(episode.arrays["u"][0], float)
+    turn = Rotation.from_quat(np.asarray(rotations.euler_to_quaternion(first[3:])), scalar_first=True)
+    base = Rotation.from_quat(episode.arrays["link_quaternion"][0, 0], scalar_first=True) * turn.inv()
+    origin = episode.arrays["link_position"][0, 0] - base.apply(first[:3])
+    turned = (base.inv() * reach.rotation).as_quat(scalar_first=True)
+    hinges = np.zeros((len(turned), 3))
+    near = first[3:]
+    for i in reversed(range(len(turned))):  # from the grasp backwards, so that no angle jumps
+        near = hinges[i] = np.asarray(rotations.quaternion_to_euler(turned[i : i + 1], near[None]))[0]
+    return np.concatenate([base.inv().apply(reach.position - origin), hinges], 1)

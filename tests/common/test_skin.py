@@ -1,0 +1,111 @@
+"""Every hand has a closed surface that follows its links and stays on their capsules."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from common.hands import get_hand
+from common.hands.flesh import surface_net
+from common.hands.skin import skin_of
+from common.hands.spec import Hand
+from services.assets.hands.kinematics import mujoco_link_poses
+
+HANDS = ("human", "allegro", "sharpa")
+
+
+def posed(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    position, quaternion = mujoco_link_poses(hand, q)
+    return skin_of(hand).posed(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
+
+
+def to_capsules(hand: Hand, q: np.ndarray, points: np.ndarray, links: set[int] | None = None) -> np.ndarray:
+    """(n,) distances of points to the surface of the nearest capsule of some links."""
+    position, quaternion = mujoco_link_poses(hand, q)
+    turns = Rotation.from_quat(quaternion, scalar_first=True)
+    found = []
+    for ends, radius, link in zip(hand.capsules, hand.capsule_radii, hand.capsule_links, strict=True):
+        if links is None or link in links:
+            a, b = turns[int(link)].apply(ends - skin_of(hand).origins[link]) + position[link]
+            share = np.clip((points - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)
+            found.append(np.linalg.norm(points - a - share[:, None] * (b - a), axis=-1) - radius)
+    return np.min(found, 0)
+
+
+def test_a_surface_net_of_a_ball_is_a_ball() -> None:
+    axis = np.arange(-8.0, 9.0)
+    values = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - 5.3
+    points, faces = surface_net(values)
+    mesh = trimesh.Trimesh(points - 8, faces, process=False)
+    assert mesh.is_volume and mesh.euler_number == 2
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * 5.3**3, rel=0.06)
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=-1) - 5.3).max() < 0.3
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_a_skin_is_a_surface_with_weights(name: str) -> None:
+    skin = skin_of(get_hand(name))
+    assert 2000 < len(skin.faces) < 10_000
+    np.testing.assert_allclose(skin.weights.sum(1), 1, atol=1e-5)
+    assert (skin.weights >= 0).all() and (skin.weights > 0).sum(1).max() <= 4
+    np.testing.assert_allclose(np.linalg.norm(skin.normals, axis=-1), 1, atol=1e-5)
+    corners = skin.points[skin.faces]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("fi,fi->f", flat, skin.normals[skin.faces].mean(1)) > 0).mean() > 0.995
+    links, weights = skin.influences()
+    whole = np.zeros_like(skin.weights)
+    np.add.at(whole, (np.arange(len(links))[:, None], links), weights)
+    np.testing.assert_allclose(whole, skin.weights, atol=1e-6)
+
+
+def test_flesh_is_closed_and_fingers_have_no_webs() -> None:
+    hand, skin = get_hand("human"), skin_of(get_hand("human"))
+    edges = np.concatenate([skin.faces[:, [0, 1]], skin.faces[:, [1, 2]], skin.faces[:, [2, 0]]])
+    there, back = (sorted(map(tuple, part)) for part in (edges, edges[:, ::-1]))
+    assert there == back  # each edge is passed as often one way as the other
+    finger = hand.link_fingers.copy()
+    finger[1] = -1  # the thumb's metacarpal belongs to the palm
+    share = np.stack([skin.weights[:, finger == f].sum(1) for f in range(len(hand.fingers))], 1)
+    assert ((share > 0).sum(1) <= 1).all()
+    # One finger bends alone: hardly anything is drawn out between it and its neighbours.
+    bent = hand.q_open.copy()
+    names = [joint.name for joint in hand.joints]
+    for joint in ("mcp_flexion", "pip", "dip"):
+        bent[names.index(f"middle_{joint}")] = 1.3
+    points, _ = posed(hand, bent)
+    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=-1)
+    assert lengths.max() < 0.018 and np.mean(lengths > 0.010) < 2e-3
+
+
+@pytest.mark.parametrize("closure", [0.0, 0.5, 1.0])
+def test_flesh_lies_on_the_capsules_of_the_fingers(closure: float) -> None:
+    """What touches in the simulation touches in the picture: within 2 mm on phalanges, 4 mm in a fist's folds."""
+    hand = get_hand("human")
+    q = hand.q_open + closure * (hand.q_closed - hand.q_open)
+    points, _ = posed(hand, q)
+    skin = skin_of(hand)
+    for finger in range(len(hand.fingers)):
+        links = set(np.flatnonzero(hand.link_fingers == finger))
+        own = points[skin.weights[:, sorted(links)[1:]].max(1) > 0.8]
+        assert len(own) > 40
+        distance = to_capsules(hand, q, own, links)
+        assert distance.max() < 2e-3 and distance.min() > -2e-3 - 2e-3 * closure
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_a_skin_follows_the_wrist_and_its_links(name: str) -> None:
+    hand, skin = get_hand(name), skin_of(get_hand(name))
+    points, normals = skin.posed(skin.origins, np.broadcast_to(np.eye(3), (len(hand.links), 3, 3)))
+    np.testing.assert_allclose(points, skin.points, atol=1e-6)
+    turn, shift = Rotation.from_rotvec([0.3, -1.0, 0.5]), np.array([0.1, 0.2, 0.3])
+    moved, turned = skin.posed(
+        turn.apply(skin.origins) + shift, np.broadcast_to(turn.as_matrix(), (len(hand.links), 3, 3))
+    )
+    np.testing.assert_allclose(moved, turn.apply(points) + shift, atol=1e-6)
+    np.testing.assert_allclose(turned, turn.apply(normals), atol=1e-5)
+    # A tip's own points move with its frame alone.
+    tip = hand.tip_links[1]
+    own = skin.weights[:, tip] > 0.999
+    position, quaternion = mujoco_link_poses(hand, hand.q_closed)
+    expected = Rotation.from_quat(quaternion[tip], scalar_first=True).apply(skin.points[own] - skin.origins[tip])
+    np.testing.assert_allclose(posed(hand, hand.q_closed)[0][own], expected + position[tip], atol=5e-5)

@@ -1,0 +1,152 @@
+"""The hand comes from beside the table without touching anything, and as an arm can."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.hands.kinematics import grasp_frame
+from common.objects import procedural
+from common.rotations import rotate
+from services.assets.hands.kinematics import mujoco_link_poses
+from services.export.motion_file import motion_of_episode
+from services.grasp.files import _steps_to_draw
+from services.grasp.jobs import find_objects, rest_pose
+from services.grasp.parse import grasp_part
+from services.grasp.reach import ACCELERATION, CLEARANCE, SPEED, TURNING, Reach, plan_reach, with_reach
+from services.viz.render import grasp_steps
+from tests.episodes import CONTROL_DT, episode
+
+DT = 0.01
+BALL = 0.04  # m
+
+
+@pytest.fixture(scope="module")
+def ball():
+    made = procedural.generate(1, "ball")
+    return made.scaled(2 * BALL / np.ptp(made.visual_vertices, axis=0).max())
+
+
+def beginning(hand, heading: np.ndarray, ball, away: float) -> Reach:
+    """The open hand that comes along a direction, with its centre so far from the ball's."""
+    frame = grasp_frame(hand)
+    across = np.cross(heading, [0.3, 0.9, 0.1])
+    turn = Rotation.align_vectors([heading, across], [frame.heading, frame.cross])[0]
+    center = ball.rest_poses[0][:3] - away * heading
+    position = center - turn.apply(frame.center)
+    return Reach(position[None], Rotation.concatenate([turn]), hand.q_open[None].astype(float))
+
+
+def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) exact distances of the hand's capsules from a ball, and from the table."""
+    ball, table = [], []
+    origins = np.array([link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0) for link in hand.links])
+    for q, turn, place in zip(reach.q, reach.rotation, reach.position, strict=True):
+        position, quaternion = mujoco_link_poses(hand, q)
+        links = Rotation.from_quat(quaternion, scalar_first=True)
+        for ends, radius, link in zip(hand.capsules, hand.capsule_radii, hand.capsule_links, strict=True):
+            a, b = turn.apply(links[int(link)].apply(ends - origins[link]) + position[link]) + place
+            share = np.clip((center - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)
+            ball.append(np.linalg.norm(a + share * (b - a) - center) - BALL - radius)
+            table.append(min(a[2], b[2]) - radius)
+    shape = len(reach.q), -1
+    return np.reshape(ball, shape).min(1), np.reshape(table, shape).min(1)
+
+
+@pytest.mark.parametrize("name", ["human", "allegro"])
+@pytest.mark.parametrize("heading", [(0.0, 0.0, -1.0), (-1.0, 0.2, -0.4)])
+def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, heading, ball) -> None:
+    hand, way = get_hand(name), np.array(heading) / np.linalg.norm(heading)
+    first = beginning(hand, way, ball, 0.16)
+    rest = np.asarray(ball.rest_poses[0], float)
+    reach = plan_reach(hand, ball, rest, way, first, 0.2, DT)
+    assert np.linalg.norm((reach.position[0] - rest[:3])[:2]) > 0.3  # beside the table
+    whole = Reach(
+        np.concatenate([reach.position, first.position]),
+        Rotation.concatenate([reach.rotation, first.rotation]),
+        np.concatenate([reach.q, first.q]),
+    )
+    near, low = clearance(hand, whole, rest[:3])
+    assert near.min() > min(CLEARANCE, near[-1]) - 2e-3
+    assert low.min() > min(CLEARANCE, low[-1]) - 2e-3
+    velocity = np.diff(whole.position, axis=0) / DT
+    assert np.linalg.norm(velocity, axis=1).max() < 1.02 * SPEED
+    acceleration = np.diff(velocity, axis=0, prepend=0 * velocity[:1], append=0 * velocity[:1]) / DT
+    assert np.linalg.norm(acceleration, axis=1).max() < 1.05 * ACCELERATION
+    turned = (whole.rotation[:-1].inv() * whole.rotation[1:]).magnitude() / DT
+    assert turned.max() < 1.02 * TURNING
+    assert len(plan_reach(hand, ball, rest, way, first, 3.0, DT).q) == 300  # slower if it is asked for
+
+
+def test_where_no_way_leads_is_said(ball) -> None:
+    hand = get_hand("human")
+    first = beginning(hand, np.array([0.0, 0.0, 1.0]), ball, 0.16)  # from below, through the table
+    with pytest.raises(CongraspError, match=r"no way leads to a grasp of .* Leave out --approach"):
+        plan_reach(hand, ball, np.asarray(ball.rest_poses[0], float), np.array([0.0, 0.0, 1.0]), first, 1.0, DT)
+
+
+def test_an_episode_with_a_reach_says_when_its_phases_begin() -> None:
+    made = episode()
+    made.meta["phases"] = {"grasp": 0.0, "hold": 8 * CONTROL_DT}
+    hand = get_hand("human")
+    first = Rotation.from_quat(made.arrays["link_quaternion"][0, 0], scalar_first=True)
+    turns = Rotation.concatenate([first * Rotation.from_rotvec([0.0, 0.0, a]) for a in (0.3, 0.2, 0.1)])
+    place = made.arrays["link_position"][0, 0] + np.outer([0.3, 0.2, 0.1], [0.0, 0.6, 0.8])
+    longer = with_reach(made, hand, Reach(place, turns, np.tile(hand.q_open, (3, 1))))
+    assert longer.meta["phases"] == {"approach": 0.0, "grasp": pytest.approx(0.03), "hold": pytest.approx(0.11)}
+    motion = motion_of_episode(longer)
+    assert len(motion.time) == 15 and motion.table[:11].all() and not motion.table[11:].any()
+    np.testing.assert_allclose(motion.wrist_position[:3], place, atol=1e-6)
+    np.testing.assert_allclose(motion.link_position[3:], made.arrays["link_position"])
+    assert (motion.object_position == motion.object_position[0]).all() and not motion.link_force[:3].any()
+    # The virtual wrist's joints put it there: R = Rx Ry Rz of the base, which is where the joints are zero.
+    u = longer.arrays["u"]
+    for t in range(3):
+        own = first * Rotation.from_euler("XYZ", u[t, 3:])
+        assert (own.inv() * turns[t]).magnitude() < 1e-5
+        np.testing.assert_allclose(first.apply(u[t, :3]) + made.arrays["link_position"][0, 0], place[t], atol=1e-6)
+    # What others take of such a motion is its grasp.
+    assert grasp_part(motion) == (3, 10) and grasp_steps(longer) == (3, 11)
+    lifted = dataclasses.replace(motion, about={"phases": {"grasp": 0.03, "lift": 0.08, "hold": 0.1}})
+    assert grasp_part(lifted) == (3, 7)
+    # Files of others may say anything.
+    for odd in ("soon", {"lift": "soon", "grasp": -1.0}, {"lift": 1e300, "grasp": float("nan")}, {"grasp": 9e3}):
+        first, end = grasp_part(dataclasses.replace(motion, about={"phases": odd}))
+        assert 0 <= first <= end < len(motion.time)
+        longer.meta["phases"] = odd
+        assert 0 <= grasp_steps(longer)[0] <= grasp_steps(longer)[1] <= len(motion.time)
+    drawn = _steps_to_draw(100, 150, 400)
+    assert drawn[0] == 0 and {100, 150, 400} < set(drawn) and len(drawn) == 8
+
+
+def test_resting_poses_by_name_and_number() -> None:
+    mug = procedural.generate(7, "mug")
+    upright = rest_pose(mug, "upright")
+    np.testing.assert_allclose(
+        np.asarray(rotate(mug.rest_poses[upright][3:], np.array([0.0, 0.0, 1.0])))[2], 1, atol=0.1
+    )
+    assert rest_pose(mug, "2") == 1
+    for text in ("0", "99", "sideways"):
+        with pytest.raises(CongraspError, match=f"--rest is '{text}'"):
+            rest_pose(mug, text)
+    lying = dataclasses.replace(mug, rest_poses=mug.rest_poses[:1])
+    with pytest.raises(CongraspError, match="does not rest with its z axis up in any of its 1 resting poses"):
+        rest_pose(lying, "upright")
+
+
+def test_names_of_a_folder_stand_for_files(tmp_path, monkeypatch) -> None:
+    from common.objects.store import Catalogue
+
+    mug = procedural.generate(7, "mug")
+    Catalogue(tmp_path / "mine").add(mug)
+    import pathlib
+
+    (found,), errors = find_objects([pathlib.Path("mug_7")], str(tmp_path / "mine"))
+    assert not errors and found.load().name == "mug_7"
+    trimesh.creation.box((0.05, 0.05, 0.1)).export(tmp_path / "mug_7.stl")
+    (other,), _ = find_objects([tmp_path / "mug_7.stl"], str(tmp_path / "mine"))
+    assert other.source is not None  # a file is a file
