@@ -12,7 +12,7 @@ from common.files import write_atomically
 from common.inputs import read_json
 from learner.run_directory import CONFIG_FILE, POLICY_FILE, has_checkpoints
 from services.reproduce.plan import Policy
-from services.train.presets import PRESETS
+from services.train.presets import FULL
 from services.train.processes import Child, end_all
 
 _TRAINED = "trained.json"
@@ -65,8 +65,7 @@ def train_all(
 
 def command(run_dir: pathlib.Path, policy: Policy, options: Sequence[str]) -> list[str]:
     """The command line of a training, without the program's name."""
-    known = policy.hand in PRESETS
-    chosen = ["--preset", policy.hand] if known else ["--preset", "human", "--hand", policy.hand]
+    chosen = ["--preset", FULL, "--hand", policy.hand]
     chosen += ["--method", policy.method] if policy.method != "ours" else []
     return ["train", *chosen, "--run-dir", str(run_dir), "--evaluation", "0", *options]
 
