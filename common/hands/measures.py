@@ -23,17 +23,17 @@ def fitting_scale(opening: float) -> float:
 
 
 @functools.cache
-def tip_force(hand: Hand) -> float:
-    """The force in N with which a fingertip can press, with the fingers straight; the mean over the fingers.
+def tip_forces(hand: Hand) -> np.ndarray:
+    """(G,) the forces in N with which the fingertips can press, thumb first, with the fingers straight.
 
     Of a finger it is the least over its joints of torque limit / distance of the joint's axis from the tip: what the
     tip bears whichever way it presses.
     """
-    return float(np.mean([_force(hand, hand.links[i]) for i in hand.tip_links]))
+    return np.array([_force(hand, hand.links[i]) for i in hand.tip_links])
 
 
 def _force(hand: Hand, link: Link) -> float:
-    """The same for the finger that ends with this link."""
+    """The force of the finger that ends with this link."""
     links = {other.name: other for other in hand.links}
     joints = [joint for name in chain_of(hand, link.name) for joint in links[name].joints]
     assert link.tip is not None

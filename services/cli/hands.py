@@ -110,4 +110,35 @@ def import_hand(
     return 0
 
 
-COMMANDS = {"list": list_hands, "sheet": sheet, "import": import_hand}
+def check(
+    hand: Annotated[str, tyro.conf.Positional],
+    png: pathlib.Path | None = None,
+) -> int:
+    """Decide whether a hand can grasp at all, before it is trained: one line for each check, with what mends it.
+
+    Palm, joints, opening and strength are measured; servos, overlaps, and grips of a ball, a cylinder and a box, which
+    are lifted and pushed, are simulated. The picture shows the grips and every joint. The exit code is 1 if a check
+    failed; what is in doubt may be as you want it.
+
+    Args:
+      hand: A hand, by its name or its file.
+      png: The picture; by default NAME-check.png.
+    """
+    from common.hands import get_hand
+    from common.parallel import cores
+    from services.assets.hands.check import check_hand
+    from services.train.recipe import recipe
+    from services.viz.hand_sheets import check_sheet
+    from services.viz.sheets import save_png
+
+    found = get_hand(hand)
+    checked = check_hand(found, recipe(found).task, cores())
+    for finding in checked.findings:
+        print(finding)
+    picture = png or pathlib.Path(f"{found.name}-check.png")
+    save_png(picture, check_sheet(found, checked.grips))
+    print(picture)
+    return int(checked.failed)
+
+
+COMMANDS = {"list": list_hands, "sheet": sheet, "import": import_hand, "check": check}

@@ -2,8 +2,8 @@
 
 A hand's size shows in the factor s on its objects (`Hand.object_scale`; the paper's for its hands,
 `common.hands.measures.fitting_scale` for others), its strength in the force F with which its fingertips can press
-(`common.hands.measures.tip_force`: torque limits over lengths); G is the number of its fingers. Its mass enters
-nowhere: the virtual wrist is made for it (`common.hands.spec.wrist_gains`).
+(the mean of `common.hands.measures.tip_forces`: torque limits over lengths); G is the number of its fingers. Its mass
+enters nowhere: the virtual wrist is made for it (`common.hands.spec.wrist_gains`).
 
 * **Squeeze** k = s^2 5 / G. All fingers together may press so that the pressure on the object is that of the human
   hand's five: their force grows with the object's surface, s^2, and fewer fingers press more each.
@@ -29,7 +29,7 @@ from common.config import (
     RunConfig,
     TaskConfig,
 )
-from common.hands.measures import tip_force
+from common.hands.measures import tip_forces
 from common.hands.spec import Hand
 
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
@@ -60,7 +60,7 @@ def rules(hand: Hand) -> Rules:
     """What the recipe's rules (this module's text) give for a hand."""
     squeeze = hand.object_scale**2 * 5 / len(hand.tip_links)
     force_max = max(round(2 * _FORCE * squeeze), 1) / 2
-    weakness = min(max((force_max / tip_force(hand) - _STRONG) / (1 - _STRONG), 0.0), 1.0)
+    weakness = min(max((force_max / float(tip_forces(hand).mean()) - _STRONG) / (1 - _STRONG), 0.0), 1.0)
     return Rules(
         force_max=force_max,
         heading_position=float(max(round(_HEADING * squeeze), 1)),

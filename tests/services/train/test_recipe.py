@@ -6,7 +6,7 @@ import pytest
 
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
-from common.hands.measures import fitting_scale, tip_force
+from common.hands.measures import fitting_scale, tip_forces
 from services.train.recipe import Rules, recipe, rules
 
 RULES = {
@@ -40,7 +40,7 @@ def test_a_fingertip_presses_with_the_torque_of_the_weakest_joint_over_its_lever
     # Allegro's straight finger: the second joint is 119 mm from the tip, its 0.7 N.m make 5.9 N there, less than the
     # next ones' on shorter levers; the thumb's first joint is 151 mm from its tip and makes 4.6 N.
     allegro = get_hand("allegro")
-    assert tip_force(allegro) == pytest.approx((3 * 0.7 / 0.119 + 0.7 / 0.151) / 4, rel=0.01)
+    assert tip_forces(allegro) == pytest.approx([0.7 / 0.151, *3 * [0.7 / 0.119]], rel=0.01)
     links = tuple(
         dataclasses.replace(
             link,
@@ -48,7 +48,7 @@ def test_a_fingertip_presses_with_the_torque_of_the_weakest_joint_over_its_lever
         )
         for link in allegro.links
     )
-    assert tip_force(dataclasses.replace(allegro, links=links)) == pytest.approx(2 * tip_force(allegro))
+    assert tip_forces(dataclasses.replace(allegro, links=links)) == pytest.approx(2 * tip_forces(allegro))
 
 
 def test_weaker_hands_train_more_on_parts_and_strong_ones_as_the_human_hand():
