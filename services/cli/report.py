@@ -9,7 +9,6 @@ from actors.physics import PhysicsName
 from common.errors import CongraspError
 
 _POOL = 64
-_PICTURED = 4
 
 
 def report(
@@ -39,53 +38,29 @@ def report(
       seed: Seed of constraints and episodes.
       hand: Whose pretrained policy.
     """
-    from actors.physics import resolve_physics
-    from common.config import ObjectsConfig
-    from common.objects.pool import HELD_OUT_SEED, load_pool
-    from common.parallel import cores
-    from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
-    from services.assets.objects.named import objects_of
     from services.cli.console import at_least, tracked
-    from services.evaluate.evaluator import Evaluator
-    from services.evaluate.failures import failure_sheets
-    from services.evaluate.protocol import objects_label, two_seconds
-    from services.evaluate.report import Commands, Picture, count_causes, curves_of, template, write_report
-    from services.evaluate.scores import TABLES, known_rows
-    from services.viz.sheets import png_of
+    from services.evaluate.reporting import report_on
 
     at_least(1, episodes=episodes, pool=pool)
     if out.is_dir():
         raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
-    template()  # fails before the evaluation if a package is missing
     run_dir = source if source is not None and source.is_dir() else None
     file = _policy_of_run(run_dir) if run_dir else policy_file(source, hand)
-    policy, engine = bundles.load(file), resolve_physics(physics)
-    names = known_rows(TABLES, policy.task)
     with tracked() as track:
-        curves = list(curves_of(run_dir)) if run_dir else []
-        given = (
-            objects_of(objects, track=track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
+        made = report_on(
+            file,
+            out,
+            subject=f"--policy {file}" if source else f"--hand {hand}",
+            episodes=episodes,
+            pool=pool,
+            physics=physics,
+            seed=seed,
+            objects=objects,
+            run_dir=run_dir,
+            track=track,
         )
-        track("Making constraints", None)
-        held, threads = two_seconds(policy.task), cores()
-        evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)
-        names, left_out = evaluator.allowed(names)
-        rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
-        advance = track("Pictures", len(names))
-        sheets = []
-        for name, sheet, causes in failure_sheets(evaluator, policy, names, _PICTURED, _PICTURED):
-            sheets.append(Picture(name, png_of(sheet), count_causes(causes)))
-            advance(len(sheets))
-    subject = f"--policy {file}" if source else f"--hand {hand}"
-    subject += f" --objects {objects}" if objects else f" --pool {pool}"
-    flags = f"{subject} --episodes {episodes} --physics {engine} --seed {seed}"
-    command = f"congrasp evaluate --table single composed {flags}"
-    commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
-    which = f"{len(given)} objects ({objects_label(policy, objects)})"
-    how = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
-    write_report(out, policy, file.name, rows, how, sheets, curves, commands)
-    for error in left_out:
+    for error in made.left_out:
         print(f"Left out: {error}")
     print(f"The report is in {out}: open it in a browser.")
     return 0
