@@ -1,12 +1,15 @@
 """`congrasp report`: a policy's report and model card."""
 
 import pathlib
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from actors.physics import PhysicsName
 from common.errors import CongraspError
+
+if TYPE_CHECKING:
+    from services.evaluate.report import HandCheck
 
 _POOL = 64
 
@@ -20,6 +23,8 @@ def report(
     pool: int = _POOL,
     seed: int = 0,
     hand: str = "human",
+    json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
+    check: pathlib.Path | None = None,
 ) -> int:
     """Write one HTML file about a policy: results beside the paper's, failed and successful episodes, and its training.
 
@@ -37,10 +42,14 @@ def report(
       pool: Number of procedural objects.
       seed: Seed of constraints and episodes.
       hand: Whose pretrained policy.
+      json: Also write the rows to this file.
+      check: A file of 'congrasp hands check --json', with the picture beside it, to be part of the report.
     """
+    from common.policy.bundle import content_hash
     from common.policy.pretrained import policy_file
     from services.cli.console import at_least, tracked
     from services.evaluate.reporting import report_on
+    from services.evaluate.scores import write_json
 
     at_least(1, episodes=episodes, pool=pool)
     if out.is_dir():
@@ -58,12 +67,27 @@ def report(
             seed=seed,
             objects=objects,
             run_dir=run_dir,
+            check=None if check is None else _checked(check),
             track=track,
         )
+    if json is not None:
+        about = {"policy": str(file), "content": content_hash(file.read_bytes()), "episodes": episodes, "pool": pool}
+        write_json(made.rows, json, {**about, "seed": seed})
     for error in made.left_out:
         print(f"Left out: {error}")
     print(f"The report is in {out}: open it in a browser.")
     return 0
+
+
+def _checked(file: pathlib.Path) -> "HandCheck":
+    """The self-check that a file and the picture beside it show."""
+    from services.assets.hands.check import read_findings
+    from services.evaluate.report import HandCheck
+
+    picture = file.with_suffix(".png")
+    if not picture.is_file():
+        raise CongraspError(f"There is no picture {picture}.", "Make it with 'congrasp hands check --png'.")
+    return HandCheck(read_findings(file), picture.read_bytes())
 
 
 def _policy_of_run(run_dir: pathlib.Path) -> pathlib.Path:

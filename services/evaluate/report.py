@@ -53,8 +53,6 @@ class HandCheck:
     """Check, verdict, what was measured, and the remedy of each line."""
     sheet: bytes
     """PNG of the grips and joints."""
-    command: str
-    """That makes both again."""
 
 
 def write_report(

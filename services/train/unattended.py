@@ -1,4 +1,4 @@
-"""One training as a process of its own, which nobody watches: it goes on from its last checkpoint until it is done."""
+"""Commands in processes of their own, which nobody watches; a training goes on from its last checkpoint."""
 
 import json
 import pathlib
@@ -31,6 +31,29 @@ def seconds(run_dir: pathlib.Path) -> float | None:
         return None
 
 
+def run_child(child: Child, patience: float, progress: Callable[[str], None] = lambda line: None) -> int | None:
+    """Runs a command in a process of its own; whatever happens, it is over then.
+
+    Args:
+      child: not started yet.
+      patience: seconds after which it is ended.
+      progress: is given the last line that it printed, some times a second.
+
+    Returns:
+      Its exit code; None if it was ended.
+    """
+    began = time.monotonic()
+    try:
+        child.start()
+        assert child.process is not None
+        while (code := child.process.poll()) is None and time.monotonic() - began < patience:
+            progress(child.last_line())
+            time.sleep(_POLL)
+    finally:
+        end_all([child])
+    return code
+
+
 def train_in_background(
     run_dir: pathlib.Path,
     chosen: Sequence[str],
@@ -60,14 +83,7 @@ def train_in_background(
     run_dir.parent.mkdir(parents=True, exist_ok=True)
     child = Child(name, arguments, run_dir.with_name(f"{name}.log"))
     began = time.monotonic()
-    try:
-        child.start()
-        assert child.process is not None
-        while (code := child.process.poll()) is None and time.monotonic() - began < patience:
-            progress(child.last_line())
-            time.sleep(_POLL)
-    finally:
-        end_all([child])
+    code = run_child(child, patience, progress)
     if code is None:
         raise CongraspError(
             f"The training of {name} was ended after {patience / 60:.0f} min.",

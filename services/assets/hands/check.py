@@ -6,6 +6,9 @@ measured of palm, joints, opening and strength follows from the hand's data; ser
 """
 
 import functools
+import json
+import pathlib
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -14,11 +17,14 @@ import numpy as np
 
 from actors import protocols
 from common.config import TaskConfig
+from common.errors import CongraspError
+from common.files import write_atomically
 from common.hands import kinematics
 from common.hands.kinematics import grasp_frame
 from common.hands.measures import tip_forces
 from common.hands.mjcf import overlapping
 from common.hands.spec import Hand, chain_of
+from common.inputs import read_json
 from common.objects import procedural
 from common.objects.pool import HELD_OUT_SEED
 from common.objects.spec import GraspObject
@@ -39,6 +45,7 @@ _UNREST = 0.05, 0.5  # rad/s
 _ERROR = 0.1, 0.3  # shares of a step
 _OVERLAP = 0.004, 0.012  # m
 _POOL = 48
+_LARGEST = 1 << 20  # bytes of a file of findings
 _NEAR = 0.25  # share of the way from the open to the closed pose in which joints are looked at
 
 
@@ -83,6 +90,21 @@ def check_hand(hand: Hand, task: TaskConfig, threads: int) -> Checked:
     held = grips(hand, task, threads)
     sound = all(finding.verdict != "failed" for finding in found)
     return Checked(found + [_grip(grip, sound) for grip in held], held)
+
+
+def write_findings(path: pathlib.Path, findings: Sequence[Finding]) -> None:
+    """Writes what was found as JSON, which `read_findings` reads."""
+    write_atomically(path, json.dumps({"findings": [finding._asdict() for finding in findings]}, indent=1).encode())
+
+
+def read_findings(path: pathlib.Path) -> list[Finding]:
+    """What a file of `write_findings` says; a CongraspError if it cannot be read."""
+    try:
+        return [Finding(**fields) for fields in read_json(path, _LARGEST)["findings"]]
+    except (OSError, LookupError, TypeError) as error:
+        raise CongraspError(
+            f"{path} holds no self-check: {error}.", "Make it with 'congrasp hands check --json'."
+        ) from None
 
 
 def _verdict(value: float, doubt: float, fail: float) -> Verdict:
