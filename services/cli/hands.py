@@ -95,7 +95,7 @@ def import_hand(
     if out is not None and out.suffix != SUFFIX:
         raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
     _keep(proposal, out, png)
-    print(f"Try: congrasp hands check {proposal.hand.name if out is None else out}")
+    print(f"Try: congrasp hands train {proposal.hand.name if out is None else out}")
     return 0
 
 

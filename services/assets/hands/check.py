@@ -36,13 +36,13 @@ Verdict = Literal["passed", "doubt", "failed"]
 _APART = 0.03, 0.06  # m from a finger's first joint to the palm: more is in doubt, and too much
 _REACH = 2.5, 4.0  # fingers' lengths from the wrist to the hand centre, likewise
 _STAYS = 0.01  # m: a joint whose closing moves its fingertip less is not one that closes
-_ALONG = 0.0, -0.3  # cosine between a closing fingertip's way and its opponent: less is in doubt, and the wrong way
+_ALONG = -0.1, -0.3  # cosine between a closing fingertip's way and its opponent: less is in doubt, and the wrong way
 _GAP = 0.3, 0.5  # shares of the opening to which the fingertips close
 _FITTING = 0.9, 0.6  # shares of the objects that the opening spans
 _CARRIED = 2.0, 1.0  # the weights of a median object that friction carries
 _OVERSHOOT = 0.25, 0.6  # shares of a step
 _UNREST = 0.05, 0.5  # rad/s
-_ERROR = 0.1, 0.3  # shares of a step
+_ERROR = 0.1, 0.6  # shares of a step, 0.6 s after it
 _OVERLAP = 0.004, 0.012  # m
 _POOL = 48
 _LARGEST = 1 << 20  # bytes of a file of findings
@@ -193,7 +193,9 @@ def _joints(hand: Hand) -> list[Finding]:
                     f"turn its axis, or close it towards {limit:.2f} in closed_pose; leave it out if it spreads",
                 )
             )
-    if len(found) == 1:
+    if not moved:
+        found.append(Finding("joints", "failed", "no joint closes", "give closed_pose the angles of a fist"))
+    elif len(found) == 1:
         found.append(Finding("joints", "passed", f"each of the {moved} that close brings its fingertip nearer"))
     return found
 
@@ -272,8 +274,8 @@ def _servos(hand: Hand, found: list[Response]) -> list[Finding]:
 def _response(one: Response) -> str:
     """A response in words."""
     return (
-        f"overshoots a step by {100 * one.overshoot:.0f} %, moves at {one.unrest:.2f} rad/s half a second later, "
-        f"{100 * one.error:.0f} % off"
+        f"overshoots a step by {100 * one.overshoot:.0f} %, shakes at {one.unrest:.2f} rad/s half a second later, and "
+        f"is {100 * one.error:.0f} % off then"
     )
 
 

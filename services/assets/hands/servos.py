@@ -27,7 +27,7 @@ class Response(NamedTuple):
     overshoot: float
     """Beyond the target, as a share of the step."""
     unrest: float
-    """rad/s, the root mean square of the joint's speed in the last tenth of a second."""
+    """rad/s, the standard deviation of the joint's speed in the last tenth of a second; a slow joint has none."""
     error: float
     """Distance from the target in the end, as a share of the step."""
     diverged: bool
@@ -48,7 +48,7 @@ def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
     return [
         Response(
             float(max(gone[:, j].max() - 1, 0.0)),
-            float(np.sqrt((speed[:, j] ** 2).mean())),
+            float(speed[:, j].std()),
             float(abs(gone[-1, j] - 1)),
             bool(states.diverged[:, j].any()),
         )
