@@ -95,7 +95,8 @@ def import_hand(
     if out is not None and out.suffix != SUFFIX:
         raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
     _keep(proposal, out, png)
-    print(f"Try: congrasp hands train {proposal.hand.name if out is None else out}")
+    called = proposal.hand.name if out is None else out
+    print(f"Try: congrasp hands train {called}, or congrasp train --hand {called} --physics native")
     return 0
 
 
@@ -143,7 +144,7 @@ def check(
     from common.parallel import cores
     from services.assets.hands.check import check_hand, write_findings
     from services.train.recipe import recipe
-    from services.viz.hand_sheets import check_sheet
+    from services.viz.check_sheet import check_sheet
     from services.viz.sheets import save_png
 
     found = get_hand(hand)

@@ -1,28 +1,23 @@
 """Contact sheets of hands: their poses with the grasp frame, and what every joint does."""
 
-from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand, link_origin
-from services.record.palette import HEADING, OBJECT, SKIN, WAYPOINT, Colour
+from services.record.palette import HEADING, OBJECT, SKIN, WAYPOINT
 from services.viz.raster import render_scene
 from services.viz.scene import Shape
 from services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, upright
 from services.viz.sheets import contact_sheet
 
-if TYPE_CHECKING:
-    from services.assets.hands.grips import Grip
-
 _VIEW = np.array([0.75, 0.65, 0.35])
 
 
-def _placed(hand: Hand, q: np.ndarray, marked: Collection[int] = (), colour: Colour = OBJECT) -> list[Shape]:
+def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = ()) -> list[Shape]:
     """The hand upright with finger angles (F,), some of its links in another colour."""
-    colours = [colour if i in marked else SKIN for i in range(len(hand.links))]
+    colours = [OBJECT if i in moved else SKIN for i in range(len(hand.links))]
     return posed_hand(hand, q, np.zeros(3), upright(hand), colours)
 
 
@@ -85,38 +80,6 @@ def hands_sheet(hands: Sequence[Hand], *, size: tuple[int, int] = (300, 300)) ->
 
 def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarray:
     """The hand's three poses, and every joint at both of its limits, with the links that it moves in colour."""
-    reach = max(float(np.linalg.norm(link_origin(link))) for link in hand.links)
-    title = f"{hand.name}: {len(hand.joints)} joints, {len(hand.links)} links, {100 * reach:.0f} cm to the last joint"
-    return contact_sheet(*joint_pictures(hand, size), columns=8, title=title)
-
-
-def check_sheet(hand: Hand, grips: "Sequence[Grip]", *, size: tuple[int, int] = (220, 220)) -> np.ndarray:
-    """The grips of a hand's self-check from two sides, with the links in contact in colour, before its joints."""
-    images, labels = [], []
-    for grip in grips:
-        turn = upright(hand)
-        quaternion = turn * Rotation.from_quat(grip.object_quaternion, scalar_first=True)
-        obj = Shape(
-            "mesh",
-            (0, 0),
-            OBJECT,
-            turn.apply(grip.object_position),
-            quaternion.as_quat(scalar_first=True),
-            vertices=grip.obj.visual_vertices,
-            faces=grip.obj.visual_faces,
-        )
-        shapes = [*_placed(hand, grip.q, np.flatnonzero(grip.touching).tolist(), WAYPOINT), obj]
-        # What was lost is drawn where it was let go from, as far as the picture's edge.
-        points = _points(shapes if grip.held else shapes[:-1])
-        for side, view in (("", _side(hand)), (", from the other side", _side(hand) * [1.0, -1.0, 1.0])):
-            images.append(render_scene(shapes, fit(points, view, size[0] / size[1]), size))
-            labels.append(f"{grip.obj.name} {'held' if grip.held else 'lost'}{side}")
-    joints = joint_pictures(hand, size)
-    return contact_sheet([*images, *joints[0]], [*labels, *joints[1]], columns=8, title=f"{hand.name}: self-check")
-
-
-def joint_pictures(hand: Hand, size: tuple[int, int]) -> tuple[list[np.ndarray], list[str]]:
-    """Pictures of `joints_sheet` and their labels."""
     rows = {**_poses(hand), "all at zero": _placed(hand, np.clip(0.0, hand.lower, hand.upper))}
     rows["open"] += _frame(hand)
     names = [link.name for link in hand.links]
@@ -133,4 +96,7 @@ def joint_pictures(hand: Hand, size: tuple[int, int]) -> tuple[list[np.ndarray],
             rows[f"{joint.name} {angle:.2f}"] = _placed(hand, q, sorted(moved))
     points = np.concatenate([_points(shapes) for shapes in rows.values()])
     camera = fit(points, _side(hand), size[0] / size[1])
-    return [render_scene(shapes, camera, size) for shapes in rows.values()], list(rows)
+    images = [render_scene(shapes, camera, size) for shapes in rows.values()]
+    reach = max(float(np.linalg.norm(link_origin(link))) for link in hand.links)
+    title = f"{hand.name}: {len(hand.joints)} joints, {len(hand.links)} links, {100 * reach:.0f} cm to the last joint"
+    return contact_sheet(images, list(rows), columns=8, title=title)

@@ -177,7 +177,7 @@ def test_what_is_no_hand_is_refused_with_the_reason(tmp_path):
 def test_the_commands_import_list_and_draw(tmp_path, capsys):
     assert main.run(["hands", "import", str(HANDS / "claw.urdf"), "--name", "gripper"]) == 0
     said = capsys.readouterr().out
-    assert "6 joints, 7 links" in said and "congrasp hands train gripper" in said
+    assert "6 joints, 7 links" in said and "congrasp train --hand gripper" in said
     assert (tmp_path / "own" / "gripper.json").exists() and (tmp_path / "own" / "gripper.png").stat().st_size > 10_000
     assert main.run(["hands", "list"]) == 0
     said = capsys.readouterr().out
