@@ -85,7 +85,7 @@ def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
     pieces = obj.pieces
     return {
         "piece_kind": np.array([PIECE_KINDS.index(piece.kind) for piece in pieces], np.int32),
-        "piece_size": np.array([piece.size for piece in pieces]),
+        "piece_size": np.array([piece.size for piece in pieces], np.float64),
         "piece_pos": np.array([piece.pos for piece in pieces]),
         "piece_quat": np.array([piece.quat for piece in pieces]),
         "piece_part": np.array([piece.part for piece in pieces], np.int32),

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from actors.env import EnvState, episode_fields
+from actors.env import episode_fields
 from actors.episode import episode_message
 from actors.failure_weights import FailureWeights
+from actors.followed import Followed, Follower
 from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from actors.physics import make_physics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes
@@ -25,7 +26,7 @@ from common.journal import Journal
 from common.policy.bundle import PolicyBundle, policy_spec, sample_action
 from common.stages import stage
 from common.task.bank import ConstraintBank
-from common.task.types import Array, Surface
+from common.task.types import Array
 from common.transport.base import Transport
 from common.wire.codec import Message, finite
 from common.wire.schema import RECORDED
@@ -126,7 +127,9 @@ class _Actor:
         self._failures = self._failure_weights(bank)
         self._on_rollout = on_rollout
         self._bundle: PolicyBundle | None = None
-        self._rollouts = 0
+        self._rollouts = self._next_episode = 0
+        task = self._config.task
+        self._follower = Follower(max(task.approach_steps + task.hold_steps, config.rollout_steps))
 
     def act(self, stop: threading.Event) -> None:
         """Rollouts until `stop` is set or the run ends."""
@@ -160,6 +163,7 @@ class _Actor:
         self._objects, bank = training_set(self._hand, self._config, self._number)
         self._worker.replace_objects(self._objects, bank)
         self._worker.restart()
+        self._follower.forget()
         self._failures = self._failure_weights(bank)
 
     def _warm_up(self, stop: threading.Event) -> None:
@@ -228,9 +232,11 @@ class _Actor:
         }
         self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
         self._on_rollout({"version": float(bundle.version), **values})
-        if self._rollouts % config.episode_every == 0 and started_fresh:
-            assert before is not None
-            self._publish_episode(bundle, rollout, before)
+        due, after = self._rollouts >= self._next_episode, self._worker.state
+        assert after is not None
+        if episode := self._follower.add(rollout.trace, before if started_fresh else None, after, due=due):
+            self._publish_episode(bundle, rollout, episode)
+            self._next_episode = self._rollouts + config.episode_every
         if config.log_rollout_every and self._rollouts % config.log_rollout_every == 0:
             self._publish("rollout", self._sampled(bundle, taken))
         self._rollouts += 1
@@ -251,13 +257,11 @@ class _Actor:
         }
         return Message(first_environments(arrays, self._config.log_rollout_worlds or self._config.environments), meta)
 
-    def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, first_state: EnvState) -> None:
-        """Environment 0's episode, from the rollout that it began in."""
+    def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, episode: Followed) -> None:
+        """Environment 0's episode."""
         episodes = dict(zip(episode_fields(self._config.task), np.asarray(rollout.episodes)[0], strict=True))
         metrics = {name.removeprefix("episode/"): float(v) for name, v in episodes.items() if "episode/" in name}
-        surface = Surface(*(np.asarray(field)[0] for field in first_state.surface))
-        obj = self._objects[int(np.asarray(first_state.reset_state.object_index)[0])]
-        goal = first_state.goal.row(0)
+        obj = self._objects[episode.object_index]
         meta = {
             "time": time.time(),
             "version": bundle.version,
@@ -265,7 +269,9 @@ class _Actor:
             "success": metrics["success"] > 0,
             "metrics": metrics,
         }
-        message = episode_message(self._hand, self._config.task, rollout.trace, goal, surface, obj, meta)
+        message = episode_message(
+            self._hand, self._config.task, episode.trace, episode.goal, episode.surface, obj, meta
+        )
         self._publish("episode", message)
 
     def _publish(self, kind: str, message: Message) -> None:

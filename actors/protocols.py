@@ -198,18 +198,27 @@ def assess(
     end = task.approach_steps + hold
     until, after = (jax.tree.map(operator.itemgetter(part), samples) for part in (slice(end), slice(end - 1, None)))
     found = plausibility.measures(until, task.control_dt)
-    found |= {"clean": plausibility.is_clean(held, found), **survival(after, held, task, height)}
+    survived = survival(after.object_position, after.object_quaternion, held, task, height)
+    found |= {"clean": plausibility.is_clean(held, found), **survived}
     return {name: np.asarray(value, np.float32) for name, value in found.items()}
 
 
-def survival(samples: Sample, held: np.ndarray, task: TaskConfig, height: float = LIFT_HEIGHT) -> dict[str, np.ndarray]:
+def survival(
+    object_position: np.ndarray,
+    object_quaternion: np.ndarray,
+    held: np.ndarray,
+    task: TaskConfig,
+    height: float = LIFT_HEIGHT,
+) -> dict[str, np.ndarray]:
     """Which grasps survived the parts of `stress`: (B,) 1 or 0 each, NaN where it was not simulated.
 
     Every control step counts, and each part begins from where the object is then; what is lost in one part is lost in
     the next ones too.
 
     Args:
-      samples: of the last control step of the hold and of the `stress_steps` after it, NumPy arrays (1 + T, B, ...).
+      object_position: (1 + T, B, 3) in the wrist frame, m, after the last control step of the hold and after the
+        `stress_steps` that follow it.
+      object_quaternion: (1 + T, B, 4) object frame to wrist frame.
       held: (B,) bool, whether the object was held until then.
       task: length of a control step.
       height: of the lift, m.
@@ -222,9 +231,9 @@ def survival(samples: Sample, held: np.ndarray, task: TaskConfig, height: float 
     ends = np.cumsum([0, lift_steps(task, height), six, six])
     kept = [np.asarray(held, bool)]
     for first, last in itertools.pairwise(ends):
-        position, quaternion = samples.object_position[first : last + 1], samples.object_quaternion[first : last + 1]
+        position, quaternion = object_position[first : last + 1], object_quaternion[first : last + 1]
         way = np.linalg.norm(position - position[:1], axis=-1)
         turn = 2 * np.arccos(np.minimum(np.abs((quaternion * quaternion[:1]).sum(-1)), 1.0))
         kept.append(kept[-1] & ((way < FARTHEST) & (turn < MOST_TURNED)).all(0))
-    simulated = 1.0 if len(samples.object_position) > ends[-1] else np.nan
+    simulated = 1.0 if len(object_position) > ends[-1] else np.nan
     return {name: simulated * survived for name, survived in zip(SURVIVAL, kept[1:], strict=True)}

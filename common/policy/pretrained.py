@@ -1,28 +1,44 @@
-"""Trained policies that come with the package, one for a hand."""
+"""Trained policies by their hands: those that come with the package, and the user's own beside the own hands' files."""
 
 import pathlib
 
 from common.errors import CongraspError
-from common.hands import HANDS, get_hand
+from common.hands import HANDS, get_hand, hands_folder, own_hands
 
 _FOLDER = pathlib.Path(__file__).with_name("data")
+SUFFIX = ".safetensors"
 
 
 def pretrained_file(hand: str) -> pathlib.Path | None:
-    """The file of the policy that comes with the package for this hand; None if none does."""
-    path = _FOLDER / f"{get_hand(hand).name}.safetensors"
-    return path if path.exists() else None
+    """The file of the policy for this hand that comes with the package, or else the user's own; None if there is none.
+
+    A hand that is described by a file has a policy of the user's own alone, whatever its name.
+    """
+    found = get_hand(hand)
+    packaged, own = _FOLDER / f"{found.name}{SUFFIX}", own_policy_file(found.name)
+    return next((path for path in ([own] if found.text else [packaged, own]) if path.exists()), None)
+
+
+def own_policy_file(name: str) -> pathlib.Path:
+    """Where the user's own policy for the hand of this name is, or would be."""
+    return hands_folder() / f"{name}{SUFFIX}"
 
 
 def reference_file(hand: str) -> pathlib.Path | None:
     """The file of a hand's reference policy, which knows no reference poses and no trajectories; None if none comes."""
-    path = _FOLDER / f"{get_hand(hand).name}-reference.safetensors"
+    path = _FOLDER / f"{get_hand(hand).name}-reference{SUFFIX}"
     return path if path.exists() else None
 
 
 def pretrained_hands() -> list[str]:
     """Names of the hands whose policies come with the package, in the package's order: the human hand is the first."""
-    return [name for name in HANDS if (_FOLDER / f"{name}.safetensors").exists()]
+    return [name for name in HANDS if (_FOLDER / f"{name}{SUFFIX}").exists()]
+
+
+def hands_with_policy() -> list[str]:
+    """The same, and then the names of the user's own hands that have a policy."""
+    packaged = pretrained_hands()
+    return [*packaged, *(name for name in own_hands() if name not in packaged and own_policy_file(name).exists())]
 
 
 def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path:
@@ -35,6 +51,7 @@ def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path
     if path is None:
         raise CongraspError(
             f"No policy was named, and none comes with this installation for the hand '{get_hand(hand).name}'.",
-            "Give --policy FILE: every run of 'congrasp train' has a policy.safetensors.",
+            "Train one with 'congrasp hands train', or give --policy FILE: every run of 'congrasp train' has a "
+            "policy.safetensors.",
         )
     return path

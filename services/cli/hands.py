@@ -1,9 +1,14 @@
 """`congrasp hands`: the hands there are, pictures of them, and hands of one's own."""
 
 import pathlib
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from actors.physics import PhysicsName
+
+if TYPE_CHECKING:
+    from services.assets.hands.model_files import Choices, Proposal
 
 
 def list_hands() -> int:
@@ -15,7 +20,7 @@ def list_hands() -> int:
     from services.cli.console import show_table
 
     rows, missing = [], []
-    own = own_hands()
+    own, folder = own_hands(), hands_folder()
     for name in [*HANDS, *own]:
         try:
             hand = get_hand(name)
@@ -29,7 +34,7 @@ def list_hands() -> int:
             f"{sum(link.mass for link in hand.links):.2f} kg",
             f"{max(joint.torque_limit for joint in hand.joints):.1f} N.m",
             f"x {hand.object_scale:g}",
-            "pretrained" if pretrained_file(name) else "none",
+            "none" if (file := pretrained_file(name)) is None else "own" if file.parent == folder else "pretrained",
         )
         rows.append(row)
     show_table(("hand", "joints", "fingers", "mass", "torque", "objects", "policy"), rows)
@@ -82,20 +87,32 @@ def import_hand(
       png: The picture; by default beside the file.
     """
     from common.errors import CongraspError
+    from common.hands import SUFFIX
+    from services.assets.hands.model_files import Choices
+    from services.assets.hands.model_files import import_hand as proposed
+
+    proposal = proposed(file, Choices(name, palm, thumb, object_scale))
+    if out is not None and out.suffix != SUFFIX:
+        raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
+    _keep(proposal, out, png)
+    called = proposal.hand.name if out is None else out
+    print(f"Try: congrasp hands train {called}, or congrasp train --hand {called} --physics native")
+    return 0
+
+
+def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | None) -> None:
+    """Writes a hand's file and picture, by default in the folder of the user's own hands, and prints all of it."""
+    from common.errors import CongraspError
     from common.files import write_atomically
     from common.hands import HANDS, SUFFIX, get_hand, hands_folder
     from common.hands.files import hand_text
-    from services.assets.hands.model_files import Choices, describe
-    from services.assets.hands.model_files import import_hand as proposed
+    from services.assets.hands.model_files import describe
     from services.viz.hand_sheets import joints_sheet
     from services.viz.sheets import save_png
 
-    proposal = proposed(file, Choices(name, palm, thumb, object_scale))
     hand = proposal.hand
     if hand.name in HANDS:
         raise CongraspError(f"'{hand.name}' is a hand of congrasp.", "Give yours another --name.")
-    if out is not None and out.suffix != SUFFIX:
-        raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
     path = out or hands_folder() / f"{hand.name}{SUFFIX}"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, hand_text(hand).encode())
@@ -105,9 +122,128 @@ def import_hand(
     for line in describe(proposal):
         print(line)
     print(f"\n{path}\n{picture}")
-    called = hand.name if out is None else path
-    print(f"Try: congrasp train --hand {called} --physics native")
+
+
+def check(
+    hand: Annotated[str, tyro.conf.Positional],
+    png: pathlib.Path | None = None,
+    json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
+) -> int:
+    """Decide whether a hand can grasp at all, before it is trained: one line for each check, with what mends it.
+
+    Palm, joints, opening and strength are measured; servos, overlaps, and grips of a ball, a cylinder and a box, which
+    are lifted and pushed, are simulated. The picture shows the grips and every joint. The exit code is 1 if a check
+    failed; what is in doubt may be as you want it.
+
+    Args:
+      hand: A hand, by its name or its file.
+      png: The picture; by default NAME-check.png.
+      json: Also write the lines to this file.
+    """
+    from common.hands import get_hand
+    from common.parallel import cores
+    from services.assets.hands.check import check_hand, write_findings
+    from services.train.recipe import recipe
+    from services.viz.check_sheet import check_sheet
+    from services.viz.sheets import save_png
+
+    found = get_hand(hand)
+    checked = check_hand(found, recipe(found).task, cores())
+    for finding in checked.findings:
+        print(finding)
+    picture = png or pathlib.Path(f"{found.name}-check.png")
+    save_png(picture, check_sheet(found, checked.grips))
+    if json is not None:
+        write_findings(json, checked.findings)
+    print(picture)
+    return int(checked.failed)
+
+
+def train(
+    hand: Annotated[str, tyro.conf.Positional],
+    name: str = "",
+    palm: str = "",
+    thumb: str = "",
+    object_scale: float = 0.0,
+    out: pathlib.Path | None = None,
+    anyway: bool = False,
+    physics: PhysicsName = "auto",
+    episodes: int = 0,
+    pool: int = 0,
+    training: str = "",
+    patience: int = 240,
+) -> int:
+    """From a URDF or MJCF to a policy and a report: import, self-check, training, evaluation.
+
+    On a GPU it trains the full task by the recipe for all hands; afterwards grasp, serve, evaluate and view take the
+    policy as --hand NAME. Without a GPU the training is short and of an easier task. It stops where the self-check
+    fails. The same command goes on where it was stopped.
+
+    Examples: congrasp hands train my_hand.urdf; congrasp hands train my_hand --training="--updates 900"
+
+    Args:
+      hand: The hand's URDF (.urdf) or MJCF (.xml), which is imported unless a hand of its name is among your own
+        already; or a hand's name or file.
+      name: As in 'congrasp hands import', like the next three.
+      palm: The body that is the palm.
+      thumb: The last body of the finger that opposes the others.
+      object_scale: Factor on the objects that it learns to grasp.
+      out: Folder for the self-check, the run and the report; runs/hands/NAME by default.
+      anyway: Train it although its self-check failed.
+      physics: Engine of the full task and of the evaluation.
+      episodes: Episodes of each row of the report; 0 takes 200, without a GPU 24.
+      pool: Objects of the report; 0 takes 64, without a GPU 12.
+      training: Further options of 'congrasp train', as one text.
+      patience: Minutes after which the training is ended, to be resumed by the next 'congrasp hands train'.
+    """
+    import shlex
+
+    import jax
+
+    from common.hands import get_hand
+    from services.assets.hands.model_files import Choices
+    from services.cli.console import at_least
+    from services.train.own_hand import Request, train_hand
+    from services.train.processes import accelerators
+
+    at_least(0, episodes=episodes, pool=pool)
+    at_least(1, patience=patience)
+    full = accelerators()[0] != "cpu"
+    jax.config.update("jax_platforms", "cpu")  # the stages are processes that have a GPU's memory for themselves
+    reference = _taken(hand, Choices(name, palm, thumb, object_scale))
+    found = get_hand(reference)
+    request = Request(
+        hand=found,
+        reference=reference,
+        out=out or pathlib.Path("runs", "hands", found.name),
+        full=full,
+        anyway=anyway,
+        physics=physics,
+        episodes=episodes or (200 if full else 24),
+        pool=pool or (64 if full else 12),
+        options=shlex.split(training),
+        patience=60.0 * patience,
+    )
+    train_hand(request, lambda text: print(text, flush=True))
+    print(f"Try: congrasp grasp mug.obj --hand {reference}")
     return 0
 
 
-COMMANDS = {"list": list_hands, "sheet": sheet, "import": import_hand}
+def _taken(hand: str, choices: "Choices") -> str:
+    """What commands call a hand by; that of a URDF or MJCF is imported, unless it was before."""
+    from common.hands import own_hands
+    from services.assets.hands.model_files import import_hand as proposed
+
+    file = pathlib.Path(hand)
+    if file.suffix.lower() not in (".urdf", ".xml", ".mjcf"):
+        return hand
+    proposal = proposed(file, choices)
+    name = proposal.hand.name
+    if name in own_hands():
+        print(f"The hand '{name}' is {own_hands()[name]}; 'congrasp hands import' would make it anew.")
+    else:
+        _keep(proposal, None, None)
+    return name
+
+
+COMMANDS = {"list": list_hands, "sheet": sheet, "import": import_hand, "check": check, "train": train}

@@ -30,7 +30,7 @@ COMMANDS = {
     "reproduce": "the paper's tables: train what is missing, evaluate, compare",
     "query": "ask a policy server for one action, or measure its latency",
     "objects": "generate, import, list and show objects",
-    "hands": "list and draw hands, and bring one of your own",
+    "hands": "list, draw and check hands; from the URDF of your own to its policy",
     "constraints": "make the constraint sets of objects, and look at them",
     "record": "record a run to MCAP, from this machine or another",
     "plot": "draw a run's learning curves and reward terms",

@@ -1,15 +1,17 @@
 """`congrasp report`: a policy's report and model card."""
 
 import pathlib
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from actors.physics import PhysicsName
 from common.errors import CongraspError
 
+if TYPE_CHECKING:
+    from services.evaluate.report import HandCheck
+
 _POOL = 64
-_PICTURED = 4
 
 
 def report(
@@ -21,6 +23,8 @@ def report(
     pool: int = _POOL,
     seed: int = 0,
     hand: str = "human",
+    json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
+    check: pathlib.Path | None = None,
 ) -> int:
     """Write one HTML file about a policy: results beside the paper's, failed and successful episodes, and its training.
 
@@ -38,57 +42,52 @@ def report(
       pool: Number of procedural objects.
       seed: Seed of constraints and episodes.
       hand: Whose pretrained policy.
+      json: Also write the rows to this file.
+      check: A file of 'congrasp hands check --json', with the picture beside it, to be part of the report.
     """
-    from actors.physics import resolve_physics
-    from common.config import ObjectsConfig
-    from common.objects.pool import HELD_OUT_SEED, load_pool
-    from common.parallel import cores
-    from common.policy import bundle as bundles
+    from common.policy.bundle import content_hash
     from common.policy.pretrained import policy_file
-    from services.assets.objects.named import objects_of
     from services.cli.console import at_least, tracked
-    from services.evaluate.evaluator import Evaluator
-    from services.evaluate.failures import failure_sheets
-    from services.evaluate.protocol import objects_label, two_seconds
-    from services.evaluate.report import Commands, Picture, count_causes, curves_of, template, write_report
-    from services.evaluate.scores import TABLES, known_rows
-    from services.viz.sheets import png_of
+    from services.evaluate.reporting import report_on
+    from services.evaluate.scores import write_json
 
     at_least(1, episodes=episodes, pool=pool)
     if out.is_dir():
         raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
-    template()  # fails before the evaluation if a package is missing
     run_dir = source if source is not None and source.is_dir() else None
     file = _policy_of_run(run_dir) if run_dir else policy_file(source, hand)
-    policy, engine = bundles.load(file), resolve_physics(physics)
-    names = known_rows(TABLES, policy.task)
     with tracked() as track:
-        curves = list(curves_of(run_dir)) if run_dir else []
-        given = (
-            objects_of(objects, track=track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
+        made = report_on(
+            file,
+            out,
+            subject=f"--policy {file}" if source else f"--hand {hand}",
+            episodes=episodes,
+            pool=pool,
+            physics=physics,
+            seed=seed,
+            objects=objects,
+            run_dir=run_dir,
+            check=None if check is None else _checked(check),
+            track=track,
         )
-        track("Making constraints", None)
-        held, threads = two_seconds(policy.task), cores()
-        evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)
-        names, left_out = evaluator.allowed(names)
-        rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
-        advance = track("Pictures", len(names))
-        sheets = []
-        for name, sheet, causes in failure_sheets(evaluator, policy, names, _PICTURED, _PICTURED):
-            sheets.append(Picture(name, png_of(sheet), count_causes(causes)))
-            advance(len(sheets))
-    subject = f"--policy {file}" if source else f"--hand {hand}"
-    subject += f" --objects {objects}" if objects else f" --pool {pool}"
-    flags = f"{subject} --episodes {episodes} --physics {engine} --seed {seed}"
-    command = f"congrasp evaluate --table single composed {flags}"
-    commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
-    which = f"{len(given)} objects ({objects_label(policy, objects)})"
-    how = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
-    write_report(out, policy, file.name, rows, how, sheets, curves, commands)
-    for error in left_out:
+    if json is not None:
+        about = {"policy": str(file), "content": content_hash(file.read_bytes()), "episodes": episodes, "pool": pool}
+        write_json(made.rows, json, {**about, "seed": seed})
+    for error in made.left_out:
         print(f"Left out: {error}")
     print(f"The report is in {out}: open it in a browser.")
     return 0
+
+
+def _checked(file: pathlib.Path) -> "HandCheck":
+    """The self-check that a file and the picture beside it show."""
+    from services.assets.hands.check import read_findings
+    from services.evaluate.report import HandCheck
+
+    picture = file.with_suffix(".png")
+    if not picture.is_file():
+        raise CongraspError(f"There is no picture {picture}.", "Make it with 'congrasp hands check --png'.")
+    return HandCheck(read_findings(file), picture.read_bytes())
 
 
 def _policy_of_run(run_dir: pathlib.Path) -> pathlib.Path:

@@ -36,12 +36,12 @@ def train(
 ) -> int:
     """Trains a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
 
-    Starts from a preset (`--preset quickstart`, `human`, `allegro` or `sharpa`); every field of the run can be set on
-    the command line.
+    Starts from a preset; every field of the run can be set on the command line. `--preset full --hand HAND` is the full
+    task for any hand, by the recipe for all of them; human, allegro and sharpa are presets that mean the same.
 
     Args:
       config: The run.
-      preset: Named configuration to start from.
+      preset: Named configuration to start from: quickstart, full, human, allegro or sharpa.
       method: What of it is trained: ours, or a baseline or ablation of the paper (graspxl, dgrasp, no-dynamic-center,
         no-feedforward, two-phase, single-stage), whose settings then hold. By default the preset's, ours.
       hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by default the
@@ -101,7 +101,7 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
     run_dir = _value("--run-dir", arguments)
     if {"--resume", "--or-resume"} & set(arguments) and run_dir and (pathlib.Path(run_dir) / CONFIG_FILE).exists():
         return {"preset": preset, "config": open_run(pathlib.Path(run_dir))}
-    return {"preset": preset, "config": get_preset(preset)}
+    return {"preset": preset, "config": get_preset(preset, _value("--hand", arguments) or None)}
 
 
 def _value(option: str, arguments: list[str]) -> str:

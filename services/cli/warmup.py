@@ -34,12 +34,12 @@ def warmup(
     from common.stages import imported
     from services.ops.shutdown import on_signal
     from services.train.command import first_update
-    from services.train.presets import get_preset, with_hand
+    from services.train.presets import get_preset
     from services.train.warmup import until_first_update
 
     imported()
     console = Console(highlight=False)
-    config = with_hand(get_preset(preset), hand)
+    config = get_preset(preset, hand)
     config = dataclasses.replace(
         config,
         environments=environments or config.environments,

@@ -45,6 +45,16 @@ class Commands:
     curves: str = ""
 
 
+@dataclasses.dataclass(frozen=True)
+class HandCheck:
+    """What a report says of the self-check of its policy's hand."""
+
+    findings: Sequence[tuple[str, str, str, str]]
+    """Check, verdict, what was measured, and the remedy of each line."""
+    sheet: bytes
+    """PNG of the grips and joints."""
+
+
 def write_report(
     out: pathlib.Path,
     policy: PolicyBundle,
@@ -54,6 +64,7 @@ def write_report(
     sheets: Sequence[Picture],
     curves: Sequence[Picture],
     commands: Commands,
+    check: HandCheck | None = None,
 ) -> None:
     """Writes the report, whole or not at all.
 
@@ -66,6 +77,7 @@ def write_report(
       sheets: episodes of each row.
       curves: of the training, where it was recorded.
       commands: that make its parts again.
+      check: the self-check of the hand, where it was made.
 
     Raises:
       CongraspError: jinja2 is absent, or the file cannot be written.
@@ -81,6 +93,7 @@ def write_report(
         pictures_command=commands.pictures,
         curves=[embedded(curve) for curve in curves],
         curves_command=commands.curves,
+        check=check and {**vars(check), "sheet": embedded(Picture("self-check", check.sheet))},
         facts=_facts(policy, name),
         limits=_LIMITS,
     )

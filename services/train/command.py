@@ -35,7 +35,7 @@ from services.ops.shutdown import on_signal
 from services.serve.client import PolicyClient
 from services.serve.load import example_episode, one_answer, serving, wait_until_ready
 from services.train.learn import learn
-from services.train.presets import PRESETS, easier
+from services.train.presets import FULL, easier
 from services.train.processes import engine_of, leave_gpus_to, train
 from services.viz.render import episode_sheet
 from services.viz.sheets import save_png
@@ -193,9 +193,8 @@ def _announce(config: RunConfig, run_dir: pathlib.Path, plan: _Plan) -> bool:
     )
     simplifications = easier(config)
     if simplifications:
-        preset = f"--preset {config.task.hand if config.task.hand in PRESETS else 'human'}"
         console.print(
-            f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is {preset}, for a GPU.",
+            f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is --preset {FULL}, for a GPU.",
             soft_wrap=True,
         )
     return bool(simplifications)

@@ -45,6 +45,15 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
     return np.asarray(sheet)
 
 
+def stacked(sheets: Sequence[np.ndarray]) -> np.ndarray:
+    """Sheets (H, W, 3) under one another, as wide as the widest."""
+    width = max(sheet.shape[1] for sheet in sheets)
+    wide = [np.full((len(sheet), width, 3), _PAPER, np.uint8) for sheet in sheets]
+    for whole, sheet in zip(wide, sheets, strict=True):
+        whole[:, : sheet.shape[1]] = sheet
+    return np.concatenate(wide)
+
+
 def _font(text: str, size: int, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """The largest font up to a size in which a text fits a width in pixels."""
     font = ImageFont.load_default(size)

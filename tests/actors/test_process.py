@@ -13,7 +13,7 @@ from actors import process
 from actors.env import episode_fields
 from actors.rollout import Rollout, Trace
 from actors.training_set import TrainingSet
-from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
+from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig, to_json
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
@@ -38,6 +38,7 @@ CONFIG = RunConfig(
     environments=B,
     rollout_steps=T,
     episode_every=1,
+    task=TaskConfig(approach_steps=3, hold_steps=2, hold_steps_max=2),
     objects=ObjectsConfig(count=1),
     network=NetworkConfig(hidden=(8,), encoder=2),
     ppo=PPOConfig(rollouts_per_update=1),

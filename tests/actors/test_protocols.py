@@ -26,7 +26,6 @@ from common.hands import get_hand
 from common.objects import procedural
 from common.objects.distance import distance_field
 from common.task import plausibility
-from common.task.plausibility import Sample
 from common.task.types import Surface
 from services.train.command import untrained
 from tests import scripted
@@ -237,16 +236,14 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     measured.physics.close()
 
 
-def path(**moves: tuple[float, float]) -> Sample:
-    """Samples of one grasp whose object moves (m) and turns (degrees) against the wrist at some of the steps."""
+def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """The way of one grasp whose object moves (m) and turns (degrees) against the wrist at some of the steps."""
     steps = protocols.stress_steps(TASK) + 1
     position, angle = np.zeros((steps, 1, 3)), np.zeros(steps)
     for step, (metres, degrees) in moves.items():
         position[int(step[1:]) :, 0, 1] += metres
         angle[int(step[1:]) :] += degrees
-    turns = Rotation.from_euler("z", angle[:, None], degrees=True).as_quat(scalar_first=True)[:, None]
-    empty = dict.fromkeys(Sample._fields, np.zeros((steps, 1)))
-    return Sample(**{**empty, "object_position": position, "object_quaternion": turns})
+    return position, Rotation.from_euler("z", angle[:, None], degrees=True).as_quat(scalar_first=True)[:, None]
 
 
 @pytest.mark.parametrize(
@@ -261,9 +258,9 @@ def path(**moves: tuple[float, float]) -> Sample:
     ],
 )
 def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
-    found = protocols.survival(path(**moves), np.array([True]), TASK)
+    found = protocols.survival(*path(**moves), np.array([True]), TASK)
     assert tuple(found[name][0] for name in protocols.SURVIVAL) == survived
-    lost = protocols.survival(path(**moves), np.array([False]), TASK)
+    lost = protocols.survival(*path(**moves), np.array([False]), TASK)
     assert not any(lost[name][0] for name in protocols.SURVIVAL)
 
 

@@ -6,12 +6,12 @@ import pytest
 
 from common.config import CurriculumConfig, RewardWeights, RunConfig, run_config_from_json, to_json
 from common.errors import CongraspError
-from services.train.presets import PRESETS
+from services.train.presets import PRESETS, get_preset
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_configurations_survive_the_wire(name):
-    assert run_config_from_json(to_json(PRESETS[name])) == PRESETS[name]
+    assert run_config_from_json(to_json(get_preset(name))) == get_preset(name)
 
 
 def test_unknown_keys_are_named():

@@ -1,14 +1,23 @@
 """Policies that come with the package."""
 
+import dataclasses
 import pathlib
 import tomllib
 
 import pytest
 
 from common.errors import CongraspError
+from common.hands import get_hand
+from common.hands.files import hand_text
 from common.policy import bundle as bundles
 from common.policy import pretrained as module
-from common.policy.pretrained import policy_file, pretrained_file, pretrained_hands
+from common.policy.pretrained import (
+    hands_with_policy,
+    own_policy_file,
+    policy_file,
+    pretrained_file,
+    pretrained_hands,
+)
 
 ROOT = pathlib.Path(module.__file__).resolve().parents[2]
 
@@ -24,6 +33,24 @@ def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monke
     (tmp_path / "human.safetensors").touch()
     assert policy_file(None) == pretrained_file("human") == tmp_path / "human.safetensors"
     assert pretrained_file("allegro") is None
+
+
+def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("CONGRASP_HANDS", str(tmp_path))
+    get_hand.cache_clear()
+    mine = dataclasses.replace(get_hand("human"), name="mine")
+    (tmp_path / "mine.json").write_text(hand_text(mine))
+    assert pretrained_file("mine") is None and hands_with_policy() == pretrained_hands()
+    with pytest.raises(CongraspError, match=r"for the hand 'mine'.*congrasp hands train"):
+        policy_file(None, "mine")
+    own_policy_file("mine").touch()
+    assert policy_file(None, "mine") == tmp_path / "mine.safetensors" == pretrained_file(get_hand("mine").reference)
+    assert hands_with_policy() == [*pretrained_hands(), "mine"]
+    # Another hand of the same name as one of the package does not get the package's policy.
+    (tmp_path / "human.json").write_text(hand_text(get_hand("human")))
+    assert pretrained_file(str(tmp_path / "human.json")) is None
+    assert pretrained_file("human").parent == module._FOLDER
+    get_hand.cache_clear()
 
 
 def test_what_is_shipped_is_installed_and_can_be_loaded():

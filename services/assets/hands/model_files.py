@@ -16,6 +16,7 @@ import trimesh
 from common.errors import CongraspError
 from common.hands.files import faults, hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
+from common.hands.measures import fitting_scale
 from common.hands.spec import Capsule, Hand, Joint, Link, chain_of, vector, wrist_gains
 from services.assets.hands.compile import compiled_model
 from services.assets.hands.poses import opening, propose_poses, thumb_of
@@ -24,7 +25,6 @@ TORQUE = 1.0
 """N.m, of a joint for which the file names no limit."""
 _REACH = 0.3  # rad of error at which a joint gives all its torque, where the file has no gain
 _FLAT = 1.6  # broader than this, a link gets several capsules side by side
-_HUMAN_OPENING = 0.115  # m between thumb and fingers of a hand that grasps objects of their own size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +81,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
         wrist=wrist_gains(sum(link.mass for link in links)),
     )
     hand = propose_poses(hand)
-    scale = choices.object_scale or round(float(np.clip(opening(hand) / _HUMAN_OPENING, 0.3, 3.0)), 1)
+    scale = choices.object_scale or fitting_scale(opening(hand))
     hand = dataclasses.replace(hand, object_scale=scale)
     for fault in faults(hand):
         raise CongraspError(f"{path}: {fault}.", "Correct the file, or write a hand file by hand (docs/add-a-hand.md).")

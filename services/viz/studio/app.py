@@ -10,7 +10,7 @@ from common.errors import CongraspError
 from common.objects import procedural
 from common.objects.pool import HELD_OUT_SEED
 from common.objects.spec import GraspObject
-from common.policy.pretrained import policy_file, pretrained_hands
+from common.policy.pretrained import hands_with_policy, policy_file
 from common.transport import urls
 from common.transport.base import Transport
 from common.transport.security import check_exposure
@@ -87,10 +87,10 @@ def _of_run(
 
 
 def _pretrained() -> dict[str, Callable[[], PolicyGrasping]]:
-    """The pretrained policies, by the names of their hands."""
+    """The pretrained policies and the user's own, by the names of their hands."""
     return {
         name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
-        for name in pretrained_hands()
+        for name in hands_with_policy()
     }
 
 

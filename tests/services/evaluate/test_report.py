@@ -4,12 +4,18 @@ import base64
 import dataclasses
 import html
 import io
+import json
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from common.errors import CongraspError
+from common.policy import bundle as bundles
+from services.assets.hands.check import Finding, write_findings
+from services.cli import main
 from services.evaluate.report import Commands, Picture, count_causes, curves_of, write_report
+from services.evaluate.reporting import Reported
 from services.record.channels import JsonChannels
 from services.record.writer import LogWriter
 from services.train.command import untrained
@@ -53,6 +59,34 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
         kind, content = source.split(",")
         assert kind == "data:image/png;base64"
         assert Image.open(io.BytesIO(base64.b64decode(content))).size == (8, 6)
+
+
+def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkeypatch):
+    save_png(tmp_path / "check.png", np.full((6, 8, 3), 200, np.uint8))
+    write_findings(
+        tmp_path / "check.json", [Finding("palm", "passed", "fine"), Finding("ball", "failed", "falls", "close <it>")]
+    )
+    bundles.save(policy, tmp_path / "policy.safetensors")
+    rows, out = [row("heading", 0.99, 0.975, 0.995)], tmp_path / "report.html"
+
+    def report_on(file, out, *, check, track, subject, **options):
+        assert subject == f"--policy {file}" and options["episodes"] == 8 and options["run_dir"] == tmp_path
+        write_report(out, policy, file.name, rows, "8 episodes", [], [], Commands("c", ""), check)
+        return Reported(rows, [CongraspError("Row x.", "Y.")])
+
+    monkeypatch.setattr("services.evaluate.reporting.report_on", report_on)
+    command = ["report", str(tmp_path), "--out", str(out), "--episodes", "8", "--json", str(tmp_path / "rows.json")]
+    assert main.run([*command, "--check", str(tmp_path / "check.json")]) == 0
+    found = Reader(text := out.read_text())
+    cells = {content: kind for kind, content in found.cells}
+    assert cells["passed"] == "better" and cells["failed"] == "worse" and "close &lt;it&gt;" in text
+    assert len(found.sources) == 1
+    written = json.loads((tmp_path / "rows.json").read_text())
+    assert written["content"] == bundles.content_hash((tmp_path / "policy.safetensors").read_bytes())
+    assert [one["constraint"] for one in written["rows"]] == ["heading"] and written["episodes"] == 8
+    (tmp_path / "check.json").write_text('{"findings": [{"name": 3}]}')
+    with pytest.raises(CongraspError, match=r"check\.json holds no self-check"):
+        main.run([*command, "--check", str(tmp_path / "check.json")])
 
 
 def test_a_runs_curves_are_pictures(tmp_path):

@@ -1,5 +1,6 @@
 """Trainings of a reproduction; scripts stand in for them."""
 
+import dataclasses
 import subprocess
 import sys
 import time
@@ -9,6 +10,8 @@ import pytest
 from services.cli import main
 from services.reproduce import training
 from services.reproduce.plan import Policy
+from services.train import unattended
+from services.train.presets import get_preset
 from services.train.processes import Child
 
 OURS, GRAPSXL, PHASES = (Policy("human", method) for method in ("ours", "graspxl", "two-phase"))
@@ -30,8 +33,8 @@ def scripts(monkeypatch):
                 command = [sys.executable, "-c", chosen[self.name], run_dir]
                 self.process = subprocess.Popen(command, stdout=log, stderr=log)
 
-    monkeypatch.setattr(training, "Child", Script)
-    monkeypatch.setattr(training, "_POLL", 0.05)
+    monkeypatch.setattr(unattended, "Child", Script)
+    monkeypatch.setattr(unattended, "_POLL", 0.05)
     yield chosen, started
     assert all(child.process.poll() is not None for child in started)
 
@@ -64,14 +67,16 @@ def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scr
     assert training.train_all(tmp_path, [OURS, GRAPSXL], options=["--updates", "9"], patience=20.0) == {}
     ours, graspxl = (child.arguments for child in started)
     assert "--resume" in ours and ours[-2:] == ["--updates", "9"] and "--preset" not in ours
+    run = str(tmp_path / GRAPSXL.name)
+    assert graspxl[graspxl.index("--run-dir") + 1] == run and graspxl[graspxl.index("--evaluation") + 1] == "0"
     assert "--resume" not in graspxl and not (tmp_path / GRAPSXL.name / "config.json").exists()
 
 
 @pytest.mark.parametrize("policy", [OURS, GRAPSXL, Policy("allegro", "ours")], ids=lambda policy: policy.name)
-def test_its_command_lines_are_those_of_train(policy, tmp_path):
-    name, *arguments = training.command(tmp_path, policy, ["--environments", "32768"])
-    train = main._parsed(name, main.load(name), arguments)
+def test_its_command_lines_are_those_of_train(policy):
+    arguments = [*training.chosen(policy), "--environments", "4096"]
+    train = main._parsed("train", main.load("train"), arguments)
     config = train.keywords["config"]
-    assert (config.task.hand, config.environments) == (policy.hand, 32768)
+    assert (config.task.hand, config.environments) == (policy.hand, 4096)
     assert train.keywords["method"] == (None if policy.method == "ours" else policy.method)
-    assert train.keywords["run_dir"] == tmp_path and train.keywords["evaluation"] == 0
+    assert dataclasses.replace(config, environments=32_768) == get_preset("full", policy.hand)

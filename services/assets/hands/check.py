@@ -1,0 +1,338 @@
+"""The self-check of a hand: whether it can grasp at all, decided by geometry and physics before a GPU trains it.
+
+Every check is a line: what was measured, and where it is in doubt or failed, which field or option mends it. What is
+measured of palm, joints, opening and strength follows from the hand's data; servos, overlaps and grips are simulated
+(`servos`, `grips`) in the physics of the full task.
+"""
+
+import functools
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from actors import protocols
+from common.config import TaskConfig
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.hands import kinematics
+from common.hands.kinematics import grasp_frame
+from common.hands.measures import tip_forces
+from common.hands.mjcf import overlapping
+from common.hands.spec import Hand, chain_of
+from common.inputs import read_json
+from common.objects import procedural
+from common.objects.pool import HELD_OUT_SEED
+from common.objects.spec import GraspObject
+from common.task import plausibility
+from services.assets.hands.grips import Grip, grips
+from services.assets.hands.servos import Response, closed_overlap, responses
+
+Verdict = Literal["passed", "doubt", "failed"]
+_APART = 0.03, 0.06  # m from a finger's first joint to the palm: more is in doubt, and too much
+_REACH = 2.5, 4.0  # fingers' lengths from the wrist to the hand centre, likewise
+_STAYS = 0.01  # m: a joint whose closing moves its fingertip less is not one that closes
+_ALONG = -0.1, -0.3  # cosine between a closing fingertip's way and its opponent: less is in doubt, and the wrong way
+_GAP = 0.3, 0.5  # shares of the opening to which the fingertips close
+_FITTING = 0.9, 0.6  # shares of the objects that the opening spans
+_CARRIED = 2.0, 1.0  # the weights of a median object that friction carries
+_OVERSHOOT = 0.25, 0.6  # shares of a step
+_UNREST = 0.05, 0.5  # rad/s
+_ERROR = 0.1, 0.6  # shares of a step, 0.6 s after it
+_OVERLAP = 0.004, 0.012  # m
+_POOL = 48
+_LARGEST = 1 << 20  # bytes of a file of findings
+_NEAR = 0.25  # share of the way from the open to the closed pose in which joints are looked at
+
+
+class Finding(NamedTuple):
+    """What one check found."""
+
+    check: str
+    verdict: Verdict
+    measured: str
+    remedy: str = ""
+    """What mends it; empty where it passed."""
+
+    def __str__(self) -> str:
+        """One line."""
+        remedy = f" -> {self.remedy}" if self.remedy else ""
+        return f"{self.verdict:7s} {self.check:9s} {self.measured}{remedy}"
+
+
+class Checked(NamedTuple):
+    """A hand's self-check."""
+
+    findings: list[Finding]
+    grips: list[Grip]
+
+    @property
+    def failed(self) -> bool:
+        """Whether any check failed."""
+        return any(finding.verdict == "failed" for finding in self.findings)
+
+
+def check_hand(hand: Hand, task: TaskConfig, threads: int) -> Checked:
+    """Checks a hand.
+
+    Args:
+      hand: the hand.
+      task: the full task for it (`services.train.recipe`), whose physics holds.
+      threads: of the physics.
+    """
+    found = [_palm(hand), *_joints(hand), _opening(hand), _strength(hand)]
+    found += [*_servos(hand, responses(hand, task, threads)), _open_overlap(hand)]
+    found.append(_closed_overlap(closed_overlap(hand, task, threads)))
+    held = grips(hand, task, threads)
+    sound = all(finding.verdict != "failed" for finding in found)
+    return Checked(found + [_grip(grip, sound) for grip in held], held)
+
+
+def write_findings(path: pathlib.Path, findings: Sequence[Finding]) -> None:
+    """Writes what was found as JSON, which `read_findings` reads."""
+    write_atomically(path, json.dumps({"findings": [finding._asdict() for finding in findings]}, indent=1).encode())
+
+
+def read_findings(path: pathlib.Path) -> list[Finding]:
+    """What a file of `write_findings` says; a CongraspError if it cannot be read."""
+    try:
+        return [Finding(**fields) for fields in read_json(path, _LARGEST)["findings"]]
+    except (OSError, LookupError, TypeError) as error:
+        raise CongraspError(
+            f"{path} holds no self-check: {error}.", "Make it with 'congrasp hands check --json'."
+        ) from None
+
+
+def _verdict(value: float, doubt: float, fail: float) -> Verdict:
+    """By two limits, of which `fail` is the worse."""
+    worse = (lambda limit: value > limit) if fail > doubt else (lambda limit: value < limit)
+    return "failed" if worse(fail) else "doubt" if worse(doubt) else "passed"
+
+
+def _worst(*verdicts: Verdict) -> Verdict:
+    """The worst of some verdicts."""
+    order: tuple[Verdict, ...] = ("failed", "doubt", "passed")
+    return min(verdicts, key=order.index)
+
+
+def _finding(check: str, verdict: Verdict, measured: str, remedy: str) -> Finding:
+    """A finding, with its remedy where it needs one."""
+    return Finding(check, verdict, measured, "" if verdict == "passed" else remedy)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _tips(hand: Hand, q: jax.Array) -> jax.Array:
+    """(N, G, 3) fingertips, thumb first, of finger angles (N, F), wrist frame, m."""
+    return kinematics.keypoints(hand, kinematics.link_transforms(hand, q))[:, len(hand.links) :]
+
+
+@functools.cache
+def _objects() -> list[GraspObject]:
+    """Objects such as the hand will be given, at the human hand's size."""
+    seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + _POOL)
+    return list(map(procedural.generate, seeds, procedural.family_turns(_POOL, HELD_OUT_SEED)))
+
+
+def _palm(hand: Hand) -> Finding:
+    """Whether the fingers are on the palm, and the wrist is near them."""
+    capsules = hand.links[0].capsules
+    points = np.concatenate([np.linspace(one.start, one.end, 20) for one in capsules])
+    radii = np.repeat([one.radius for one in capsules], 20)
+    links = {link.name: link for link in hand.links}
+    apart, lengths = [], []
+    for i, tip in zip(hand.tip_links, hand.keypoints[len(hand.links) :], strict=True):
+        root = np.array(links[chain_of(hand, hand.links[i].name)[0]].joints[0].anchor)
+        apart.append(float((np.linalg.norm(points - root, axis=-1) - radii).min()))
+        lengths.append(float(np.linalg.norm(tip - root)))
+    reach = float(np.linalg.norm(grasp_frame(hand).center) / np.mean(lengths))
+    farthest = int(np.argmax(apart))
+    return _finding(
+        "palm",
+        _worst(_verdict(apart[farthest], *_APART), _verdict(reach, *_REACH)),
+        f"fingers begin within {100 * max(apart[farthest], 0.0):.1f} cm of it ({hand.fingers[farthest]}), the hand "
+        f"centre is {reach:.1f} fingers' lengths from the wrist",
+        f"import with --palm and the body that carries '{hand.finger_roots[farthest]}', or mend the capsules of "
+        f"'{hand.links[0].name}'",
+    )
+
+
+def _joints(hand: Hand) -> list[Finding]:
+    """Whether closing brings the fingertips to one another, as a whole and joint by joint."""
+    way = hand.q_closed - hand.q_open
+    shares = np.linspace(0, 1, 21)
+    tips = np.asarray(_tips(hand, jnp.asarray(hand.q_open + shares[:, None] * way, jnp.float32)))
+    gaps = np.linalg.norm(tips[:, 1:].mean(1) - tips[:, 0], axis=-1)
+    found = [
+        _finding(
+            "closing",
+            _verdict(float(gaps.min() / gaps[0]), *_GAP),
+            f"thumb and fingers come from {100 * gaps[0]:.1f} to {100 * gaps.min():.1f} cm",
+            "close further: raise the angles of closed_pose, and turn the thumb against the fingers in open_pose",
+        )
+    ]
+    carrier = [i for i, link in enumerate(hand.links) for _ in link.joints]
+    moved = 0
+    for j, joint in enumerate(hand.joints):
+        finger = int(hand.link_fingers[carrier[j]])
+        cosine, path = _approach(hand, j, finger) if finger >= 0 else (0.0, 0.0)
+        if path < _STAYS:
+            continue
+        moved += 1
+        if (verdict := _verdict(cosine, *_ALONG)) != "passed":
+            limit = hand.lower[j] if way[j] > 0 else hand.upper[j]
+            found.append(
+                Finding(
+                    "joint",
+                    verdict,
+                    f"closing '{joint.name}' moves the tip of '{hand.fingers[finger]}' {100 * path:.1f} cm, at a "
+                    f"cosine of {cosine:.2f} to its opponent",
+                    f"turn its axis, or close it towards {limit:.2f} in closed_pose; leave it out if it spreads",
+                )
+            )
+    if not moved:
+        found.append(Finding("joints", "failed", "no joint closes", "give closed_pose the angles of a fist"))
+    elif len(found) == 1:
+        found.append(Finding("joints", "passed", f"each of the {moved} that close brings its fingertip nearer"))
+    return found
+
+
+def _approach(hand: Hand, joint: int, finger: int) -> tuple[float, float]:
+    """The cosine between the way of a fingertip as one joint closes and the way to its opponent (the thumb's is the
+    middle of the others), at the beginning of closing; and how long (m) its way is in all."""
+    way, small = float(hand.q_closed[joint] - hand.q_open[joint]), 0.01
+    cosines, levers = [], []
+    for share in (0.0, _NEAR):
+        q = np.tile(hand.q_open + share * (hand.q_closed - hand.q_open), (2, 1))
+        q[:, joint] += np.sign(way) * np.array([-small, small])
+        tips = np.asarray(_tips(hand, jnp.asarray(q, jnp.float32)))
+        middle = tips.mean(0)
+        opponent = middle[1:].mean(0) if finger == 0 else middle[0]
+        towards, step = opponent - middle[finger], tips[1, finger] - tips[0, finger]
+        length = float(np.linalg.norm(step))
+        levers.append(length / (2 * small))
+        cosines.append(float(step @ towards) / max(length * float(np.linalg.norm(towards)), 1e-12))
+    return float(np.mean(cosines)), abs(way) * float(np.mean(levers))
+
+
+def _opening(hand: Hand) -> Finding:
+    """Whether the open hand spans the objects that it will be given."""
+    radii = hand.keypoint_radii[len(hand.links) :]
+    clear = grasp_frame(hand).opening - float(radii[0] + radii[1:].mean())
+    widths = hand.object_scale * np.array([np.ptp(obj.points, axis=0).min() for obj in _objects()])
+    share = float((widths < clear).mean())
+    scale = float(np.quantile(widths, _FITTING[0])) / hand.object_scale
+    return _finding(
+        "opening",
+        _verdict(share, *_FITTING),
+        f"{100 * clear:.1f} cm clear; {100 * share:.0f} % of the objects (x {hand.object_scale:g}) have a narrower "
+        f"side, {100 * np.median(widths):.1f} cm in the middle",
+        f"object_scale {max(clear / scale, 0.1):.1f} (import with --object-scale), or open the open_pose",
+    )
+
+
+def _strength(hand: Hand) -> Finding:
+    """Whether the fingertips press hard enough to carry a median object between them by friction."""
+    forces = tip_forces(hand)
+    mass = hand.object_scale**3 * float(np.median([obj.mass for obj in _objects()]))
+    weight, carried = protocols.GRAVITY * mass, 2 * float(min(forces[0], forces[1:].sum()))
+    return _finding(
+        "strength",
+        _verdict(carried / weight, *_CARRIED),
+        f"fingertips press with {forces.min():.1f} to {forces.max():.1f} N, so that they carry {carried:.1f} N by "
+        f"friction; a median object weighs {weight:.1f} N",
+        "check torque_limit (N.m) of the joints, or take a smaller object_scale",
+    )
+
+
+def _servos(hand: Hand, found: list[Response]) -> list[Finding]:
+    """Whether joints go where they are told, and rest there."""
+    bad = []
+    for joint, one in zip(hand.joints, found, strict=True):
+        shakes = _worst(_verdict(one.overshoot, *_OVERSHOOT), _verdict(one.unrest, *_UNREST))
+        misses = _verdict(one.error, *_ERROR)
+        verdict: Verdict = "failed" if one.diverged else _worst(shakes, misses)
+        if verdict != "passed":
+            remedy = f"raise kv ({joint.kv:g}) or armature ({joint.armature:g}), or lower kp ({joint.kp:g})"
+            if shakes == "passed" and not one.diverged:
+                remedy = f"raise kp ({joint.kp:g}), or lower kv ({joint.kv:g}) and damping ({joint.damping:g})"
+            text = "breaks the simulation" if one.diverged else _response(one)
+            bad.append(Finding("servo", verdict, f"'{joint.name}' {text}", remedy))
+    overshoot, error = max(one.overshoot for one in found), max(one.error for one in found)
+    return bad or [
+        Finding(
+            "servos",
+            "passed",
+            f"{len(found)} joints follow a step, overshoot {100 * overshoot:.0f} %, {100 * error:.0f} % off in the end",
+        )
+    ]
+
+
+def _response(one: Response) -> str:
+    """A response in words."""
+    return (
+        f"overshoots a step by {100 * one.overshoot:.0f} %, shakes at {one.unrest:.2f} rad/s half a second later, and "
+        f"is {100 * one.error:.0f} % off then"
+    )
+
+
+def _open_overlap(hand: Hand) -> Finding:
+    """Whether different fingers are in one another while the hand is open; housings of one finger nest at knuckles."""
+    names = [link.name for link in hand.links]
+    transforms = kinematics.link_transforms(hand, jnp.asarray(hand.q_open))
+    ends = np.asarray(kinematics.capsules(hand, transforms))
+    deepest, pair = 0.0, ""
+    for pair_of in overlapping(hand):
+        if any(one in ("", names[0], *chain_of(hand, other)) for one, other in (pair_of, pair_of[::-1])):
+            continue
+        a, b = (np.flatnonzero(hand.capsule_links == names.index(name)) for name in pair_of)
+        first, second = (grid.ravel() for grid in np.meshgrid(a, b))
+        apart = np.asarray(
+            plausibility.segment_distance(*(jnp.asarray(ends[i, side]) for i in (first, second) for side in (0, 1)))
+        )
+        depth = float((hand.capsule_radii[first] + hand.capsule_radii[second] - apart).max())
+        if depth > deepest:
+            deepest, pair = depth, f" ({pair_of[0]} and {pair_of[1]}, which do not collide then)"
+    return _finding(
+        "open",
+        _verdict(deepest, *_OVERLAP),
+        f"fingers overlap by {1e3 * deepest:.1f} mm at most{pair}",
+        "open the open_pose, or make the capsules of the two smaller",
+    )
+
+
+def _closed_overlap(depth: float) -> Finding:
+    """Whether links go through one another as the empty hand closes."""
+    return _finding(
+        "closed",
+        _verdict(depth, *_OVERLAP),
+        f"the closing hand's links press {1e3 * depth:.1f} mm into one another",
+        "end the closed_pose earlier, or make torque_limit or capsules of what meets there smaller",
+    )
+
+
+def _grip(grip: Grip, sound: bool) -> Finding:
+    """Whether an object is held, lifted, and survives six pushes."""
+    lifted, half, newton = (grip.survived[name] for name in protocols.SURVIVAL)
+    verdict: Verdict = "passed" if half else "doubt" if grip.held else "failed"
+    fate = (
+        "falls"
+        if not grip.held
+        else "is held, but lost when lifted"
+        if not lifted
+        else "is lifted, but lost in six pushes of half its weight"
+        if not half
+        else f"survives lift and six pushes of half its weight{', and six of 1 N' if newton else ''}"
+    )
+    size = f"{100 * grip.width:.1f} cm wide, {1e3 * grip.obj.mass:.0f} g"
+    return _finding(
+        grip.obj.name,
+        verdict,
+        f"{size}: {fate}; {int(grip.touching.sum())} links touch it",
+        "close further (closed_pose), turn the thumb against the fingers (open_pose), or take a smaller object_scale"
+        if sound
+        else "mend what failed above first",
+    )

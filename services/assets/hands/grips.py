@@ -1,0 +1,218 @@
+"""Scripted grips: a hand closes around a ball, a cylinder and a box without a policy, lifts them, and they are pushed.
+
+The hand comes from above: its heading axis points down, and the object lies in the grasp frame, the cylinder's and the
+box's length across the plane in which the fingers close. Each object is tried at several places along the heading axis
+and with several forces, side by side. It is held in place until the fingers have closed; then it is let go, without a
+table. The lift and the pushes are those of `actors.protocols`.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from actors import protocols
+from actors.physics.engine import PhysicsState, ResetState
+from actors.physics.native import NativePhysics
+from common import rotations
+from common.config import TaskConfig
+from common.hands.kinematics import grasp_frame
+from common.hands.spec import Hand
+from common.objects import shapes
+from common.objects.families import draft
+from common.objects.spec import GraspObject, Piece
+from common.objects.surface import mass_properties, sample_union
+
+OBJECTS = ("ball", "cylinder", "box")
+SIZES = (0.4, 0.3)
+"""Widths of the objects as shares of the hand's opening; cylinder and box are twice as long as they are wide."""
+DENSITY = 650.0
+"""kg/m^3, the middle of procedural objects."""
+_PLACES = (0.0, 0.5, 1.0)
+"""Half widths of the object from the hand centre towards the palm."""
+_FIRMNESS = (0.3, 0.8)
+"""Shares of the torque limits with which fingers press."""
+_SPEED = 0.06
+"""rad per control step by which fingers close at most."""
+_CLOSE, _HOLD = 100, 50
+"""Control steps."""
+
+
+class Grip(NamedTuple):
+    """What became of the best attempt at an object."""
+
+    obj: GraspObject
+    width: float
+    """m."""
+    held: bool
+    """Half a second after it was let go."""
+    survived: dict[str, bool]
+    """By the names of `actors.protocols.SURVIVAL`."""
+    touching: np.ndarray
+    """(L,) bool, links in contact half a second after it was let go."""
+    q: np.ndarray
+    """(F,) finger angles then, rad."""
+    object_position: np.ndarray
+    """(3,) m, wrist frame, then."""
+    object_quaternion: np.ndarray
+    """(4,) object frame to wrist frame."""
+
+    @property
+    def rank(self) -> tuple[int, ...]:
+        """How good it is."""
+        return (self.held, *map(int, self.survived.values()), int(self.touching.sum()))
+
+
+def grip_objects(width: float) -> list[GraspObject]:
+    """A ball, a cylinder and a box of a width in metres; their length lies along y."""
+    half = width / 2
+    pieces = (
+        draft.ellipsoid((half, half, half)),
+        draft.cylinder((0, -width, 0), (0, width, 0), half),
+        draft.box((half, width, half)),
+    )
+    return [_object(name, piece) for name, piece in zip(OBJECTS, pieces, strict=True)]
+
+
+def grips(hand: Hand, task: TaskConfig, threads: int) -> list[Grip]:
+    """The best attempt at each of `OBJECTS`, of the larger ones, or of the smaller ones where those are not held.
+
+    Args:
+      hand: the hand.
+      task: its physics: time step, contacts, collisions.
+      threads: of the physics.
+    """
+    found: dict[str, Grip] = {}
+    for share in SIZES:
+        for grip in _attempts(hand, task, share * grasp_frame(hand).opening, threads):
+            if grip.obj.name not in found or grip.rank > found[grip.obj.name].rank:
+                found[grip.obj.name] = grip
+        if all(all(grip.survived.values()) for grip in found.values()):
+            break
+    return [found[name] for name in OBJECTS]
+
+
+def _attempts(hand: Hand, task: TaskConfig, width: float, threads: int) -> list[Grip]:
+    """All attempts at objects of one width."""
+    objects = grip_objects(width)
+    tried = list(itertools.product(range(len(objects)), _PLACES, _FIRMNESS))
+    index, places, firmness = (np.array(column) for column in zip(*tried, strict=True))
+    physics = NativePhysics(hand, task, objects, threads)
+    try:
+        start = _start(hand, index, places * width / 2)
+        target = _close(physics, hand, start, firmness)
+        states = _shake(physics, hand, task, start, target, objects)
+    finally:
+        physics.close()
+    return _judged(task, start, states, objects, width)
+
+
+def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
+    """Open hands above objects that are held in place at the world's origin, `depth` (B,) m from the hand centre."""
+    frame, count = grasp_frame(hand), len(index)
+    own = np.stack([frame.cross, np.cross(frame.cross, frame.heading), -frame.heading])  # onto x, y and z
+    ones, turn = np.ones(count), np.asarray(rotations.from_matrix(jnp.asarray(own)))
+    return ResetState(
+        object_index=index,
+        mass_scale=ones,
+        friction=ones,
+        base_position=-(frame.center - depth[:, None] * frame.heading) @ own.T,
+        base_quaternion=np.tile(turn, (count, 1)),
+        q=np.tile(hand.q_open, (count, 1)),
+        object_position=np.zeros((count, 3)),
+        object_quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        stationary=ones > 0,
+    )
+
+
+def _close(physics: NativePhysics, hand: Hand, start: ResetState, firmness: np.ndarray) -> np.ndarray:
+    """(B, F) targets of fingers that have closed around what is held in place, and is let go then."""
+    physics.start(start)
+    reach = firmness[:, None] * np.array([joint.torque_limit / joint.kp for joint in hand.joints])
+    q = target = np.asarray(start.q)
+    still, away = np.zeros((len(q), 6)), np.zeros(len(q), bool)
+    for _ in range(_CLOSE):
+        target = np.clip(target + np.clip(hand.q_closed - target, -_SPEED, _SPEED), q - reach, q + reach)
+        _, state = physics.step(physics, np.concatenate([still, target], -1), away)
+        q = np.asarray(state.q)
+    for instance in physics.instances:
+        instance.data.eq_active[instance.model.equality("hold").id] = False
+    return target
+
+
+def _shake(
+    physics: NativePhysics,
+    hand: Hand,
+    task: TaskConfig,
+    start: ResetState,
+    target: np.ndarray,
+    objects: Sequence[GraspObject],
+) -> PhysicsState:
+    """Half a second without support, the lift, and the pushes; the states have a leading axis T."""
+    task = dataclasses.replace(task, approach_steps=0)
+    protocol, time = protocols.stress(task, objects, _HOLD), jnp.arange(_HOLD + protocols.stress_steps(task))
+    base = jnp.tile(jnp.asarray(start.base_quaternion)[:1], (len(time), 1))
+    frame = protocols.frame(protocol, task, time + 0.5)
+    wrist = np.asarray(protocols.carried_targets(jnp.zeros((len(time), 6)), hand, base, frame))
+    which = [jnp.full(len(time), n) for n in range(len(objects))]
+    pushes = np.stack([protocols.push(protocol, task, time, n, jnp.ones(len(time))) for n in which], 1)
+    states, away = [], np.zeros(len(target), bool)
+    for u, force in zip(wrist, pushes[:, start.object_index], strict=True):
+        _, state = physics.step(physics, np.concatenate([np.tile(u, (len(target), 1)), target], -1), away, force)
+        states.append(jax.tree.map(np.asarray, state))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
+
+
+def _judged(
+    task: TaskConfig, start: ResetState, states: PhysicsState, objects: Sequence[GraspObject], width: float
+) -> list[Grip]:
+    """What became of the attempts."""
+    wrist = rotations.compose_pose(
+        start.base_position, start.base_quaternion, states.u[..., :3], rotations.euler_to_quaternion(states.u[..., 3:])
+    )
+    seen = rotations.relative_pose(*wrist, states.object_position, states.object_quaternion)
+    position, quaternion = (np.asarray(leaf) for leaf in seen)
+    last = _HOLD - 1
+    moved = np.linalg.norm(states.object_position[last], axis=-1)  # it was let go at the origin
+    held = (moved < protocols.FARTHEST) & ~states.diverged.any(0)
+    survived = protocols.survival(position[last:], quaternion[last:], held, task)
+    touching = states.contact_found[last].any(-1)
+    return [
+        Grip(
+            obj=objects[index],
+            width=width,
+            held=bool(held[i]),
+            survived={name: bool(column[i]) for name, column in survived.items()},
+            touching=touching[i],
+            q=states.q[last, i],
+            object_position=position[last, i],
+            object_quaternion=quaternion[last, i],
+        )
+        for i, index in enumerate(np.asarray(start.object_index))
+    ]
+
+
+def _object(name: str, piece: Piece) -> GraspObject:
+    """One piece as an object."""
+    mass, _, inertia = mass_properties((piece,), np.array([DENSITY]))
+    points, normals, _ = sample_union((piece,), np.random.default_rng(0))
+    vertices, faces = shapes.tessellate(piece)
+    return GraspObject(
+        name=name,
+        family=name,
+        pieces=(piece,),
+        part_names=("all",),
+        graspable=np.array([True]),
+        mass=mass,
+        inertia=inertia,
+        points=points.astype(np.float32),
+        normals=normals.astype(np.float32),
+        labels=np.zeros(len(points), np.int32),
+        rest_poses=np.zeros((0, 7)),
+        visual_vertices=vertices.astype(np.float32),
+        visual_faces=faces.astype(np.int32),
+    )

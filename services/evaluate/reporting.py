@@ -1,0 +1,87 @@
+"""Evaluates a policy and writes its report: what `congrasp report` and `congrasp hands train` end with."""
+
+import pathlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+from actors.physics import PhysicsName, resolve_physics
+from common.config import ObjectsConfig
+from common.errors import CongraspError
+from common.objects.pool import HELD_OUT_SEED, load_pool
+from common.parallel import cores
+from common.policy import bundle as bundles
+from services.assets.objects.named import objects_of
+from services.evaluate.evaluator import Evaluator
+from services.evaluate.failures import failure_sheets
+from services.evaluate.protocol import objects_label, two_seconds
+from services.evaluate.report import Commands, HandCheck, Picture, count_causes, curves_of, template, write_report
+from services.evaluate.scores import TABLES, Row, known_rows
+from services.viz.sheets import png_of
+
+_PICTURED = 4
+
+
+class Reported(NamedTuple):
+    """What a report says."""
+
+    rows: list[Row]
+    left_out: list[CongraspError]
+    """Why rows are missing."""
+
+
+def report_on(
+    file: pathlib.Path,
+    out: pathlib.Path,
+    *,
+    subject: str,
+    episodes: int,
+    pool: int,
+    physics: PhysicsName = "auto",
+    seed: int = 0,
+    objects: pathlib.Path | None = None,
+    run_dir: pathlib.Path | None = None,
+    check: HandCheck | None = None,
+    track: Callable[[str, int | None], Callable[[int], None]],
+) -> Reported:
+    """Evaluates a policy by the paper's protocol and writes one HTML file about it.
+
+    Args:
+      file: the policy's file.
+      out: the HTML file.
+      subject: options of `congrasp evaluate` that name the policy.
+      episodes: in each row.
+      pool: number of procedural objects.
+      physics: engine.
+      seed: of constraints and episodes.
+      objects: objects to grasp, as `congrasp evaluate` takes them; held-out procedural ones by default.
+      run_dir: the run whose curves are shown.
+      check: the self-check of its hand.
+      track: shows progress.
+
+    Raises:
+      CongraspError: a package is missing, or a file cannot be read or written.
+    """
+    template()  # fails before the evaluation if a package is missing
+    policy, engine = bundles.load(file), resolve_physics(physics)
+    names = known_rows(TABLES, policy.task)
+    curves = list(curves_of(run_dir)) if run_dir else []
+    given = objects_of(objects, track=track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
+    track("Making constraints", None)
+    held, threads = two_seconds(policy.task), cores()
+    evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)
+    names, left_out = evaluator.allowed(names)
+    rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
+    advance = track("Pictures", len(names))
+    sheets = []
+    for name, sheet, causes in failure_sheets(evaluator, policy, names, _PICTURED, _PICTURED):
+        sheets.append(Picture(name, png_of(sheet), count_causes(causes)))
+        advance(len(sheets))
+    subject += f" --objects {objects}" if objects else f" --pool {pool}"
+    command = (
+        f"congrasp evaluate --table single composed {subject} --episodes {episodes} --physics {engine} --seed {seed}"
+    )
+    commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
+    which = f"{len(given)} objects ({objects_label(policy, objects)})"
+    how = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
+    write_report(out, policy, file.name, rows, how, sheets, curves, commands, check)
+    return Reported(rows, left_out)

@@ -1,0 +1,186 @@
+"""The flow of `congrasp hands train`: self-check, training, evaluation, and one report about a hand.
+
+Each stage is a command of its own in a process of its own, so that it has a GPU's memory for itself, and leaves its
+result in one folder: the same command goes on with what is missing.
+"""
+
+import dataclasses
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+
+from common.engines import PhysicsName
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.hands.files import hand_text
+from common.hands.spec import Hand
+from common.inputs import read_json
+from common.policy import bundle as bundles
+from common.policy.pretrained import own_policy_file, pretrained_hands
+from learner.run_directory import CONFIG_FILE, POLICY_FILE
+from services.assets.hands.check import Finding, read_findings
+from services.train.presets import FULL, get_preset
+from services.train.processes import Child
+from services.train.unattended import run_child, seconds, train_in_background, trained
+
+HAND, CHECK, REPORT = "hand.json", "check.json", "report.html"
+_ROWS = "report.json"
+_LARGEST = 1 << 24  # bytes of a file of rows
+_PATIENCE = 1800.0  # seconds of a check or a report
+_LINE_SECONDS = 10.0
+_RATE = 400_000  # trained steps a second of one H200
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What is wanted."""
+
+    hand: Hand
+    reference: str
+    """What commands call it by: its name or the path of its file."""
+    out: pathlib.Path
+    full: bool
+    """The full task; otherwise the short training of a machine without a GPU."""
+    anyway: bool
+    """Train it although its self-check failed."""
+    physics: PhysicsName
+    episodes: int
+    """Of each row of the report."""
+    pool: int
+    """Objects of the report."""
+    options: Sequence[str]
+    """Further options of `congrasp train`."""
+    patience: float
+    """Seconds of the training."""
+
+    @property
+    def run_dir(self) -> pathlib.Path:
+        """Folder of the training."""
+        return self.out / ("full" if self.full else "short")
+
+
+def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
+    """Makes what is missing of a hand's self-check, training and report.
+
+    Args:
+      request: what is wanted.
+      note: is given what is worth a line.
+
+    Returns:
+      The trained policy's file in the run's folder.
+
+    Raises:
+      CongraspError: the self-check failed, a stage failed, or the folder holds the training of another hand.
+    """
+    _begin(request)
+    _check(request, note)
+    note("" if request.full else _what_a_gpu_would_take(request))
+    policy = trained(request.run_dir)
+    if policy is None:
+        policy = _train(request, note)
+    _install(request, policy, note)
+    _report(request, policy, note)
+    return policy
+
+
+def _begin(request: Request) -> None:
+    """Makes the folder for this hand; a CongraspError if it holds the training of another."""
+    file, text = request.out / HAND, hand_text(request.hand).encode()
+    request.out.mkdir(parents=True, exist_ok=True)
+    if file.exists() and file.read_bytes() == text:
+        return
+    if any(request.out.glob(f"*/{CONFIG_FILE}")):
+        raise CongraspError(
+            f"{request.out} holds the training of another hand, or of this one before it was changed.",
+            "Name another --out, or remove the folder.",
+        )
+    (request.out / CHECK).unlink(missing_ok=True)
+    write_atomically(file, text)
+
+
+def _check(request: Request, note: Callable[[str], None]) -> None:
+    """The self-check, unless it was made."""
+    file = request.out / CHECK
+    if not file.exists():
+        arguments = ["hands", "check", request.reference, "--json", str(file)]
+        arguments += ["--png", str(file.with_suffix(".png"))]
+        _run(request, "check", arguments, (0, 1), {"JAX_PLATFORMS": "cpu"})
+    findings: list[Finding] = read_findings(file)
+    for finding in findings:
+        note(str(finding))
+    if any(finding.verdict == "failed" for finding in findings) and not request.anyway:
+        raise CongraspError(
+            f"The hand '{request.hand.name}' failed its self-check ({file.with_suffix('.png')}).",
+            "Mend its file as the lines say, or train it all the same with --anyway.",
+        )
+
+
+def _train(request: Request, note: Callable[[str], None]) -> pathlib.Path:
+    """The training, from where it was."""
+    chosen = ["--preset", FULL if request.full else "quickstart", "--hand", request.reference]
+    log = request.run_dir.with_name(f"{request.run_dir.name}.log")
+    note(f"Training {request.hand.name} in {request.run_dir} (log: {log})")
+    said, told = time.monotonic(), ""
+
+    def progress(line: str) -> None:
+        """A line now and then."""
+        nonlocal said, told
+        if line != told and time.monotonic() - said > _LINE_SECONDS:
+            said, told = time.monotonic(), line
+            note(f"  {line}")
+
+    options = ["--physics", request.physics, *request.options] if request.full else request.options
+    train_in_background(request.run_dir, chosen, options, patience=request.patience, progress=progress)
+    return request.run_dir / POLICY_FILE
+
+
+def _install(request: Request, policy: pathlib.Path, note: Callable[[str], None]) -> None:
+    """Puts the policy where `--hand` finds it, unless one with more experience of this hand is there."""
+    hand, own = request.hand, own_policy_file(request.hand.name)
+    if not hand.text and hand.name in pretrained_hands():
+        note(f"--hand {hand.name} stays the policy that comes with congrasp; this one is --policy {policy}.")
+        return
+    if own.exists():
+        there, fresh = bundles.load(own), bundles.load(policy)
+        if there.spec.hand == hand.reference and there.transitions > fresh.transitions:
+            note(f"{own} has seen more ({there.transitions:,} steps) and stays; this one is --policy {policy}.")
+            return
+    own.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(own, policy.read_bytes())
+    note(f"The policy of --hand {hand.name} is {own}.")
+
+
+def _report(request: Request, policy: pathlib.Path, note: Callable[[str], None]) -> None:
+    """The evaluation and the report, unless they were made of this policy."""
+    rows, page = request.out / _ROWS, request.out / REPORT
+    about = {"content": bundles.content_hash(policy.read_bytes()), "episodes": request.episodes, "pool": request.pool}
+    if not (page.exists() and rows.exists() and about.items() <= read_json(rows, _LARGEST).items()):
+        note(f"Evaluating {request.episodes} episodes of each constraint …")
+        arguments = ["report", str(request.run_dir), "--out", str(page), "--json", str(rows)]
+        arguments += ["--check", str(request.out / CHECK), "--physics", request.physics]
+        arguments += ["--episodes", str(request.episodes), "--pool", str(request.pool)]
+        _run(request, "report", arguments, (0,), {})
+    for row in read_json(rows, _LARGEST)["rows"]:
+        note(f"  {row['constraint']:22s} success {100 * row['success']:5.1f} %")
+    took = seconds(request.run_dir)
+    note(f"The report is {page}" + (f"; the training took {took / 60:.1f} min." if took else "."))
+
+
+def _run(request: Request, name: str, arguments: list[str], fine: tuple[int, ...], environment: dict[str, str]) -> None:
+    """Runs a stage; a CongraspError unless it ends with one of the exit codes."""
+    child = Child(name, arguments, request.out / f"{name}.log", environment)
+    code = run_child(child, _PATIENCE)
+    if code not in fine:
+        why = f"was ended after {_PATIENCE / 60:.0f} min" if code is None else f"failed: {child.last_line()}"
+        raise CongraspError(f"The {name} of '{request.hand.name}' {why}", f"Its log is {child.log}.")
+
+
+def _what_a_gpu_would_take(request: Request) -> str:
+    """What the short training leaves out."""
+    full = get_preset(FULL, request.reference)
+    steps = full.updates * full.environments * full.rollout_steps * full.ppo.rollouts_per_update
+    return (
+        "This machine has no GPU: a short training of an easier task follows, whose policy grasps from above at best. "
+        f"On a GPU the same command trains the full task: {steps / 1e6:.0f} million steps, some "
+        f"{steps / _RATE / 60:.0f} minutes of one H200 and two to four for start and report."
+    )

@@ -1,0 +1,194 @@
+"""From a hand's file to its report, stage by stage; scripts stand in for the stages' commands, but for one real run."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.hands.files import hand_text
+from common.policy import bundle as bundles
+from common.policy.pretrained import own_policy_file, policy_file
+from learner.run_directory import CHECKPOINTS, CONFIG_FILE, open_run
+from services.assets.hands.check import Finding, write_findings
+from services.assets.hands.model_files import import_hand
+from services.cli import main
+from services.train import own_hand
+from services.train.command import untrained
+from services.train.own_hand import CHECK, HAND, REPORT, Request, train_hand
+from services.train.presets import get_preset
+
+CLAW = pathlib.Path(__file__).parents[2] / "hands" / "claw.urdf"
+TINY = (
+    "--actors 0 --environments 4 --rollout-steps 8 --updates {} --checkpoint-every 1 --ppo.minibatches 2 "
+    "--network.hidden 16 --objects.count 1 --objects.families box"
+)
+GOOD = [Finding("palm", "passed", "fingers begin on it")]
+BAD = [*GOOD, Finding("ball", "failed", "falls", "close further")]
+
+
+@pytest.fixture
+def hand(monkeypatch, tmp_path):
+    """The claw among the user's own hands."""
+    monkeypatch.setenv("CONGRASP_HANDS", str(tmp_path / "hands"))
+    (tmp_path / "hands").mkdir()
+    (tmp_path / "hands" / "claw.json").write_text(hand_text(import_hand(CLAW).hand))
+    get_hand.cache_clear()
+    yield get_hand("claw")
+    get_hand.cache_clear()
+
+
+@pytest.fixture
+def stages(monkeypatch, tmp_path, hand):
+    """Which stages ran, in their order, and what they do: `findings` of the check, `steps` of the policy."""
+    ran, does = [], {"findings": GOOD, "steps": 1000}
+
+    def check_or_report(child, patience, progress=lambda line: None):
+        ran.append(child.name)
+        option = dict(zip(child.arguments, child.arguments[1:], strict=False))
+        if child.name == "check":
+            write_findings(pathlib.Path(option["--json"]), does["findings"])
+            assert child.arguments[:3] == ["hands", "check", "claw"] and child.environment["JAX_PLATFORMS"] == "cpu"
+            return int(does["findings"] is BAD)
+        content = bundles.content_hash((pathlib.Path(child.arguments[1]) / "policy.safetensors").read_bytes())
+        rows = [{"constraint": "heading", "success": 0.953}]
+        about = {"content": content, "episodes": int(option["--episodes"]), "pool": int(option["--pool"])}
+        pathlib.Path(option["--json"]).write_text(json.dumps({**about, "rows": rows}))
+        pathlib.Path(option["--out"]).touch()
+        return 0
+
+    def train(run_dir, chosen, options, *, patience, progress):
+        ran.append(f"train {' '.join([*chosen, *options])}")
+        run_dir.mkdir()
+        config = get_preset("quickstart", "claw")
+        config = dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,)))
+        (run_dir / CONFIG_FILE).write_text("{}")
+        bundles.save(dataclasses.replace(untrained(config), transitions=does["steps"]), run_dir / "policy.safetensors")
+        (run_dir / "trained.json").write_text('{"seconds": 90}')
+
+    monkeypatch.setattr(own_hand, "run_child", check_or_report)
+    monkeypatch.setattr(own_hand, "train_in_background", train)
+    return ran, does
+
+
+def request(hand, out, **changes):
+    asked = Request(hand, "claw", out, False, False, "auto", 8, 2, ("--updates", "3"), 60.0)
+    return dataclasses.replace(asked, **changes)
+
+
+def test_what_is_there_is_not_made_again(stages, hand, tmp_path):
+    ran, _ = stages
+    notes = []
+    policy = train_hand(request(hand, tmp_path / "out"), notes.append)
+    assert ran == ["check", "train --preset quickstart --hand claw --updates 3", "report"]
+    assert policy_file(None, "claw").read_bytes() == policy.read_bytes()
+    text = "\n".join(notes)
+    for words in ("passed  palm", "no GPU", "197 million steps", "heading", "95.3 %", str(tmp_path / "out" / REPORT)):
+        assert words in text
+    train_hand(request(hand, tmp_path / "out"), notes.append)
+    assert len(ran) == 3
+    (tmp_path / "out" / REPORT).unlink()
+    train_hand(request(hand, tmp_path / "out"), notes.append)
+    assert ran[3:] == ["report"]
+    train_hand(request(hand, tmp_path / "out", episodes=9), notes.append)
+    assert ran[4:] == ["report"]
+    # A GPU trains the full task, beside what was trained without one.
+    notes.clear()
+    train_hand(request(hand, tmp_path / "out", full=True), notes.append)
+    assert ran[5:] == ["train --preset full --hand claw --physics auto --updates 3", "report"]
+    assert "no GPU" not in "\n".join(notes)
+
+
+def test_a_hand_that_fails_its_check_is_not_trained_unless_told_so(stages, hand, tmp_path):
+    ran, does = stages
+    does["findings"] = BAD
+    for _ in range(2):
+        with pytest.raises(CongraspError, match=r"'claw' failed its self-check.*--anyway"):
+            train_hand(request(hand, tmp_path / "out"), lambda text: None)
+    assert ran == ["check"] and not own_policy_file("claw").exists()
+    # Mended, it is checked anew.
+    does["findings"] = GOOD
+    mended = dataclasses.replace(hand, object_scale=0.8)
+    train_hand(request(mended, tmp_path / "out"), lambda text: None)
+    assert ran[1] == "check" and len(ran) == 4
+    with pytest.raises(CongraspError, match="another hand, or of this one before it was changed"):
+        train_hand(request(hand, tmp_path / "out"), lambda text: None)
+    does["findings"] = BAD
+    train_hand(request(hand, tmp_path / "other", anyway=True), lambda text: None)
+    assert len(ran) == 7
+
+
+def test_a_policy_of_more_experience_stays(stages, hand, tmp_path):
+    _, does = stages
+    does["steps"] = 10**8
+    best = train_hand(request(hand, tmp_path / "long", full=True), lambda text: None)
+    does["steps"], notes = 1000, []
+    train_hand(request(hand, tmp_path / "short"), notes.append)
+    assert own_policy_file("claw").read_bytes() == best.read_bytes()
+    assert "has seen more (100,000,000 steps) and stays" in "\n".join(notes)
+    # But one of the hand as it was before is replaced.
+    (tmp_path / "hands" / "claw.json").write_text(hand_text(dataclasses.replace(hand, object_scale=0.8)))
+    get_hand.cache_clear()
+    fresh = train_hand(request(get_hand("claw"), tmp_path / "new"), lambda text: None)
+    assert own_policy_file("claw").read_bytes() == fresh.read_bytes() != best.read_bytes()
+
+
+def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
+    ran, _ = stages
+    monkeypatch.setattr("services.train.processes.accelerators", lambda: ("cpu", 1))
+    (tmp_path / "hands" / "claw.json").unlink()
+    command = ["hands", "train", str(CLAW), "--out", str(tmp_path / "out"), "--training=--updates 3"]
+    assert main.run(command) == 0
+    said = capsys.readouterr().out
+    assert "thumb        opposing_lower - opposing_upper" in said and "congrasp grasp mug.obj --hand claw" in said
+    file = tmp_path / "hands" / "claw.json"
+    made = file.read_text()
+    assert main.run(command) == 0 and len(ran) == 3 and file.read_text() == made
+    assert f"The hand 'claw' is {file}" in capsys.readouterr().out
+    assert main.run(["hands", "list"]) == 0
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if "claw" in line and "own" in line]
+    assert "x 1" in row
+    with pytest.raises(CongraspError, match="no hand 'paw'"):
+        main.run(["hands", "train", "paw"])
+
+
+@pytest.mark.timeout(300)
+def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(hand, monkeypatch, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / HAND).write_text(hand_text(hand))
+    write_findings(out / CHECK, GOOD)
+    run_dir = out / "short"
+    command = [sys.executable, "-m", "services.cli.main", "hands", "train", "claw", "--out", str(out)]
+    process = subprocess.Popen(
+        [*command, f"--training={TINY.format(10_000)}"], stdout=subprocess.PIPE, start_new_session=True, env=os.environ
+    )
+    try:
+        deadline = time.monotonic() + 200
+        while len(list((run_dir / CHECKPOINTS).glob("*.safetensors"))) < 2:
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 128 + signal.SIGTERM
+    finally:
+        process.kill()
+        process.communicate()
+    (run_dir / "mark").touch()
+    first = max(int(file.stem.rpartition("_")[2]) for file in (run_dir / CHECKPOINTS).glob("*.safetensors"))
+
+    monkeypatch.setattr(own_hand, "_report", lambda *arguments: None)
+    last = first + 2
+    options = ("--updates", str(last))
+    policy = train_hand(request(hand, out, options=options, patience=200.0), lambda text: None)
+    assert open_run(run_dir).task.hand == hand.reference
+    trained = bundles.load(policy_file(None, "claw"))
+    assert trained.version == last and trained.spec.hand == hand.reference
+    assert policy.read_bytes() == own_policy_file("claw").read_bytes()
+    assert first >= 2 and (run_dir / "mark").exists()  # one that begins anew clears its folder
