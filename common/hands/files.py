@@ -23,7 +23,7 @@ FORMAT = 1
 MAX_BYTES = 1 << 20
 """Bytes that a hand file may have."""
 _LINKS, _JOINTS, _CAPSULES = 64, 64, 16  # most of a hand, of a hand, of a link
-_LARGEST = 1e4  # of any number
+_LARGEST = 1e5  # of any number
 _REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-hand.md."
 _ROUNDING = 1e-5  # rad, of single precision
 _TAKEN = {"hand_base", "table", "anchor", "object", "hold", "world"}
@@ -115,8 +115,8 @@ def faults(hand: Hand) -> list[str]:
             found.append(f"the axis of '{joint.name}' is not a unit vector")
         if min(joint.damping, joint.armature) < 0:
             found.append(f"damping and armature of '{joint.name}' must be at least zero")
-    if uncoupled := _coupling_faults(hand):
-        return found + uncoupled
+    if found := found or _coupling_faults(hand):
+        return found
     for motor in hand.motors:
         if min(motor.kp, motor.torque_limit) <= 0 or motor.kv < 0:
             found.append(f"gains and torque limit of '{motor.name}' must be above zero")

@@ -17,6 +17,7 @@ _TABLE_RADIUS, _TABLE_HALF_HEIGHT = 0.28, 0.008  # m
 FIELD_OF_VIEW = 26.0
 """Degrees, of cameras that `fit` makes."""
 _SPACE = 1.06  # free space at the picture's edges
+_STILL = 1e-3  # m of a curl that tells no direction
 
 
 def hand_shapes(
@@ -123,5 +124,8 @@ def upright(hand: Hand) -> Rotation:
     links = list(hand.tip_links[1:])
     curl = (mujoco_link_poses(hand, hand.q_closed)[0] - mujoco_link_poses(hand, hand.q_open)[0])[links].mean(0)
     palm = curl - (curl @ up) * up
+    if np.linalg.norm(palm) < _STILL:  # fingers of one joint, or around an axis: towards the thumb, then
+        thumb = hand.keypoints[len(hand.links)] - fingers
+        palm = thumb - (thumb @ up) * up
     palm = palm / np.linalg.norm(palm)
     return Rotation.from_matrix(np.stack([palm, np.cross(up, palm), up]))
