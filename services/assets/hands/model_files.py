@@ -22,6 +22,7 @@ from services.assets.hands.poses import opening, propose_poses, thumb_of
 from services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
 
 _HUMAN_OPENING = 0.11  # m between thumb and fingers of a hand that grasps objects of their own size
+_LEVER = 0.02  # m from a joint to the tip that it moves, at least
 _SMALL = 0.03  # m of opening below which a hand is doubtful
 
 
@@ -30,6 +31,8 @@ class Proposal:
     """A hand as it was understood, and what was not in the file."""
 
     hand: Hand
+    palm: str
+    """Its name in the file; the hand calls it `palm`."""
     notes: tuple[str, ...]
 
 
@@ -87,7 +90,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     scale = choices.object_scale or round(float(np.clip(wide / _HUMAN_OPENING, 0.3, 3.0)), 1)
     hand = dataclasses.replace(hand, object_scale=scale)
     _check(path, hand)
-    return Proposal(hand_from_text(hand_text(hand), str(path)), tuple(notes))
+    return Proposal(hand_from_text(hand_text(hand), str(path)), model.body(tree.palm).name, tuple(notes))
 
 
 def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
@@ -108,6 +111,7 @@ def describe(proposal: Proposal) -> list[str]:
     lines = [
         f"hand         {hand.name}: {len(hand.joints)} joints, {len(hand.motors)} motors, {len(hand.links)} links, "
         f"{mass:.3f} kg",
+        f"palm         {proposal.palm}",
         f"thumb        {' - '.join(tips[0])}",
         *(f"finger       {' - '.join(tip)}" for tip in tips[1:]),
         f"heading v    {_text(frame.heading)} in the palm's frame, cross-finger axis w {_text(frame.cross)}",
@@ -150,7 +154,8 @@ def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[s
         local = [(p - origin) @ turn for p in points]
         shapes[link] = fit_capsules(np.array(local or bare(at[link], *(at[x] for x in above if above[x] == link))))
     tips = {link: far_end(shapes[link], at[link]) for link in tree.ends}
-    levers, joints = _levers(model, data, tree, above, tips, turn, origin)
+    joints = _joint_names(model, tree, {*names.values()})
+    levers = _levers(model, data, tree, above, tips, turn, origin)
     drive = Drive(model, data, joints, levers)
     links = []
     for link, bodies in tree.groups.items():
@@ -162,7 +167,7 @@ def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[s
             Link(
                 name=names[link],
                 parent="" if link == tree.palm else names[above[link]],
-                joints=tuple(_joint(model, data, j, turn, origin, drive) for j in own),
+                joints=tuple(_joint(model, data, j, joints[j], turn, origin, drive) for j in own),
                 capsules=shapes[link],
                 mass=max(mass, 1e-3),
                 contact_weight=3.0 if link in tips else 1.0,
@@ -181,6 +186,13 @@ def _anchor(model: mujoco.MjModel, data: mujoco.MjData, link: int, turn: np.ndar
     return np.asarray((data.xanchor[hinges(model, link)[0]] - origin) @ turn)
 
 
+def _joint_names(model: mujoco.MjModel, tree: Tree, taken: set[str]) -> dict[int, str]:
+    """Names of the hand's joints in its order, apart from those of links."""
+    order = [j for link in tree.groups if link != tree.palm for j in hinges(model, link)]
+    names = {j: identifier(model.joint(j).name, f"joint_{j}") for j in order}
+    return {j: f"{name}_joint" if name in taken else name for j, name in names.items()}
+
+
 def _levers(
     model: mujoco.MjModel,
     data: mujoco.MjData,
@@ -189,26 +201,22 @@ def _levers(
     tips: dict[int, np.ndarray],
     turn: np.ndarray,
     origin: np.ndarray,
-) -> tuple[dict[int, float], dict[int, str]]:
-    """m from each joint of the hand to the farthest tip that it moves, and the joints' names."""
-    levers: dict[int, float] = {}
+) -> dict[int, float]:
+    """m from each joint of the hand to the farthest tip that it moves."""
+    levers = {j: _LEVER for link in tree.groups if link != tree.palm for j in hinges(model, link)}
     for end, tip in tips.items():
         link = end
         while link != tree.palm:
             for j in hinges(model, link):
-                reach = float(np.linalg.norm((data.xanchor[j] - origin) @ turn - tip))
-                levers[j] = max(levers.get(j, 0.0), reach)
+                levers[j] = max(levers[j], float(np.linalg.norm((data.xanchor[j] - origin) @ turn - tip)))
             link = above[link]
-    order = [j for link in tree.groups if link != tree.palm for j in hinges(model, link)]
-    names = {j: identifier(model.joint(j).name, f"joint_{j}") for j in order}
-    return {j: levers.get(j, 0.03) for j in order}, names
+    return levers
 
 
 def _joint(
-    model: mujoco.MjModel, data: mujoco.MjData, j: int, turn: np.ndarray, origin: np.ndarray, drive: Drive
+    model: mujoco.MjModel, data: mujoco.MjData, j: int, name: str, turn: np.ndarray, origin: np.ndarray, drive: Drive
 ) -> Joint:
     """A hinge in the palm's frame, which `turn` (3, 3) brings to the world and whose origin lies at `origin` (3,) m."""
-    name = identifier(model.joint(j).name, f"joint_{j}")
     if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
         raise CongraspError(f"The joint '{name}' is not a hinge.", "Hands of hinges alone can be imported.")
     if not model.jnt_limited[j]:

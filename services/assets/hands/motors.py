@@ -13,7 +13,7 @@ from common.hands.spec import Coupling, Joint, Motor
 
 FINGERTIP_FORCE = 15.0
 """N, with which a joint without a torque limit can press its fingertip."""
-LARGEST_FORCE = 100.0
+LARGEST_FORCE = 40.0
 """N, above which a torque limit is no finger's."""
 _REACH = 0.3  # rad of error at which a joint gives all its torque, where the file has no gain
 _SLACK = 0.3  # rad that a limited tendon may leave between two joints to count as a coupling

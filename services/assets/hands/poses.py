@@ -21,13 +21,15 @@ from common.hands.spec import Hand, chain_of, link_origin
 _CLOSED = 0.8  # share of the way from zero to a joint's end at which it is closed, where thumb and fingers can meet
 _FLEXED = 0.15  # the same for the fingers of an open hand, as far as nothing else matters
 _SQUEEZE = 0.3  # rad that motors go on when their fingers have met the palm or others
-_OPENING = 1.25  # finger lengths between the tips of an open hand
+_OPENING = 1.25  # finger lengths between the tips of an open hand; of what is between them at zero, where that is less
 _AHEAD = 0.3  # finger lengths by which tips of an open hand are at least ahead of where their fingers begin
-_TOWARDS = 0.5  # least share of a tip's motion that leads to the other tips, for a joint that closes
+_TOWARDS = 0.6  # least share of a tip's motion that leads to the hand's centre, for a joint that closes
 _TURNED = 0.1  # least share of its range that a joint goes to the pinch, to tell the way in which it closes
-_EFFORT = 0.15  # weight of the way of all joints from limit to limit, against finger lengths
+_ALIKE = 0.3  # share of its range by which a joint goes farther to one side, to tell the same where it does not
+_EFFORT = 0.1  # weight of a radian of all joints, against a finger length
 _STILL = 0.004  # m/rad, below which a joint does not move its tip
 _APART = 0.02  # m between tips that count as met
+_MORE = 4  # starts at random
 _STEPS = 40
 _THUMB = re.compile(r"thumb|(^|_)th(j?\d|base|prox|hub|mid|dist)", re.IGNORECASE)
 
@@ -53,7 +55,7 @@ def thumb_of(hand: Hand, wanted: str, notes: list[str]) -> str:
 def propose_poses(hand: Hand, notes: list[str]) -> Hand:
     """The hand with an open and a closed pose; `notes` says what is doubtful."""
     body = _Body(hand)
-    opened, _, apart = _faced(body, 6)
+    opened, _, apart = _faced(body, _MORE)
     if apart > _APART:
         notes.append(
             f"thumb and fingers do not meet, {100 * apart:.0f} cm remain between their tips (--thumb, or 'open_pose'"
@@ -72,7 +74,7 @@ def propose_poses(hand: Hand, notes: list[str]) -> Hand:
         """Angles of joints that follow none by their names, without zeros."""
         angles = joint_positions(hand, motors.astype(np.float32))
         q = {joint.name: angle for joint, angle in zip(hand.joints, angles, strict=True)}
-        return {name: round(float(q[name]), 4) for name in names if round(float(q[name]), 4)}
+        return {name: round(float(q[name]), 6) for name in names if abs(q[name]) > 1e-4}
 
     return dataclasses.replace(hand, open_pose=pose(opened), closed_pose=pose(closed))
 
@@ -92,6 +94,7 @@ class _Body:
         add_hand(spec, hand, self_collision=True)
         self.hand, self.limits = hand, motor_limits(hand).astype(float)
         self._model = spec.compile()
+        self._ratios = [joint_positions(hand, row) - joint_positions(hand, 0 * row) for row in np.eye(len(hand.motors))]
         self._data = mujoco.MjData(self._model)
         self._links = [self._model.body(hand.links[i].name).id for i in hand.tip_links]
         self._local = np.array([np.subtract(hand.links[i].tip, link_origin(hand.links[i])) for i in hand.tip_links])  # type: ignore[arg-type]
@@ -105,13 +108,14 @@ class _Body:
         origins = {link.name: link_origin(link) for link in hand.links}
         self.roots = np.array([origins[root] for root in hand.finger_roots])
         """(tips, 3) where the fingers begin, thumb first."""
-        others = self.roots[1:]
-        spread = np.linalg.svd(others - others.mean(0))[2][0] if len(others) > 1 else np.zeros(3)
-        self.across = np.eye(3) - np.outer(spread, spread)
+        tips = self.tips(np.clip(0.0, *self.limits))
+        row = tips[1:] - tips[1:].mean(0)
+        sideways = np.linalg.svd(row)[2][0] if len(row) > 1 else np.zeros(3)
+        self.across = np.eye(3) - np.outer(sideways, sideways)
         """Projection that leaves out the direction in which the fingers stand side by side."""
         last = [list(link.joints)[-1].name for link in (hand.links[i] for i in hand.tip_links)]
         self._last = [next(m for m in range(len(hand.motors)) if name in self._moved(m)) for name in last]
-        straight = self.tips(np.clip(0.0, *self.limits))[1:] - others
+        straight = (tips - self.roots)[1:]
         self.size = float(np.linalg.norm(straight, axis=-1).mean())
         """m, length of the fingers."""
         self.ahead = straight.mean(0) / np.linalg.norm(straight.mean(0))
@@ -141,27 +145,32 @@ class _Body:
 
     def pads(self, motors: np.ndarray, way: np.ndarray) -> np.ndarray:
         """(tips, 3) unit, where the tips go when their last joints close, which do so by the signs `way` (M,)."""
-        found = []
-        for tip, m in enumerate(self._last):
-            step = np.zeros(len(motors))
-            step[m] = 0.02 * (way[m] or 1.0)
-            moved = (self.tips(motors + step) - self.tips(motors - step))[tip]
-            found.append(moved / max(float(np.linalg.norm(moved)), 1e-9))
-        return np.array(found)
+        tips = self.tips(motors)
+        mujoco.mj_comPos(self._model, self._data)
+        found, jacobian = np.zeros((len(tips), 3)), np.zeros((3, self._model.nv))
+        for i, m in enumerate(self._last):
+            mujoco.mj_jac(self._model, self._data, jacobian, None, tips[i], self._links[i])
+            moved = jacobian[:, 6:] @ self._ratios[m] * (way[m] or 1.0)
+            found[i] = moved / max(float(np.linalg.norm(moved)), 1e-9)
+        return found
 
     def closing(self, motors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(M,) the share of each motor's motion of its tips that closes the gap, and their speed in m/rad."""
-        towards = self.gap(motors).mean(0)
-        towards /= max(float(np.linalg.norm(towards)), 1e-9)
+        """(M,) the share of each motor's motion of its tip that leads to the hand's centre, and the tip's speed, m/rad.
+
+        Of many fingers in a row the outer ones need not come to its middle: the more there are, the less that counts.
+        """
+        tips = self.tips(motors)
+        towards = 0.5 * (tips[0] + tips[1:].mean(0)) - tips
+        towards = towards @ self.across + towards @ (np.eye(3) - self.across) / max(len(tips) - 2, 1)
+        towards /= np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-9)
         share, speed = np.zeros(len(motors)), np.zeros(len(motors))
         for m in range(len(motors)):
             step = np.zeros(len(motors))
             step[m] = 0.02
             moved = (self.tips(motors + step) - self.tips(motors - step)) / 0.04
-            moved[0] *= -1.0
-            fastest = moved[np.argmax(np.linalg.norm(moved, axis=-1))]
-            speed[m] = np.linalg.norm(fastest)
-            share[m] = -(fastest @ towards) / max(speed[m], 1e-9)
+            i = int(np.argmax(np.linalg.norm(moved, axis=-1)))
+            speed[m] = np.linalg.norm(moved[i])
+            share[m] = (moved[i] @ towards[i]) / max(speed[m], 1e-9)
         return share, speed
 
     def touching(self, motors: np.ndarray) -> set[str]:
@@ -181,22 +190,26 @@ def _faced(body: _Body, more: int) -> tuple[np.ndarray, float, float]:
     lower, upper = body.limits
     flat = np.clip(0.0, lower, upper)
     pinch = _pinch(body, flat, more)
-    way = np.where(np.abs(pinch - flat) > _TURNED * (upper - lower), pinch - flat, lower + upper - 2 * flat)
+    longer = lower + upper - 2 * flat
+    goes = (np.abs(pinch - flat) > _TURNED * (upper - lower)) | (np.abs(longer) < _ALIKE * (upper - lower))
+    way = np.where(goes, pinch - flat, longer)
     share, _ = body.closing(0.5 * (flat + pinch))
     flexing = ~body.thumb & (share * np.sign(way) > _TOWARDS)
     rest = np.where(flexing, flat + _FLEXED * (np.where(way > 0, upper, lower) - flat), flat)
-    weight = np.where(body.thumb | flexing, 4.0, 12.0)  # fingers spread only for a good reason
+    weight = np.where(body.thumb, 4.0, np.where(flexing, 8.0, 24.0))  # fingers spread only for a good reason
+    straight = body.tips(flat)
+    target = _OPENING * min(1.0, float(np.linalg.norm(straight[1:].mean(0) - straight[0])) / body.size)
 
     def residuals(motors: np.ndarray) -> np.ndarray:
-        """Pads of thumb and fingers face each other across the opening, not aside of each other, nor behind the palm."""
+        """Pads of thumb and fingers face each other across the opening, not aside of one another or behind the palm."""
         tips, pads = body.tips(motors), body.pads(motors, np.sign(way))
         between = tips[1:].mean(0) - tips[0]
         wide = float(np.linalg.norm(between))
         facing = 0.5 * np.concatenate([pads[0] - between / wide, *(pads[1:] + between / wide) / np.sqrt(len(pads) - 1)])
         aside = (between - body.across @ between) / body.size
         back = np.maximum(_AHEAD - (tips - body.roots) @ body.ahead / body.size, 0.0)
-        spent = weight * _effort(body, motors - rest)
-        return np.concatenate([facing, aside, back, [wide / body.size - _OPENING], spent])
+        spent = weight * _effort(motors - rest)
+        return np.concatenate([facing, aside, back, [wide / body.size - target], spent])
 
     opened, cost = _least(body, residuals, [rest, 0.5 * (rest + pinch), pinch], more)
     return opened, cost, float(np.linalg.norm(body.gap(pinch), axis=-1).max())
@@ -208,16 +221,16 @@ def _pinch(body: _Body, flat: np.ndarray, more: int) -> np.ndarray:
 
     def residuals(motors: np.ndarray) -> np.ndarray:
         gap = body.gap(motors) / body.size
-        return np.concatenate([(gap / np.sqrt(len(gap))).ravel(), _effort(body, motors - flat)])
+        return np.concatenate([(gap / np.sqrt(len(gap))).ravel(), _effort(motors - flat)])
 
     longer = np.where(upper > -lower, upper, lower)
     starts = [flat + 0.4 * (end - flat) for end in (lower, upper, longer)]
     return _least(body, residuals, starts, more)[0]
 
 
-def _effort(body: _Body, way: np.ndarray) -> np.ndarray:
-    """(M,) residuals of a way (M,) of the motors."""
-    return _EFFORT * way / (body.limits[1] - body.limits[0]) / np.sqrt(len(way))
+def _effort(way: np.ndarray) -> np.ndarray:
+    """(M,) residuals of a way (M,) of the motors, rad."""
+    return _EFFORT * way / np.sqrt(len(way))
 
 
 def _least(
@@ -227,7 +240,7 @@ def _least(
     lower, upper = body.limits
     rng = np.random.default_rng(0)
     found = [
-        least_squares(residuals, np.clip(start, lower + 1e-6, upper - 1e-6), bounds=(lower, upper), max_nfev=60)
+        least_squares(residuals, np.clip(start, lower + 1e-6, upper - 1e-6), bounds=(lower, upper), max_nfev=40)
         for start in (*starts, *(rng.uniform(lower, upper) for _ in range(more)))
     ]
     best = min(found, key=lambda result: float(result.cost))
