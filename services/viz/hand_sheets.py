@@ -1,6 +1,7 @@
 """Contact sheets of hands: their poses with the grasp frame, and what every joint does."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,16 +17,19 @@ from services.viz.sheets import contact_sheet
 _VIEW = np.array([0.75, 0.65, 0.35])
 
 
-def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = ()) -> list[Shape]:
+Meshes = Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+
+def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = (), meshes: Meshes | None = None) -> list[Shape]:
     """The hand upright with finger angles (F,), some of its links in another colour."""
     colours = [OBJECT if i in moved else SKIN for i in range(len(hand.links))]
-    return posed_hand(hand, q, np.zeros(3), upright(hand), colours)
+    return posed_hand(hand, q, np.zeros(3), upright(hand), colours, meshes=meshes)
 
 
-def _poses(hand: Hand) -> dict[str, list[Shape]]:
+def _poses(hand: Hand, meshes: Meshes | None = None) -> dict[str, list[Shape]]:
     """The hand upright in three poses."""
     poses = {"open": hand.q_open, "half closed": (hand.q_open + hand.q_closed) / 2, "closed": hand.q_closed}
-    return {name: _placed(hand, q) for name, q in poses.items()}
+    return {name: _placed(hand, q, meshes=meshes) for name, q in poses.items()}
 
 
 def _frame(hand: Hand) -> list[Shape]:
@@ -66,11 +70,16 @@ def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
     return contact_sheet(images, labels, columns=len(placed), title=title)
 
 
-def hands_sheet(hands: Sequence[Hand], *, size: tuple[int, int] = (300, 300)) -> np.ndarray:
-    """A row for each hand: open with its grasp frame, half closed, closed; all on one scale."""
+def hands_sheet(
+    hands: Sequence[Hand], meshes: Sequence[Meshes] = (), *, size: tuple[int, int] = (300, 300)
+) -> np.ndarray:
+    """A row for each hand: open with its grasp frame, half closed, closed; all on one scale.
+
+    `meshes` has what is drawn of each hand's links in the place of their capsules (`services.viz.shapes.hand_shapes`).
+    """
     images, labels = [], []
-    for hand in hands:
-        rows = _poses(hand)
+    for hand, drawn in itertools.zip_longest(hands, meshes):
+        rows = _poses(hand, drawn)
         rows["open"] += _frame(hand)
         camera = fit(np.concatenate([_points(shapes) for shapes in rows.values()]), _side(hand), size[0] / size[1])
         images += [render_scene(shapes, camera, size) for shapes in rows.values()]

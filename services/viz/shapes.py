@@ -1,14 +1,14 @@
 """Shapes that pictures are made of: hands, the table, arrows, strings of beads; and cameras that hold them."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.hands.spec import Hand, capsule_ends
+from common.hands.spec import Hand, capsule_ends, link_origin
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.palette import SKIN, TABLE, Colour
 from services.viz.scene import Camera, Shape, between
@@ -26,8 +26,9 @@ def hand_shapes(
     quaternion: np.ndarray,
     colours: Sequence[Colour] | None = None,
     alpha: float = 1.0,
+    meshes: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> list[Shape]:
-    """The hand's capsules.
+    """The hand's capsules, or meshes of links that have one.
 
     Args:
       hand: the hand.
@@ -35,9 +36,16 @@ def hand_shapes(
       quaternion: (L, 4) their orientations.
       colours: one for each link; skin otherwise.
       alpha: below one the hand is seen through.
+      meshes: vertices (V, 3) m, wrist frame at zero, and triangles (E, 3), by the names of links.
     """
     shapes = []
     for i, link in enumerate(hand.links):
+        if meshes and link.name in meshes:
+            vertices, faces = meshes[link.name]
+            colour, local = colours[i] if colours else SKIN, vertices - np.array(link_origin(link))
+            placed = {"position": position[i], "quaternion": quaternion[i], "vertices": local, "faces": faces}
+            shapes.append(Shape("mesh", (0.0, 0.0), colour, alpha=alpha, **placed))
+            continue
         turn = Rotation.from_quat(quaternion[i], scalar_first=True)
         for capsule, ends in zip(link.capsules, capsule_ends(link), strict=True):
             start, end = turn.apply(ends) + position[i]
@@ -52,14 +60,15 @@ def posed_hand(
     wrist: Rotation,
     colours: Sequence[Colour] | None = None,
     alpha: float = 1.0,
+    meshes: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> list[Shape]:
     """The hand with finger angles (F,) and its wrist at a position (3,) m and orientation in the world.
 
-    Colours and alpha are those of `hand_shapes`.
+    Colours, alpha and meshes are those of `hand_shapes`.
     """
     links, quaternion = mujoco_link_poses(hand, q)
     turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
-    return hand_shapes(hand, wrist.apply(links) + position, turned, colours, alpha)
+    return hand_shapes(hand, wrist.apply(links) + position, turned, colours, alpha, meshes)
 
 
 def table_shape(below: np.ndarray) -> Shape:

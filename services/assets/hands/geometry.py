@@ -17,29 +17,33 @@ def surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.nd
     solid = [g for g in mine if model.geom_contype[g] | model.geom_conaffinity[g]] or mine
     found: list[np.ndarray] = []
     for g in solid:
-        local = _points(model, g)
-        found += list(local @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g])
+        if (mesh := geom_mesh(model, g)) is not None:
+            local = np.asarray(mesh.vertices)
+            found += list(local @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g])
     return found
 
 
-def _points(model: mujoco.MjModel, g: int) -> np.ndarray:
-    """(n, 3) points on a geom in its own frame; none of a plane."""
+def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
+    """A geom as a mesh in its own frame; None of a plane."""
     kind, size = mujoco.mjtGeom(model.geom_type[g]), model.geom_size[g]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         m = model.geom_dataid[g]
-        start = model.mesh_vertadr[m]
-        return np.array(model.mesh_vert[start : start + model.mesh_vertnum[m]])
+        vertices = slice(model.mesh_vertadr[m], model.mesh_vertadr[m] + model.mesh_vertnum[m])
+        faces = slice(model.mesh_faceadr[m], model.mesh_faceadr[m] + model.mesh_facenum[m])
+        return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return np.array(trimesh.creation.box(2 * size).vertices)
+        return trimesh.creation.box(2 * size)
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return np.array(trimesh.creation.icosphere(1, size[0]).vertices)
+        return trimesh.creation.icosphere(1, size[0])
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return np.array(trimesh.creation.capsule(2 * size[1], size[0], count=(8, 8)).vertices)
+        return trimesh.creation.capsule(2 * size[1], size[0], count=(8, 8))
     if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return np.array(trimesh.creation.cylinder(size[0], 2 * size[1], sections=12).vertices)
+        return trimesh.creation.cylinder(size[0], 2 * size[1], sections=12)
     if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        return np.array(trimesh.creation.icosphere(1).vertices) * size
-    return np.zeros((0, 3))
+        ball = trimesh.creation.icosphere(1)
+        ball.vertices *= size
+        return ball
+    return None
 
 
 def inertia_box(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:

@@ -20,6 +20,7 @@ from services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_
 from services.assets.hands.motors import Drive
 from services.assets.hands.poses import opening, propose_poses, thumb_of
 from services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
+from services.assets.hands.visual import Meshes, link_mesh
 
 _HUMAN_OPENING = 0.11  # m between thumb and fingers of a hand that grasps objects of their own size
 _LEVER = 0.02  # m from a joint to the tip that it moves, at least
@@ -34,6 +35,8 @@ class Proposal:
     palm: str
     """Its name in the file; the hand calls it `palm`."""
     notes: tuple[str, ...]
+    meshes: Meshes
+    """What its file draws."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +93,8 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     scale = choices.object_scale or round(float(np.clip(wide / _HUMAN_OPENING, 0.3, 3.0)), 1)
     hand = dataclasses.replace(hand, object_scale=scale)
     _check(path, hand)
-    return Proposal(hand_from_text(hand_text(hand), str(path)), model.body(tree.palm).name, tuple(notes))
+    hand = hand_from_text(hand_text(hand), str(path))
+    return Proposal(hand, model.body(tree.palm).name, tuple(notes), _meshes(model, data, tree))
 
 
 def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
@@ -179,6 +183,16 @@ def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[s
     if empty:
         notes.append(f"no geometry and no inertia, thin capsules ('capsules' in the hand file): {', '.join(empty)}")
     return links, drive
+
+
+def _meshes(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree) -> Meshes:
+    """What the file draws of each link, in the palm's frame at zero."""
+    turn, origin = data.xmat[tree.palm].reshape(3, 3), data.xpos[tree.palm]
+    found = {
+        "palm" if link == tree.palm else body_name(model, link): link_mesh(model, data, bodies, turn, origin)
+        for link, bodies in tree.groups.items()
+    }
+    return {name: mesh for name, mesh in found.items() if mesh is not None}
 
 
 def _anchor(model: mujoco.MjModel, data: mujoco.MjData, link: int, turn: np.ndarray, origin: np.ndarray) -> np.ndarray:

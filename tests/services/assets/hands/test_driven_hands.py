@@ -5,11 +5,17 @@ import pathlib
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
+from common.errors import CongraspError
+from common.hands import VARIABLE, get_hand
 from common.hands.files import hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import chain_of
 from services.assets.hands.model_files import describe, import_hand
+from services.assets.hands.visual import MAX_FACES, load_meshes, save_meshes
+from services.cli import main
+from services.viz.hand_sheets import hands_sheet
 
 HANDS = pathlib.Path(__file__).parents[3] / "hands"
 
@@ -98,15 +104,63 @@ def test_a_left_hand_is_the_mirror_image(driven, tmp_path):
 
 def test_what_cannot_be_kept_is_said_with_its_remedy(tmp_path):
     text = (HANDS / "driven.xml").read_text()
-
-    def notes(old, new):
+    for old, new in {
+        'polycoef="0 0.5 0.1 0 0"': 'polycoef="3 1 0 0 0"',
+        'forcerange="-60 60"': "",
+        'forcerange="-1 1"': 'forcerange="-50 50"',
+        'damping="0.02"': 'damping="2"',
+    }.items():
         assert old in text
-        (tmp_path / "hand.xml").write_text(text.replace(old, new))
-        return "\n".join(import_hand(tmp_path / "hand.xml").notes)
+        text = text.replace(old, new)
+    (tmp_path / "hand.xml").write_text(text)
+    notes = "\n".join(import_hand(tmp_path / "hand.xml").notes)
+    assert "coupling of 'middle_end' to 'middle_middle' is left out" in notes and "'couplings'" in notes
+    assert "no motor in the file, here one each ('couplings' in the hand file): middle_end_joint" in notes
+    assert "above 40 N at the fingertip are lowered to that ('torque_limit'): index_spread, index_root" in notes
+    assert "damping that holds joints for more than 0.1 s is lowered ('damping' in the hand file)" in notes
+    assert "no torque limit, 15 N at the fingertip is proposed ('torque_limit'): middle_end_joint" in notes
 
-    stuck = notes('polycoef="0 0.5 0.1 0 0"', 'polycoef="3 1 0 0 0"')
-    assert "coupling of 'middle_end' to 'middle_middle' is left out" in stuck and "'couplings'" in stuck
-    assert "no motor in the file, here one each ('couplings' in the hand file): middle_end_joint" in stuck
-    assert "above 40 N at the fingertip are lowered" in notes('forcerange="-1 1"', 'forcerange="-50 50"')
-    assert "damping that holds joints" in notes('damping="0.02"', 'damping="2"')
-    assert "no torque limit, 15 N at the fingertip" in notes('forcerange="-1 1"', "")
+
+def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    get_hand.cache_clear()
+    path = tmp_path / "driven.json"
+    path.write_text(hand_text(driven.hand))
+    save_meshes(path, driven.meshes)
+    found = load_meshes(path, driven.hand)
+    assert found.keys() == {link.name for link in driven.hand.links}
+    vertices, faces = found["palm"]  # the box of the file, in the palm's frame
+    np.testing.assert_allclose([vertices.min(0), vertices.max(0)], [[-0.012, -0.04, -0.005], [0.012, 0.04, 0.085]])
+    assert len(faces) == 12
+    with_meshes, bare = (hands_sheet([driven.hand], [x], size=(40, 40)) for x in (found, {}))
+    assert np.abs(with_meshes.astype(int) - bare).max() > 30
+    assert main.run(["hands", "sheet", "driven", "--out", str(tmp_path / "sheet.png")]) == 0
+
+    def refused(word, meshes):
+        save_meshes(path, meshes)
+        with pytest.raises(CongraspError, match=word) as raised:
+            load_meshes(path, driven.hand)
+        assert "\n" not in str(raised.value)
+
+    refused("holds no mesh of 'palm'", {"palm": (vertices, faces + len(vertices))})
+    refused("has no link 'wing'", {"wing": (vertices, faces)})
+    save_meshes(path, {})
+    assert load_meshes(path, driven.hand) == {}
+
+
+def test_a_fine_mesh_is_simplified(tmp_path):
+    trimesh.creation.icosphere(5, 0.009).export(tmp_path / "pad.stl")
+    text = (
+        (HANDS / "claw.urdf").read_text().replace('<sphere radius="0.009"/>', '<mesh filename="package://x/pad.stl"/>')
+    )
+    (tmp_path / "claw.urdf").write_text(text)
+    proposal = import_hand(tmp_path / "claw.urdf")
+    vertices, faces = proposal.meshes["left_upper"]
+    assert 1000 < len(faces) <= MAX_FACES < 20_000
+    # The pad's centre is 5 cm along the link, whose capsule is fitted to it as well.
+    joints = {joint.name: joint for joint in proposal.hand.joints}
+    reach = np.linalg.norm(vertices - np.array(joints["left_middle"].anchor), axis=-1).max()
+    assert reach == pytest.approx(0.059, abs=1e-3)
+    assert not any("meshes were not found" in note for note in proposal.notes)
+    (tmp_path / "pad.stl").unlink()
+    assert any("1 meshes were not found" in note for note in import_hand(tmp_path / "claw.urdf").notes)
