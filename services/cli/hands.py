@@ -41,7 +41,7 @@ def sheet(
     hands: Annotated[tuple[str, ...], tyro.conf.Positional] = ("human", "allegro", "sharpa"),
     out: pathlib.Path = pathlib.Path("hands.png"),
 ) -> int:
-    """Draw hands open, half closed and closed, with their grasp frames; as their files drew them, where they did.
+    """Draw hands open, half closed and closed, with their grasp frames, as their files drew them where they did.
 
     Args:
       hands: Names of hands, or hand files.
@@ -71,9 +71,9 @@ def import_hand(
 ) -> int:
     """Make a hand of a URDF or MJCF file: what the file does not say is proposed, said and drawn.
 
-    The result is one JSON file, which every command takes as --hand, by its name or its path; what the file draws of the
-    hand is kept beside it. Look at the picture, and
-    correct the file where the proposal is wrong: poses, fingertips, gains and capsules are all in it.
+    The result is one JSON file, which every command takes as --hand, by its name or its path; what the file draws of
+    the hand is kept beside it. Look at the picture, and correct the file where the proposal is wrong: poses,
+    fingertips, gains, couplings and capsules are all in it.
 
     Examples: congrasp hands import hand.urdf; congrasp hands import hand.xml --name mine --palm palm_link
 
@@ -81,7 +81,8 @@ def import_hand(
       file: The hand's URDF (.urdf) or MJCF (.xml), a right or left hand of hinges.
       name: Its name; that of the file by default.
       palm: The body that is the palm; by default the one off which most fingers branch.
-      thumb: The last body of the finger that opposes the others; by default one called thumb, or the one that best faces the others.
+      thumb: The last body of the finger that opposes the others;
+        by default one called thumb, or the one that best faces the others.
       object_scale: Factor on the objects that it learns to grasp; by default from its opening, 1 for a human hand's.
       out: The file to write; by default NAME.json in the folder of your own hands ('congrasp hands list' names it).
       png: The picture; by default beside the file.
