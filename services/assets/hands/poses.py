@@ -67,7 +67,9 @@ def propose_poses(hand: Hand, notes: list[str]) -> Hand:
     closing = (np.abs(share) > _TOWARDS) & (speed > _STILL)
     ends = np.where(share > 0, upper, lower)
     far = _CLOSED if apart <= _APART else 1.0
-    closed = _closed(body, opened, np.where(closing, flat + far * (ends - flat), opened))
+    target = flat + far * (ends - flat)
+    target = np.where(np.sign(share) * (target - opened) > 0, target, ends)
+    closed = _closed(body, opened, np.where(closing, target, opened))
     names = [joint.name for joint in hand.joints if joint.name not in {x.joint for x in hand.couplings}]
 
     def pose(motors: np.ndarray) -> dict[str, float]:
