@@ -15,6 +15,7 @@ from actors.physics.engine import Physics, PhysicsState, ResetState, where_envir
 from actors.protocols import Frame, Protocol
 from actors.success import Success
 from common.config import ControlConfig, RewardWeights, TaskConfig
+from common.hands.motors import motor_positions
 from common.hands.spec import Hand
 from common.task import metrics
 from common.task.constraints import blocks
@@ -157,7 +158,7 @@ class GraspEnv:
 
         Args:
           state: the environments.
-          action: (B, F + 6) residual action.
+          action: (B, M + 6) residual action.
           settings: reward weights and control, may be traced; those of the task by default.
         """
         settings = settings or self.settings
@@ -168,14 +169,15 @@ class GraspEnv:
     def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, tuple[Array, ...]]:
         """Joint targets of an action, and what the engine's step takes (`Physics.step`)."""
         target, table = decode(self.scene_of(state), settings.control, action), self.table_present(state)
+        motors = motor_positions(self.hand, target.q_target)
         if settings.protocol is None:
-            return target, (jnp.concatenate([target.u_target, target.q_target], -1), table)
+            return target, (jnp.concatenate([target.u_target, motors], -1), table)
         start, time = state.reset_state, state.time
         frame = protocols.frame(settings.protocol, self.task, time + 0.5)
         table = table | settings.protocol.table
         u_target = protocols.carried_targets(target.u_target, self.hand, start.base_quaternion, frame)
         force = protocols.push(settings.protocol, self.task, time, start.object_index, start.mass_scale)
-        return target, (jnp.concatenate([u_target, target.q_target], -1), table, force)
+        return target, (jnp.concatenate([u_target, motors], -1), table, force)
 
     def advance(
         self, state: EnvState, target: Action, physics_state: PhysicsState, settings: Settings

@@ -45,7 +45,7 @@ class Grasp:
         stored = session.get_modelmeta().custom_metadata_map
         self.meta = meta = {name: json.loads(value) for name, value in stored.items()}
         self.task, self.control = meta["task"], meta["task"]["control"]
-        self.limits = np.array(meta["joint_limits"])
+        self.limits = np.array([motor["limits"] for motor in meta["motors"]])
         self.keypoint_links = np.array(meta["keypoint_links"])
         self.keypoint_offsets = np.array(meta["keypoints"]) - np.array(meta["link_origins"])[self.keypoint_links]
         self.tips = slice(len(meta["links"]), None)  # keypoints: the links' origins, then the tips, thumb first
@@ -73,7 +73,8 @@ class Grasp:
         self.finger_speeds = [model.joint(name).dofadr[0] for name in meta["joints"]]
         self.wrist = [model.joint(name).qposadr[0] for name in meta["wrist_joints"]]
         self.wrist_speeds = [model.joint(name).dofadr[0] for name in meta["wrist_joints"]]
-        self.ctrl = [model.actuator(name).id for name in (*meta["wrist_joints"], *meta["joints"])]
+        motors = [motor["name"] for motor in meta["motors"]]
+        self.ctrl = [model.actuator(name).id for name in (*meta["wrist_joints"], *motors)]
         self.free = model.joint("object").dofadr[0]
 
         # Points on the cylinder's surface, as many as the policy was trained with.
@@ -200,8 +201,17 @@ class Grasp:
         """Asks the policy, turns its action into joint targets, and steps the physics."""
         (action,) = self.session.run(["action"], {"observation": self.observe()[None]})
         scale = np.array([entry["scale"] for entry in self.meta["action"]])
-        fingers, wrist = np.split(scale * action[0], [len(self.fingers)])
-        self.q_target = np.clip(self.q_target + fingers, *self.limits.T)
+        motors = self.meta["motors"]
+        fingers, wrist = np.split(scale * action[0], [len(motors)])
+        before = dict(zip(self.meta["joints"], self.q_target, strict=True))
+        now = np.array([sum(c * before[joint] for joint, c in motor["pulls"].items()) for motor in motors])
+        now = np.clip(now + fingers, *self.limits.T)
+        targets = {
+            joint: place["ratio"] * position + place["rest"]
+            for motor, position in zip(motors, now, strict=True)
+            for joint, place in motor["moves"].items()
+        }
+        self.q_target = np.array([targets[joint] for joint in self.meta["joints"]])
 
         position, turn = self.guidance(self.seen()["center"])
         relative = self.base.T @ turn
@@ -215,7 +225,7 @@ class Grasp:
         ahead[3:] = (ahead[3:] + np.pi) % (2 * np.pi) - np.pi
         self.u_target = u + self.lead(ahead, wrist, self.data.qvel[self.wrist_speeds])
 
-        self.data.ctrl[self.ctrl] = np.concatenate([self.u_target, self.q_target])
+        self.data.ctrl[self.ctrl] = np.concatenate([self.u_target, now])
         if self.time == self.task["approach_steps"]:
             self.data.mocap_pos[self.model.body("table").mocapid[0]] = self.meta["scene"]["table_away"]
         mujoco.mj_step(self.model, self.data, self.task["substeps"])

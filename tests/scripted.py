@@ -9,6 +9,7 @@ from actors.bank import build_bank
 from actors.physics.native import NativePhysics
 from actors.rollout import Rollout, RolloutWorker, finished_episodes
 from common.config import TaskConfig
+from common.hands.motors import motor_positions
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.task.observation import layout
@@ -32,7 +33,7 @@ def close(hand: Hand, task: TaskConfig, firmness: float = 1.0):
         time = observation[:, sizes["state"] - 2]
         off = jnp.linalg.norm(observation[:, sizes["state"] + 6 : sizes["state"] + 9], axis=-1)
         closing = (off < NEAR) | (time > 0.35) | (jnp.max(jnp.abs(q - jnp.array(hand.q_open)), -1) > 0.3)
-        wanted = jnp.clip((goal - (q + ahead)) / task.control.finger_scale, -STEP, STEP)
+        wanted = jnp.clip(motor_positions(hand, goal - (q + ahead)) / task.control.finger_scale, -STEP, STEP)
         action = jnp.concatenate([jnp.where(closing[:, None], wanted, 0.0), jnp.zeros((len(q), 6))], -1)
         return action, jnp.zeros(len(q))
 

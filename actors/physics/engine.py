@@ -76,7 +76,7 @@ class Physics(Protocol):
 
         Args:
           state: the environments.
-          target: (B, 6 + F) joint targets, wrist first.
+          target: (B, 6 + M) targets of the wrist's joints and of the fingers' motors.
           table: (B,) bool, where the table stands.
           force: (B, 3) on the object's centre of mass throughout the step, world frame, N; none by default.
         """

@@ -15,6 +15,7 @@ import dacite
 import numpy as np
 
 from common.errors import CongraspError
+from common.hands.motors import motor_limits
 from common.hands.spec import Hand, chain_of
 from common.inputs import LONGEST_NAME, read_file
 
@@ -22,8 +23,9 @@ FORMAT = 1
 MAX_BYTES = 1 << 20
 """Bytes that a hand file may have."""
 _LINKS, _JOINTS, _CAPSULES = 64, 64, 16  # most of a hand, of a hand, of a link
-_LARGEST = 1e4  # of any number
+_LARGEST = 1e5  # of any number
 _REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-hand.md."
+_ROUNDING = 1e-5  # rad, of single precision
 _TAKEN = {"hand_base", "table", "anchor", "object", "hold", "world"}
 _WRIST = {"wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz"}
 
@@ -111,12 +113,17 @@ def faults(hand: Hand) -> list[str]:
             found.append(f"the limits {joint.lower:g} and {joint.upper:g} of '{joint.name}' are in the wrong order")
         if abs(float(np.linalg.norm(joint.axis)) - 1) > 1e-3:
             found.append(f"the axis of '{joint.name}' is not a unit vector")
-        if min(joint.kp, joint.torque_limit) <= 0 or min(joint.kv, joint.damping, joint.armature) < 0:
-            found.append(f"gains and torque limit of '{joint.name}' must be above zero")
-    for pose, q in (("open", hand.open_pose), ("closed", hand.closed_pose)):
-        found += [f"the {pose} pose names '{name}', which is no joint" for name in sorted({*q} - {*joints})]
-        for joint in hand.joints:
-            if not joint.lower - 1e-6 <= q.get(joint.name, 0.0) <= joint.upper + 1e-6:
+        if min(joint.damping, joint.armature) < 0:
+            found.append(f"damping and armature of '{joint.name}' must be at least zero")
+    if found := found or _coupling_faults(hand):
+        return found
+    for motor in hand.motors:
+        if min(motor.kp, motor.torque_limit) <= 0 or motor.kv < 0:
+            found.append(f"gains and torque limit of '{motor.name}' must be above zero")
+    for pose, named, q in (("open", hand.open_pose, hand.q_open), ("closed", hand.closed_pose, hand.q_closed)):
+        found += [f"the {pose} pose names '{name}', which is no joint" for name in sorted({*named} - {*joints})]
+        for joint, angle in zip(hand.joints, q, strict=True):
+            if not joint.lower - _ROUNDING <= angle <= joint.upper + _ROUNDING:
                 found.append(f"'{joint.name}' is outside of its limits in the {pose} pose")
     tips = [link.name for link in hand.links if link.tip is not None]
     if hand.thumb not in tips or len(tips) < 2:
@@ -125,6 +132,35 @@ def faults(hand: Hand) -> list[str]:
         found.append("two fingertips are on the same finger")
     if not hand.object_scale > 0:
         found.append("the object scale must be above zero")
+    return found
+
+
+def _coupling_faults(hand: Hand) -> list[str]:
+    """What is wrong with couplings and tendons."""
+    joints = [joint.name for joint in hand.joints]
+    followers = [coupling.joint for coupling in hand.couplings]
+    pulled = [name for tendon in hand.tendons for name in tendon.joints]
+    found = []
+    for x in hand.couplings:
+        if x.joint not in joints or x.leader not in joints or x.leader in followers or followers.count(x.joint) > 1:
+            found.append(f"'{x.joint}' cannot follow '{x.leader}': one is no joint, or follows another")
+        if not x.ratio:
+            found.append(f"'{x.joint}' follows '{x.leader}' with the ratio zero")
+    for tendon in hand.tendons:
+        odd = [name for name in tendon.joints if name not in joints or name in followers or pulled.count(name) > 1]
+        if odd:
+            found.append(f"the tendon '{tendon.name}' pulls '{odd[0]}', which is no joint, follows another, or has two")
+        if len(tendon.joints) < 2 or not all(tendon.joints.values()):
+            found.append(f"the tendon '{tendon.name}' needs two joints at least, and coefficients that are not zero")
+        if tendon.name in joints or [x.name for x in hand.tendons].count(tendon.name) > 1 or not tendon.name:
+            found.append(f"the name '{tendon.name}' of a tendon is taken, or empty")
+    if not found:
+        lower, upper = motor_limits(hand)
+        found += [
+            f"the limits of the joints that '{motor.name}' moves leave it no way"
+            for motor, low, high in zip(hand.motors, lower, upper, strict=True)
+            if not low < high
+        ]
     return found
 
 

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 
+from common.hands.motors import transmission
 from common.hands.spec import Hand, Link, chain_of
 
 HUMAN_OPENING = 0.106
@@ -26,7 +27,8 @@ def fitting_scale(opening: float) -> float:
 def tip_forces(hand: Hand) -> np.ndarray:
     """(G,) the forces in N with which the fingertips can press, thumb first, with the fingers straight.
 
-    Of a finger it is the least over its joints of torque limit / distance of the joint's axis from the tip: what the
+    Of a finger it is the least over its motors of torque limit / |dx/dm|, the tip's way for a radian of the motor with
+    all of the joints that it moves: where it moves one, the distance of the joint's axis from the tip. That is what the
     tip bears whichever way it presses.
     """
     return np.array([_force(hand, hand.links[i]) for i in hand.tip_links])
@@ -34,9 +36,13 @@ def tip_forces(hand: Hand) -> np.ndarray:
 
 def _force(hand: Hand, link: Link) -> float:
     """The force of the finger that ends with this link."""
-    links = {other.name: other for other in hand.links}
-    joints = [joint for name in chain_of(hand, link.name) for joint in links[name].joints]
     assert link.tip is not None
-    ways = [np.subtract(link.tip, joint.anchor) for joint in joints]
-    levers = [float(np.linalg.norm(np.cross(joint.axis, way))) for joint, way in zip(joints, ways, strict=True)]
-    return min(joint.torque_limit / max(lever, 1e-6) for joint, lever in zip(joints, levers, strict=True))
+    own, finger = transmission(hand), chain_of(hand, link.name)
+    moved = [joint for other in hand.links for joint in other.joints if other.name in finger]
+    index = {joint.name: j for j, joint in enumerate(hand.joints)}
+    ways: dict[int, np.ndarray] = {}
+    for joint in moved:
+        j = index[joint.name]
+        way = own.ratio[j] * np.cross(joint.axis, np.subtract(link.tip, joint.anchor))
+        ways[int(own.motor[j])] = ways.get(int(own.motor[j]), np.zeros(3)) + way
+    return min(hand.motors[m].torque_limit / max(float(np.linalg.norm(way)), 1e-6) for m, way in ways.items())

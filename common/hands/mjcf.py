@@ -9,6 +9,7 @@ from common.hands.spec import Hand, Link, link_origin
 
 HAND_CONTYPE = 1
 """Collision bit of the hand: whatever collides with it has this bit in its conaffinity."""
+_COUPLING_TIME = 0.005  # s, within which a joint is again where its leader puts it
 WRIST_JOINTS = ("wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz")
 
 
@@ -47,8 +48,8 @@ def add_hand(
                 damping=joint.damping,
                 armature=joint.armature,
             )
-            _add_position_actuator(spec, joint.name, joint.kp, joint.kv, joint.torque_limit)
         _add_capsules(body, link, origin, self_collision, contact_time)
+    _add_transmission(spec, hand)
     if self_collision:
         for first, second in overlapping(hand):
             spec.add_exclude(bodyname1=first, bodyname2=second)
@@ -96,18 +97,44 @@ def _add_wrist(spec: mujoco.MjSpec, body: mujoco.MjsBody, hand: Hand) -> None:
         _add_position_actuator(
             spec,
             name,
+            mujoco.mjtTrn.mjTRN_JOINT,
             gains.slide_kp if slide else gains.hinge_kp,
             gains.slide_kv if slide else gains.hinge_kv,
             gains.slide_limit if slide else gains.hinge_limit,
         )
 
 
-def _add_position_actuator(spec: mujoco.MjSpec, joint: str, kp: float, kv: float, limit: float) -> None:
-    """Adds a position servo of a joint, which stops at `limit`."""
+def _add_transmission(spec: mujoco.MjSpec, hand: Hand) -> None:
+    """Adds the motors, tendons for those that pull several joints, and what couples joints to others."""
+    for motor in hand.motors:
+        alone = motor.joints == {motor.name: 1.0}
+        if not alone:
+            tendon = spec.add_tendon(name=motor.name)
+            for joint, coefficient in motor.joints.items():
+                tendon.wrap_joint(joint, coefficient)
+        kind = mujoco.mjtTrn.mjTRN_JOINT if alone else mujoco.mjtTrn.mjTRN_TENDON
+        _add_position_actuator(spec, motor.name, kind, motor.kp, motor.kv, motor.torque_limit)
+    for coupling in hand.couplings:
+        spec.add_equality(
+            name=coupling.joint,
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            name1=coupling.joint,
+            name2=coupling.leader,
+            data=[coupling.offset, coupling.ratio, *[0.0] * 10],
+            solref=(_COUPLING_TIME, 1.0),
+            solimp=(0.99, 0.99, 0.001, 0.5, 2.0),
+        )
+
+
+def _add_position_actuator(
+    spec: mujoco.MjSpec, name: str, kind: mujoco.mjtTrn, kp: float, kv: float, limit: float
+) -> None:
+    """Adds a position servo of the joint or tendon of its name, which stops at `limit`."""
     actuator = spec.add_actuator(
-        name=joint,
-        target=joint,
-        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        name=name,
+        target=name,
+        trntype=kind,
         forcerange=(-limit, limit),
         forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
     )

@@ -23,8 +23,38 @@ def vector(array: np.ndarray) -> Vector:
 
 
 @dataclasses.dataclass(frozen=True)
+class Coupling:
+    """A joint without a motor that follows another, whatever pushes it: q = offset + ratio * q of the leader."""
+
+    joint: str
+    leader: str
+    """Name of a joint that has a motor, or is pulled by a tendon."""
+    ratio: float
+    offset: float = 0.0
+    """rad."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Motor:
+    """A position servo that pulls joints: at sum(c q), it turns each by c times its own torque.
+
+    Gains are in N.m/rad, N.m.s/rad and N.m of the motor.
+    """
+
+    name: str
+    joints: dict[str, float]
+    """Coefficients c by the names of the joints."""
+    kp: float
+    kv: float
+    torque_limit: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Joint:
-    """A hinge. `axis` and `anchor` in the wrist frame at zero; gains in N.m/rad, N.m.s/rad and N.m."""
+    """A hinge. `axis` and `anchor` in the wrist frame at zero; gains in N.m/rad, N.m.s/rad and N.m.
+
+    The gains are those of its own motor; a joint that follows another or is pulled by a tendon has none, and zeros.
+    """
 
     name: str
     axis: Vector
@@ -78,7 +108,7 @@ class WristGains:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hand:
-    """A dexterous hand with `F` finger joints, `L` links and `P` keypoints (link origins, then fingertips).
+    """A dexterous hand with `F` finger joints, `M` motors, `L` links and `P` keypoints (link origins, then fingertips).
 
     Hands are compared by identity, so that they can be static arguments of compiled functions.
     """
@@ -94,6 +124,10 @@ class Hand:
     wrist: WristGains
     object_scale: float = 1.0
     """Factor on object sizes in the paper's comparison of hands."""
+    couplings: tuple[Coupling, ...] = ()
+    """Joints that follow others, in the place of a motor."""
+    tendons: tuple[Motor, ...] = ()
+    """Motors that pull several joints each; every other joint that follows none has one of its own."""
     text: str = ""
     """The hand's file, for hands that are not part of the package."""
 
@@ -106,6 +140,17 @@ class Hand:
     def joints(self) -> tuple[Joint, ...]:
         """Finger joints in the order of `q`."""
         return tuple(joint for link in self.links for joint in link.joints)
+
+    @functools.cached_property
+    def motors(self) -> tuple[Motor, ...]:
+        """The M motors in the order of the first joints that they pull; see `common.hands.motors`."""
+        tendons = {next(joint.name for joint in self.joints if joint.name in x.joints): x for x in self.tendons}
+        driven = {name for tendon in self.tendons for name in tendon.joints} | {x.joint for x in self.couplings}
+        return tuple(
+            tendons.get(j.name) or Motor(j.name, {j.name: 1.0}, j.kp, j.kv, j.torque_limit)
+            for j in self.joints
+            if j.name in tendons or j.name not in driven
+        )
 
     @functools.cached_property
     def lower(self) -> np.ndarray:
@@ -200,8 +245,10 @@ class Hand:
         return np.array([mass + self.wrist.slide_armature, mass * _GYRATION**2 + self.wrist.hinge_armature])
 
     def _pose(self, angles: dict[str, float]) -> np.ndarray:
-        """(F,) angles in the order of the joints."""
-        return np.array([angles.get(joint.name, 0.0) for joint in self.joints], np.float32)
+        """(F,) angles in the order of the joints; those that follow others are where these put them."""
+
+        follow = {x.joint: x.offset + x.ratio * angles.get(x.leader, 0.0) for x in self.couplings}
+        return np.array([(angles | follow).get(joint.name, 0.0) for joint in self.joints], np.float32)
 
 
 def link_origin(link: Link) -> Vector:

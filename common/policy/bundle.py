@@ -74,7 +74,7 @@ class PolicySpec:
 def policy_spec(task: TaskConfig, sizes: NetworkConfig) -> PolicySpec:
     """The spec of a task's policy."""
     hand = get_hand(task.hand)
-    return PolicySpec(hand.reference, task_observation.layout(hand, task), len(hand.joints) + 6, sizes)
+    return PolicySpec(hand.reference, task_observation.layout(hand, task), len(hand.motors) + 6, sizes)
 
 
 class InferenceParameters(NamedTuple):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from common.config import ControlConfig
+from common.hands.motors import joint_positions, motor_limits, motor_positions
 from common.task.constraints import known
 from common.task.constraints.base import Scene
 from common.task.geometry import wrist_to_joints
@@ -41,17 +42,17 @@ def guidance_pose(scene: Scene, control: ControlConfig) -> tuple[Array, Array]:
 
 
 def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
-    """Joint targets of a residual action (B, F + 6).
+    """Joint targets of a residual action (B, M + 6), of the M finger motors and the wrist.
 
-    q_tgt = clamp(q_tgt_prev + alpha_f a_f, limits); u_tgt = u_g + alpha_w a_w, nearer to the wrist where it would else
-    become faster or be accelerated harder than the limits allow (`_lead`).
+    m_tgt = clamp(m_tgt_prev + alpha_f a_f, limits) of the motors, which put joints at q_tgt; u_tgt = u_g + alpha_w a_w,
+    nearer to the wrist where it would else become faster or be accelerated harder than the limits allow (`_lead`).
     """
     hand, state = scene.hand, scene.state
-    fingers = len(hand.joints)
-    q_target = state.q_target + control.finger_scale * action[..., :fingers]
+    fingers = len(hand.motors)
+    motors = motor_positions(hand, state.q_target) + control.finger_scale * action[..., :fingers]
     if control.finger_guidance:
-        q_target += _finger_guidance(scene, control.finger_guidance)
-    q_target = jnp.clip(q_target, jnp.array(hand.lower), jnp.array(hand.upper))
+        motors += _finger_guidance(scene, control.finger_guidance)
+    q_target = joint_positions(hand, jnp.clip(motors, *motor_limits(hand)))
     ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
     gains, (mass, inertia) = hand.wrist, hand.wrist_inertia
     slides = _lead(
@@ -89,9 +90,10 @@ def _lead(ahead: Array, residual: Array, steady: Array, farthest: Array | float,
 
 
 def _finger_guidance(scene: Scene, rate: float) -> Array:
-    """(B, F) rad by which finger targets go on to the closed hand, at most `rate`, once half the approach is over."""
+    """(B, M) rad by which motors go on to the closed hand, at most `rate`, once half the approach is over."""
     begun = 2.0 * scene.state.time >= scene.task.approach_steps
-    return begun[:, None] * jnp.clip(jnp.array(scene.hand.q_closed) - scene.state.q_target, -rate, rate)
+    ahead = motor_positions(scene.hand, jnp.array(scene.hand.q_closed) - scene.state.q_target)
+    return begun[:, None] * jnp.clip(ahead, -rate, rate)
 
 
 def _limit(vector: Array, length: Array | float) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from common import rotations
 from common.hands import kinematics
 from common.hands.mjcf import overlapping
+from common.hands.motors import motor_positions
 from common.hands.spec import Hand
 from common.objects.distance import DistanceField
 from common.task.constraints.base import Scene
@@ -47,7 +48,7 @@ class Sample(NamedTuple):
     link_force: Array
     """(B, L) net contact force of the object on each link, N."""
     torque_share: Array
-    """(B, F) finger torques as shares of their limits."""
+    """(B, M) torques of the fingers' motors as shares of their limits."""
     object_position: Array
     """(B, 3) of the object, wrist frame, m."""
     object_quaternion: Array
@@ -147,9 +148,11 @@ def hand_object(
 
 
 def torque_share(scene: Scene) -> Array:
-    """(B, F) |clip(kp (q_target - q) - kv q_velocity, limit)| / limit: finger torques by the hand's position servos."""
-    gains = np.array([(joint.kp, joint.kv, joint.torque_limit) for joint in scene.hand.joints], np.float32)
-    torque = gains[:, 0] * (scene.state.q_target - scene.state.q) - gains[:, 1] * scene.state.q_velocity
+    """(B, M) |clip(kp (m_target - m) - kv m_velocity, limit)| / limit: torques of the fingers' motors at m."""
+    hand, state = scene.hand, scene.state
+    gains = np.array([(motor.kp, motor.kv, motor.torque_limit) for motor in hand.motors], np.float32)
+    ahead, speed = (motor_positions(hand, x) for x in (state.q_target - state.q, state.q_velocity))
+    torque = gains[:, 0] * ahead - gains[:, 1] * speed
     return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)
 
 

@@ -21,6 +21,8 @@ from actors.physics.native import NativePhysics
 from actors.rollout import RolloutWorker
 from common.engines import ENGINES, PhysicsName
 from common.hands import get_hand
+from common.hands.motors import motor_positions
+from common.hands.spec import Hand
 from common.objects.pool import load_pool, scale_objects
 from common.policy.bundle import PolicyBundle, sample_action
 from services.train.command import untrained
@@ -155,7 +157,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
                 physics.commands.clear()
                 bare = functools.partial(replay, twin, physics.commands, config.task.substeps)
             else:
-                bare = _compiled_loop(worker)
+                bare = _compiled_loop(worker, hand)
             actor_seconds.append(_timed(functools.partial(_collect, worker, policy)))
             if isinstance(physics, Recorder) and twin is not None:
                 peer_seconds.append(_timed(rolled(twin, physics.commands, config.task.substeps)))
@@ -192,7 +194,7 @@ def _collect(worker: RolloutWorker, policy: PolicyBundle) -> None:
 
 
 @functools.lru_cache(maxsize=1)
-def _compiled_loop(worker: RolloutWorker) -> Callable[[], object]:
+def _compiled_loop(worker: RolloutWorker, hand: Hand) -> Callable[[], object]:
     """Control steps with nothing but the engine, compiled."""
     physics = worker.physics
 
@@ -205,7 +207,7 @@ def _compiled_loop(worker: RolloutWorker) -> Callable[[], object]:
     compiled = jax.jit(loop)
     state = worker.state
     assert state is not None
-    target = jax.numpy.concatenate([state.u_target, state.q_target], -1)
+    target = jax.numpy.concatenate([state.u_target, motor_positions(hand, state.q_target)], -1)
     table = jax.numpy.ones(len(target), bool)
 
     def run() -> object:

@@ -12,6 +12,7 @@ from rich.table import Table
 from actors.physics.scene import TABLE_AWAY, addresses, compile_scene
 from common.config import TaskConfig
 from common.hands import get_hand
+from common.hands.motors import motor_positions
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject, Piece
 from services.assets.objects.fidelity import fidelity
@@ -82,7 +83,7 @@ def _closed_around(hand: Hand, task: TaskConfig, obj: GraspObject) -> tuple[mujo
     data.mocap_pos[where.anchor_mocap] = middle
     data.mocap_quat[where.anchor_mocap] = (1.0, 0.0, 0.0, 0.0)
     data.eq_active[where.weld] = 1
-    data.ctrl[:6], data.ctrl[6:] = 0.0, hand.q_closed
+    data.ctrl[:6], data.ctrl[6:] = 0.0, motor_positions(hand, hand.q_closed)
     mujoco.mj_step(model, data, _CLOSING * task.substeps)
     return model, data
 

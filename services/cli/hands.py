@@ -32,7 +32,7 @@ def list_hands() -> int:
             str(len(hand.joints)),
             str(len(hand.tip_links)),
             f"{sum(link.mass for link in hand.links):.2f} kg",
-            f"{max(joint.torque_limit for joint in hand.joints):.1f} N.m",
+            f"{max(motor.torque_limit for motor in hand.motors):.1f} N.m",
             f"x {hand.object_scale:g}",
             "none" if (file := pretrained_file(name)) is None else "own" if file.parent == folder else "pretrained",
         )
@@ -46,17 +46,22 @@ def sheet(
     hands: Annotated[tuple[str, ...], tyro.conf.Positional] = ("human", "allegro", "sharpa"),
     out: pathlib.Path = pathlib.Path("hands.png"),
 ) -> int:
-    """Draw hands open, half closed and closed, with their grasp frames, and every joint from limit to limit.
+    """Draw hands open, half closed and closed, with their grasp frames, as their files drew them where they did.
 
     Args:
       hands: Names of hands, or hand files.
       out: The PNG file to write; with several hands, one beside another.
     """
-    from common.hands import get_hand
+    from common.hands import get_hand, own_hands
+    from services.assets.hands.visual import load_meshes, skin_of_meshes
     from services.viz.hand_sheets import hands_sheet
     from services.viz.sheets import save_png
 
-    save_png(out, hands_sheet([get_hand(name) for name in hands]))
+    found = [get_hand(name) for name in hands]
+    files = [own_hands().get(name, pathlib.Path(name)) for name in hands]
+    meshes = [load_meshes(file, hand) if hand.text else {} for file, hand in zip(files, found, strict=True)]
+    skins = [skin_of_meshes(hand, own) if own else None for hand, own in zip(found, meshes, strict=True)]
+    save_png(out, hands_sheet(found, skins))
     print(out)
     return 0
 
@@ -72,16 +77,18 @@ def import_hand(
 ) -> int:
     """Make a hand of a URDF or MJCF file: what the file does not say is proposed, said and drawn.
 
-    The result is one JSON file, which every command takes as --hand, by its name or its path. Look at the picture, and
-    correct the file where the proposal is wrong: poses, fingertips, gains and capsules are all in it.
+    The result is one JSON file, which every command takes as --hand, by its name or its path; what the file draws of
+    the hand is kept beside it. Look at the picture, and correct the file where the proposal is wrong: poses,
+    fingertips, gains, couplings and capsules are all in it.
 
     Examples: congrasp hands import hand.urdf; congrasp hands import hand.xml --name mine --palm palm_link
 
     Args:
       file: The hand's URDF (.urdf) or MJCF (.xml), a right or left hand of hinges.
       name: Its name; that of the file by default.
-      palm: The body that is the palm; by default the first off which fingers branch.
-      thumb: The last body of the finger that opposes the others; by default one called thumb, or the most remote.
+      palm: The body that is the palm; by default the one off which most fingers branch.
+      thumb: The last body of the finger that opposes the others;
+        by default one called thumb, or the one that best faces the others.
       object_scale: Factor on the objects that it learns to grasp; by default from its opening, 1 for a human hand's.
       out: The file to write; by default NAME.json in the folder of your own hands ('congrasp hands list' names it).
       png: The picture; by default beside the file.
@@ -107,6 +114,7 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     from common.hands import HANDS, SUFFIX, get_hand, hands_folder
     from common.hands.files import hand_text
     from services.assets.hands.model_files import describe
+    from services.assets.hands.visual import save_meshes
     from services.viz.hand_sheets import joints_sheet
     from services.viz.sheets import save_png
 
@@ -116,6 +124,7 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     path = out or hands_folder() / f"{hand.name}{SUFFIX}"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, hand_text(hand).encode())
+    save_meshes(path, proposal.meshes)
     get_hand.cache_clear()
     picture = png or path.with_suffix(".png")
     save_png(picture, joints_sheet(hand))

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.hands.kinematics import grasp_frame
+from common.hands.motors import coupled
 from common.hands.spec import Hand
 from common.task.bank import ConstraintBank
 
@@ -53,7 +54,7 @@ def with_noise(hand: Hand, bank: ConstraintBank, noise: Noise, seed: int) -> Con
     if noise.kind == "joints":
         q = np.asarray(bank.pose_q)
         noisy = np.clip(q + rng.normal(0.0, noise.level, q.shape), hand.lower, hand.upper)
-        return bank._replace(pose_q=noisy.astype(np.float32))
+        return bank._replace(pose_q=coupled(hand, noisy).astype(np.float32))
     if noise.kind == "depth":
         position, quaternion = np.asarray(bank.pose_position), np.asarray(bank.pose_quaternion)
         turn = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)

@@ -18,6 +18,7 @@ from common.files import write_atomically
 from common.hands import get_hand
 from common.hands.kinematics import grasp_frame
 from common.hands.mjcf import WRIST_JOINTS
+from common.hands.motors import transmission
 from common.hands.spec import Hand, link_origin
 from common.objects.mjcf import CONTACT
 from common.policy.bundle import PolicyBundle, content_hash, mean_action
@@ -53,6 +54,7 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
         "joints": joints,
         "joint_limits": [[joint.lower, joint.upper] for joint in hand.joints],
         "open_pose": hand.q_open.tolist(),
+        "motors": motors(hand),
         "wrist_joints": list(WRIST_JOINTS),
         "wrist": wrist_servos(hand),
         "links": [link.name for link in hand.links],
@@ -99,12 +101,34 @@ def wrist_servos(hand: Hand) -> dict[str, dict[str, Any]]:
     }
 
 
+def motors(hand: Hand) -> list[dict[str, Any]]:
+    """The fingers' motors in the order of their actions: what each pulls and how far, and where it puts joints.
+
+    A motor's position is the sum of `pulls` times its joints' angles; a joint's target is `ratio` times that of its
+    motor, and `rest`. Most hands have a motor for each joint, with ones and zeros.
+    """
+    own = transmission(hand)
+    return [
+        {
+            "name": motor.name,
+            "pulls": motor.joints,
+            "limits": own.limits[:, m].tolist(),
+            "moves": {
+                joint.name: {"ratio": float(own.ratio[j]), "rest": float(own.rest[j])}
+                for j, joint in enumerate(hand.joints)
+                if own.motor[j] == m
+            },
+        }
+        for m, motor in enumerate(hand.motors)
+    ]
+
+
 def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
-    """The action's numbers in order: which joint they move, the scale, and how a target comes of them."""
+    """The action's numbers in order: the motor or wrist joint, the scale, and how a target comes of them."""
     control = bundle.task.control
     fingers = [
-        {"joint": joint.name, "scale": control.finger_scale, "target": "clip(previous target + scale * action, limits)"}
-        for joint in get_hand(bundle.spec.hand).joints
+        {"joint": motor.name, "scale": control.finger_scale, "target": "clip(previous target + scale * action, limits)"}
+        for motor in get_hand(bundle.spec.hand).motors
     ]
     wrist = [
         {

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from common.errors import CongraspError
+from common.hands.motors import coupled
 from common.hands.spec import Hand
 from common.inputs import read_json
 from common.objects.spec import GraspObject
@@ -215,7 +216,7 @@ def _pose(written: Written) -> dict[str, np.ndarray] | None:
     if np.abs(q).max() > 2 * np.pi:
         raise CongraspError(f"--pose: a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians.")
     turn = _unit(_floats(given["quaternion"], (4,), f"--pose: 'quaternion' of {path}"), "--pose: the quaternion")
-    return _reference(np.clip(q, hand.lower, hand.upper), position, turn)
+    return _reference(coupled(hand, np.clip(q, hand.lower, hand.upper)), position, turn)
 
 
 def _reference(q: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> dict[str, np.ndarray]:

@@ -133,7 +133,7 @@ class _Packer:
 
     def unpack(self, reply: Message) -> list[np.ndarray]:
         """Action, finger targets and wrist targets, of each state."""
-        return np.split(reply.arrays["packed"], [self._fingers + 6, 2 * self._fingers + 6], 1)
+        return np.split(reply.arrays["packed"], [-self._fingers - 6, -6], 1)
 
     def _write(self, vector: np.ndarray, name: str, value: np.ndarray) -> None:
         """Puts a field's numbers into their place in a vector."""

@@ -73,7 +73,7 @@ class PolicyFunction:
         if request.meta.get("layout"):
             meta |= {"layout": self.layout.digest, "states": STATES_LIMIT, **self.layout.description()}
         fingers = len(self.layout.hand.joints)
-        parts = np.split(answer.vectors[0], [fingers + 6, 2 * fingers + 6])
+        parts = np.split(answer.vectors[0], [-fingers - 6, -6])
         return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
 
     def _infer(self, weights: InferenceParameters, vectors: jax.Array) -> jax.Array:
@@ -92,7 +92,7 @@ class PolicyFunction:
 
     def _answer(self, query: Query, found: np.ndarray) -> Inference | Exception:
         """What was found for one query, or its own error."""
-        size = 2 * len(self.layout.hand.joints) + 12
+        size = len(self.layout.hand.motors) + len(self.layout.hand.joints) + 12
         vectors, redirected, aligned, checks = found[:, :size], found[:, size], found[:, size + 1], found[:, size + 2 :]
         if error := self.layout.find_error(query, checks):
             return error

@@ -19,7 +19,7 @@ class Answer(NamedTuple):
     u_target: np.ndarray
     """(6,) virtual wrist targets relative to the base: x, y, z in m, then intrinsic x-y-z angles in rad."""
     action: np.ndarray
-    """(F + 6,) the policy's raw action."""
+    """(M + 6,) the policy's raw action."""
     version: int
     """Version of the policy that answered."""
     active: tuple[str, ...]

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.hands.spec import Hand
-from services.record.palette import OBJECT, SKIN, WAYPOINT
+from services.record.palette import OBJECT, WAYPOINT
 from services.viz.hand_sheets import joints_sheet
 from services.viz.raster import render_scene
 from services.viz.scene import Shape
@@ -37,7 +37,6 @@ def check_sheet(hand: Hand, grips: "Sequence[Grip]", *, size: tuple[int, int] = 
 def _grip(hand: Hand, grip: "Grip") -> list[Shape]:
     """The hand upright, and at last the object."""
     turn = upright(hand)
-    colours = [WAYPOINT if touching else SKIN for touching in grip.touching]
     placed = turn * Rotation.from_quat(grip.object_quaternion, scalar_first=True)
     obj = Shape(
         "mesh",
@@ -48,4 +47,4 @@ def _grip(hand: Hand, grip: "Grip") -> list[Shape]:
         vertices=grip.obj.visual_vertices,
         faces=grip.obj.visual_faces,
     )
-    return [*posed_hand(hand, grip.q, np.zeros(3), turn, colours), obj]
+    return [posed_hand(hand, grip.q, np.zeros(3), turn, WAYPOINT, grip.touching), obj]

@@ -1,10 +1,13 @@
 """Contact sheets of hands: their poses with the grasp frame, and what every joint does."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
 from common.hands.kinematics import grasp_frame
+from common.hands.motors import joint_positions, motor_limits, motor_positions, transmission
+from common.hands.skin import Skin
 from common.hands.spec import Hand, link_origin
 from services.record.palette import HEADING, OBJECT, WAYPOINT
 from services.viz.raster import render_scene
@@ -15,16 +18,16 @@ from services.viz.sheets import contact_sheet
 _VIEW = np.array([0.75, 0.65, 0.35])
 
 
-def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = ()) -> list[Shape]:
+def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = (), skin: Skin | None = None) -> list[Shape]:
     """The hand upright with finger angles (F,), some of its links in another colour."""
     shares = np.isin(np.arange(len(hand.links)), moved)
-    return [posed_hand(hand, q, np.zeros(3), upright(hand), OBJECT, shares)]
+    return [posed_hand(hand, q, np.zeros(3), upright(hand), OBJECT, shares, skin=skin)]
 
 
-def _poses(hand: Hand) -> dict[str, list[Shape]]:
+def _poses(hand: Hand, skin: Skin | None = None) -> dict[str, list[Shape]]:
     """The hand upright in three poses."""
     poses = {"open": hand.q_open, "half closed": (hand.q_open + hand.q_closed) / 2, "closed": hand.q_closed}
-    return {name: _placed(hand, q) for name, q in poses.items()}
+    return {name: _placed(hand, q, skin=skin) for name, q in poses.items()}
 
 
 def _frame(hand: Hand) -> list[Shape]:
@@ -65,11 +68,16 @@ def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
     return contact_sheet(images, labels, columns=len(placed), title=title)
 
 
-def hands_sheet(hands: Sequence[Hand], *, size: tuple[int, int] = (300, 300)) -> np.ndarray:
-    """A row for each hand: open with its grasp frame, half closed, closed; all on one scale."""
+def hands_sheet(
+    hands: Sequence[Hand], skins: Sequence[Skin | None] = (), *, size: tuple[int, int] = (300, 300)
+) -> np.ndarray:
+    """A row for each hand: open with its grasp frame, half closed, closed; all on one scale.
+
+    `skins` are the hands' surfaces, where they are not to be their own (`common.hands.skin.skin_of`).
+    """
     images, labels = [], []
-    for hand in hands:
-        rows = _poses(hand)
+    for hand, skin in itertools.zip_longest(hands, skins):
+        rows = _poses(hand, skin)
         rows["open"] += _frame(hand)
         camera = fit(np.concatenate([_points(shapes) for shapes in rows.values()]), _side(hand), size[0] / size[1])
         images += [render_scene(shapes, camera, size) for shapes in rows.values()]
@@ -79,24 +87,25 @@ def hands_sheet(hands: Sequence[Hand], *, size: tuple[int, int] = (300, 300)) ->
 
 
 def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarray:
-    """The hand's three poses, and every joint at both of its limits, with the links that it moves in colour."""
+    """The hand's three poses, and every motor at both of its limits, with the links that it moves in colour."""
     rows = {**_poses(hand), "all at zero": _placed(hand, np.clip(0.0, hand.lower, hand.upper))}
     rows["open"] += _frame(hand)
     names = [link.name for link in hand.links]
     parents = [names.index(link.parent) if link.parent else -1 for link in hand.links]
-    carrier = [i for i, link in enumerate(hand.links) for _ in link.joints]
-    for j, joint in enumerate(hand.joints):
-        moved = {carrier[j]}
+    carrier = np.array([i for i, link in enumerate(hand.links) for _ in link.joints])
+    for m, motor in enumerate(hand.motors):
+        moved = {int(i) for i in carrier[transmission(hand).motor == m]}
         for i, parent in enumerate(parents):
             if parent in moved:
                 moved.add(i)
-        for angle in (joint.lower, joint.upper):
-            q = hand.q_open.copy()
-            q[j] = angle
-            rows[f"{joint.name} {angle:.2f}"] = _placed(hand, q, sorted(moved))
+        for position in motor_limits(hand)[:, m]:
+            motors = motor_positions(hand, hand.q_open).copy()
+            motors[m] = position
+            rows[f"{motor.name} {position:.2f}"] = _placed(hand, joint_positions(hand, motors), sorted(moved))
     points = np.concatenate([_points(shapes) for shapes in rows.values()])
     camera = fit(points, _side(hand), size[0] / size[1])
     images = [render_scene(shapes, camera, size) for shapes in rows.values()]
     reach = max(float(np.linalg.norm(link_origin(link))) for link in hand.links)
-    title = f"{hand.name}: {len(hand.joints)} joints, {len(hand.links)} links, {100 * reach:.0f} cm to the last joint"
+    parts = f"{len(hand.joints)} joints, {len(hand.motors)} motors, {len(hand.links)} links"
+    title = f"{hand.name}: {parts}, {100 * reach:.0f} cm to the last joint"
     return contact_sheet(images, list(rows), columns=8, title=title)

@@ -18,6 +18,7 @@ _TABLE_RADIUS, _TABLE_HALF_HEIGHT = 0.28, 0.008  # m
 FIELD_OF_VIEW = 26.0
 """Degrees, of cameras that `fit` makes."""
 _SPACE = 1.06  # free space at the picture's edges
+_STILL = 1e-3  # m of a curl that tells no direction
 
 
 def hand_shape(
@@ -27,6 +28,7 @@ def hand_shape(
     tint: Colour = SKIN,
     shares: Sequence[float] | np.ndarray | None = None,
     alpha: float = 1.0,
+    skin: Skin | None = None,
 ) -> Shape:
     """The hand's skin.
 
@@ -37,8 +39,9 @@ def hand_shape(
       tint: a colour besides the hand's own.
       shares: (L,) of that colour on each link; none by default.
       alpha: below one the hand is seen through.
+      skin: the surface; the hand's own by default.
     """
-    skin = skin_of(hand)
+    skin = skin or skin_of(hand)
     points, normals = skin.posed(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
     own = skin_colours(skin)
     share = (skin.weights @ np.asarray(shares, np.float32))[:, None] if shares is not None else 0.0
@@ -79,14 +82,15 @@ def posed_hand(
     tint: Colour = SKIN,
     shares: Sequence[float] | np.ndarray | None = None,
     alpha: float = 1.0,
+    skin: Skin | None = None,
 ) -> Shape:
     """The hand with finger angles (F,) and its wrist at a position (3,) m and orientation in the world.
 
-    Tint, shares and alpha are those of `hand_shape`.
+    Tint, shares, alpha and skin are those of `hand_shape`.
     """
     links, quaternion = mujoco_link_poses(hand, q)
     turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
-    return hand_shape(hand, wrist.apply(links) + position, turned, tint, shares, alpha)
+    return hand_shape(hand, wrist.apply(links) + position, turned, tint, shares, alpha, skin)
 
 
 def table_shape(below: np.ndarray) -> Shape:
@@ -151,5 +155,8 @@ def upright(hand: Hand) -> Rotation:
     links = list(hand.tip_links[1:])
     curl = (mujoco_link_poses(hand, hand.q_closed)[0] - mujoco_link_poses(hand, hand.q_open)[0])[links].mean(0)
     palm = curl - (curl @ up) * up
+    if np.linalg.norm(palm) < _STILL:  # fingers of one joint, or around an axis: towards the thumb, then
+        thumb = hand.keypoints[len(hand.links)] - fingers
+        palm = thumb - (thumb @ up) * up
     palm = palm / np.linalg.norm(palm)
     return Rotation.from_matrix(np.stack([palm, np.cross(up, palm), up]))

@@ -13,6 +13,7 @@ import numpy as np
 
 from common import rotations
 from common.hands import kinematics
+from common.hands.motors import transmission
 from common.hands.spec import Hand, chain_of
 from common.task.constraints.heading import HeadingGoal, heading_wrist_pose
 from common.task.geometry import squared_distances
@@ -34,8 +35,15 @@ class Poses(NamedTuple):
 
 @functools.cache
 def _fingers(hand: Hand) -> tuple[np.ndarray, np.ndarray, int]:
-    """Finger index of every joint (F,) and of every keypoint (P,; -1 for the palm), and the number of fingers."""
+    """Finger index of every joint (F,) and of every keypoint (P,; -1 for the palm), and the number of fingers.
+
+    Fingers that a motor moves together are one.
+    """
     roots = [next(iter(chain_of(hand, link.name)), "") for link in hand.links]
+    owners = np.split(transmission(hand).motor, np.cumsum([len(link.joints) for link in hand.links])[:-1])
+    for motor in range(len(hand.motors)):
+        first, *others = dict.fromkeys(root for root, own in zip(roots, owners, strict=True) if motor in own)
+        roots = [first if root in others else root for root in roots]
     names = [name for name in dict.fromkeys(roots) if name]
     of_link = np.array([names.index(root) if root else -1 for root in roots])
     joints = [of_link[i] for i, link in enumerate(hand.links) for _ in link.joints]

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from common import rotations
+from common.hands.motors import coupled
 from common.hands.spec import Hand
 from common.task.types import Array
 
@@ -35,7 +36,8 @@ def disturbed_fingers(hand: Hand, q: Array, amount: Array, key: Array) -> Array:
     share = jax.random.uniform(closure_key, (len(q), 1), minval=CLOSURE[0], maxval=CLOSURE[1])
     q_open, amount = jnp.array(hand.q_open), amount[:, None]
     q = q_open + (1 + amount * (share - 1)) * (q - q_open)
-    return jnp.clip(q + amount * JOINTS * jax.random.normal(joint_key, q.shape), hand.lower, hand.upper)
+    q = q + amount * JOINTS * jax.random.normal(joint_key, q.shape)
+    return coupled(hand, jnp.clip(q, hand.lower, hand.upper))
 
 
 def disturbed_wrist(position: Array, quaternion: Array, amount: Array, key: Array) -> tuple[Array, Array]:

@@ -244,29 +244,29 @@ def _strength(hand: Hand) -> Finding:
         _verdict(carried / weight, *_CARRIED),
         f"fingertips press with {forces.min():.1f} to {forces.max():.1f} N, so that they carry {carried:.1f} N by "
         f"friction; a median object weighs {weight:.1f} N",
-        "check torque_limit (N.m) of the joints, or take a smaller object_scale",
+        "check torque_limit (N.m) of the motors, or take a smaller object_scale",
     )
 
 
 def _servos(hand: Hand, found: list[Response]) -> list[Finding]:
-    """Whether joints go where they are told, and rest there."""
+    """Whether motors go where they are told, and rest there."""
     bad = []
-    for joint, one in zip(hand.joints, found, strict=True):
+    for motor, one in zip(hand.motors, found, strict=True):
         shakes = _worst(_verdict(one.overshoot, *_OVERSHOOT), _verdict(one.unrest, *_UNREST))
         misses = _verdict(one.error, *_ERROR)
         verdict: Verdict = "failed" if one.diverged else _worst(shakes, misses)
         if verdict != "passed":
-            remedy = f"raise kv ({joint.kv:g}) or armature ({joint.armature:g}), or lower kp ({joint.kp:g})"
+            remedy = f"raise kv ({motor.kv:g}) or the armature of what it moves, or lower kp ({motor.kp:g})"
             if shakes == "passed" and not one.diverged:
-                remedy = f"raise kp ({joint.kp:g}), or lower kv ({joint.kv:g}) and damping ({joint.damping:g})"
+                remedy = f"raise kp ({motor.kp:g}), or lower kv ({motor.kv:g}) and the damping of what it moves"
             text = "breaks the simulation" if one.diverged else _response(one)
-            bad.append(Finding("servo", verdict, f"'{joint.name}' {text}", remedy))
+            bad.append(Finding("servo", verdict, f"'{motor.name}' {text}", remedy))
     overshoot, error = max(one.overshoot for one in found), max(one.error for one in found)
     return bad or [
         Finding(
             "servos",
             "passed",
-            f"{len(found)} joints follow a step, overshoot {100 * overshoot:.0f} %, {100 * error:.0f} % off in the end",
+            f"{len(found)} motors follow a step, overshoot {100 * overshoot:.0f} %, {100 * error:.0f} % off in the end",
         )
     ]
 

@@ -13,9 +13,11 @@ import signal
 import subprocess
 import sys
 import tempfile
+import xml.etree.ElementTree as ET
 
 import mujoco
 import numpy as np
+import trimesh
 
 from common.errors import CongraspError
 
@@ -44,6 +46,7 @@ _FINITE = (
     ),
     *("geom_quat", "mesh_vert", "dof_armature", "dof_damping", "actuator_biasprm", "actuator_forcerange"),
 )
+_NATIVE = (".stl", ".obj", ".msh")
 _ROOT = pathlib.Path(__file__).parents[3]
 _REMEDY = "MuJoCo must be able to load it."
 
@@ -129,20 +132,77 @@ def _compiled(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
     for count in _COUNTS.findall(path.read_text(errors="replace")):
         if any(float(number) > MAX_COUNT for number in count.split()):
             raise ValueError(f"it repeats a part {count[:40]} times, more than {MAX_COUNT}")
-    spec = mujoco.MjSpec.from_file(str(path))
+    urdf = path.suffix.lower() == ".urdf"
+    spec = _urdf(path, notes) if urdf else mujoco.MjSpec.from_file(str(path))
     spec.compiler.fusestatic = False
     for body in spec.bodies:
         if body.explicitinertial and body.mass < 0:
             raise ValueError(f"the body '{body.name[:60]}' has the mass {body.mass:g} kg")
-    missing = [mesh for mesh in spec.meshes if mesh.file and not _found(path, spec, mesh.file)]
+    missing = [mesh for mesh in spec.meshes if not urdf and mesh.file and not _found(path, spec, mesh.file)]
     if missing:
         names = {mesh.name for mesh in missing}
         for geom in [geom for geom in spec.geoms if geom.meshname in names]:
             spec.delete(geom)
         for mesh in missing:
             spec.delete(mesh)
-        notes.append(f"{len(missing)} meshes were not found beside the file: their links are thin capsules")
+        notes.append(_missing(len(missing)))
     return spec.compile()
+
+
+def _urdf(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
+    """The model of a URDF file: its meshes are looked for as ROS names them, and formats that MuJoCo lacks are read."""
+    try:
+        robot = ET.fromstring(path.read_text(errors="replace"))
+    except ET.ParseError as error:
+        raise ValueError(f"XML Error: {error}") from None
+    extension = robot.find("mujoco") or ET.SubElement(robot, "mujoco")
+    compiler = extension.find("compiler")
+    compiler = ET.SubElement(extension, "compiler") if compiler is None else compiler
+    compiler.attrib |= {"strippath": "false", "discardvisual": "false", "balanceinertia": "true", "meshdir": ""}
+    assets, lacking = dict[str, bytes](), set[str]()
+    for link in robot.iter("link"):
+        for again in link.findall("inertial")[1:]:
+            link.remove(again)
+        for shape in (*link.findall("visual"), *link.findall("collision")):
+            for mesh in shape.iter("mesh"):
+                file = _mesh_file(path, mesh.get("filename", ""))
+                content = _readable(file) if file else b""
+                if file is None or not content:
+                    lacking.add(mesh.get("filename", ""))
+                    link.remove(shape)
+                    break
+                name = f"{len(assets)}.{'stl' if file.suffix.lower() not in _NATIVE else file.suffix[1:].lower()}"
+                assets[name] = content
+                mesh.set("filename", name)
+    if lacking:
+        notes.append(_missing(len(lacking)))
+    return mujoco.MjSpec.from_string(ET.tostring(robot, "unicode"), assets=assets)
+
+
+def _mesh_file(path: pathlib.Path, name: str) -> pathlib.Path | None:
+    """The mesh of a name in a URDF file, as a path from there or from a folder above it; None where there is none."""
+    plain = name.removeprefix("file://").removeprefix("package://").removeprefix("model://")
+    above = [path.parent, *path.parent.parents[:3]]
+    parts = pathlib.PurePosixPath(plain).parts
+    within = [plain, *("/".join(parts[i:]) for i in range(1, len(parts)))] if parts else []
+    return next((file for folder in above for part in within if (file := folder / part).is_file()), None)
+
+
+def _readable(file: pathlib.Path) -> bytes:
+    """A mesh's content as MuJoCo reads it, or nothing."""
+    if file.stat().st_size > MAX_FILE:
+        return b""
+    if file.suffix.lower() in _NATIVE:
+        return file.read_bytes()
+    try:
+        return trimesh.exchange.stl.export_stl(trimesh.load_mesh(file))
+    except Exception:  # whatever readers of many formats raise
+        return b""
+
+
+def _missing(count: int) -> str:
+    """What to say of meshes that are left out."""
+    return f"{count} meshes were not found beside the file, or cannot be read: what follows without them is rough"
 
 
 def _found(path: pathlib.Path, spec: mujoco.MjSpec, file: str) -> bool:

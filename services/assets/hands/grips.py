@@ -21,6 +21,7 @@ from actors.physics.native import NativePhysics
 from common import rotations
 from common.config import TaskConfig
 from common.hands.kinematics import grasp_frame
+from common.hands.motors import motor_positions
 from common.hands.spec import Hand
 from common.objects import shapes
 from common.objects.families import draft
@@ -37,7 +38,7 @@ _PLACES = (0.0, 0.5, 1.0)
 _FIRMNESS = (0.3, 0.8)
 """Shares of the torque limits with which fingers press."""
 _SPEED = 0.06
-"""rad per control step by which fingers close at most."""
+"""rad per control step by which motors close at most."""
 _CLOSE, _HOLD = 100, 50
 """Control steps."""
 
@@ -130,15 +131,16 @@ def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
 
 
 def _close(physics: NativePhysics, hand: Hand, start: ResetState, firmness: np.ndarray) -> np.ndarray:
-    """(B, F) targets of fingers that have closed around what is held in place, and is let go then."""
+    """(B, M) targets of fingers that have closed around what is held in place, and is let go then."""
     physics.start(start)
-    reach = firmness[:, None] * np.array([joint.torque_limit / joint.kp for joint in hand.joints])
-    q = target = np.asarray(start.q)
+    reach = firmness[:, None] * np.array([motor.torque_limit / motor.kp for motor in hand.motors])
+    q = target = motor_positions(hand, np.asarray(start.q))
+    goal = motor_positions(hand, hand.q_closed)
     still, away = np.zeros((len(q), 6)), np.zeros(len(q), bool)
     for _ in range(_CLOSE):
-        target = np.clip(target + np.clip(hand.q_closed - target, -_SPEED, _SPEED), q - reach, q + reach)
+        target = np.clip(target + np.clip(goal - target, -_SPEED, _SPEED), q - reach, q + reach)
         _, state = physics.step(physics, np.concatenate([still, target], -1), away)
-        q = np.asarray(state.q)
+        q = motor_positions(hand, np.asarray(state.q))
     for instance in physics.instances:
         instance.data.eq_active[instance.model.equality("hold").id] = False
     return target

@@ -1,30 +1,30 @@
 """A hand from a URDF or MJCF file: what it says is taken over, and what it does not say is proposed.
 
-MuJoCo reads the file. The palm is the first body that fingers branch off; what stands before it (an arm, a wrist) is
-left out, since the wrist is a virtual mount here. Bodies without a hinge belong to the link that carries them. Links
-become capsules, and the pose in which the fingers close follows from the ranges of their joints.
+MuJoCo reads the file. Which bodies are the hand: `tree`. Links become capsules: `geometry`. Motors, couplings and
+tendons: `motors`. The pose in which the fingers close is found by their kinematics: `poses`.
 """
 
 import dataclasses
 import pathlib
-import re
 
 import mujoco
 import numpy as np
-import trimesh
 
 from common.errors import CongraspError
 from common.hands.files import faults, hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.measures import fitting_scale
-from common.hands.spec import Capsule, Hand, Joint, Link, chain_of, vector, wrist_gains
+from common.hands.motors import motor_limits
+from common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from services.assets.hands.compile import compiled_model
+from services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_box, surface
+from services.assets.hands.motors import Drive
 from services.assets.hands.poses import opening, propose_poses, thumb_of
+from services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
+from services.assets.hands.visual import Meshes, link_mesh
 
-TORQUE = 1.0
-"""N.m, of a joint for which the file names no limit."""
-_REACH = 0.3  # rad of error at which a joint gives all its torque, where the file has no gain
-_FLAT = 1.6  # broader than this, a link gets several capsules side by side
+_LEVER = 0.02  # m from a joint to the tip that it moves, at least
+_SMALL = 0.03  # m of opening below which a hand is doubtful
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +32,11 @@ class Proposal:
     """A hand as it was understood, and what was not in the file."""
 
     hand: Hand
+    palm: str
+    """Its name in the file; the hand calls it `palm`."""
     notes: tuple[str, ...]
+    meshes: Meshes
+    """What its file draws."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,30 +66,44 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     model = compiled_model(path, notes)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    palm = _palm(model, choices.palm)
-    bodies = _bodies(model, palm)
-    links = _links(model, data, palm, bodies, notes)
-    notes += _remarks(model, palm, bodies)
-    tips = [link.name for link in links if link.tip is not None]
-    if len(tips) < 2:
+    tree = hand_tree(model, choices.palm, notes)
+    if len(tree.ends) < 2:
         raise CongraspError(
-            f"{path} has {len(tips)} finger(s) on its palm '{_name(model, palm)}'.", "Name another --palm."
+            f"{path} has {len(tree.ends)} finger(s) on its palm '{body_name(model, tree.palm)}'.",
+            "Name another --palm.",
         )
-    name = re.sub(r"\W+", "_", choices.name or path.stem).strip("_").lower() or "hand"
+    links, drive = _links(model, data, tree, notes)
     hand = Hand(
-        name=name,
+        name=identifier(choices.name or path.stem, "hand").lower(),
         links=tuple(links),
-        thumb=thumb_of(links, tips, choices.thumb),
+        thumb=next(link.name for link in links if link.tip is not None),
         open_pose={},
         closed_pose={},
         wrist=wrist_gains(sum(link.mass for link in links)),
+        couplings=drive.couplings(),
+        tendons=drive.tendons(),
     )
-    hand = propose_poses(hand)
-    scale = choices.object_scale or fitting_scale(opening(hand))
+    notes += drive.remarks()
+    _check(path, hand, "pose")
+    hand = dataclasses.replace(hand, thumb=thumb_of(hand, choices.thumb, notes))
+    hand = propose_poses(hand, notes)
+    wide = opening(hand)
+    if wide < _SMALL:
+        notes.append(f"thumb and fingers are only {100 * wide:.1f} cm apart ('open_pose' in the hand file, or --thumb)")
+    scale = choices.object_scale or fitting_scale(wide)
     hand = dataclasses.replace(hand, object_scale=scale)
+    _check(path, hand)
+    hand = hand_from_text(hand_text(hand), str(path))
+    return Proposal(hand, model.body(tree.palm).name, tuple(notes), _meshes(model, data, tree))
+
+
+def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
+    """Raises a CongraspError for a hand that cannot be; faults that have the word `but` in them do not count yet."""
     for fault in faults(hand):
-        raise CongraspError(f"{path}: {fault}.", "Correct the file, or write a hand file by hand (docs/add-a-hand.md).")
-    return Proposal(hand_from_text(hand_text(hand), str(path)), tuple(notes))
+        if not but or but not in fault:
+            raise CongraspError(
+                f"{path}: {fault}.", "Correct the file, or write a hand file by hand (docs/add-a-hand.md)."
+            )
 
 
 def describe(proposal: Proposal) -> list[str]:
@@ -95,7 +113,9 @@ def describe(proposal: Proposal) -> list[str]:
     tips = [chain_of(hand, hand.links[i].name) for i in hand.tip_links]
     mass = sum(link.mass for link in hand.links)
     lines = [
-        f"hand         {hand.name}: {len(hand.joints)} joints, {len(hand.links)} links, {mass:.3f} kg",
+        f"hand         {hand.name}: {len(hand.joints)} joints, {len(hand.motors)} motors, {len(hand.links)} links, "
+        f"{mass:.3f} kg",
+        f"palm         {proposal.palm}",
         f"thumb        {' - '.join(tips[0])}",
         *(f"finger       {' - '.join(tip)}" for tip in tips[1:]),
         f"heading v    {_text(frame.heading)} in the palm's frame, cross-finger axis w {_text(frame.cross)}",
@@ -106,6 +126,13 @@ def describe(proposal: Proposal) -> list[str]:
     for joint, opened, closed in zip(hand.joints, hand.q_open, hand.q_closed, strict=True):
         figures = (joint.lower, joint.upper, opened, closed, joint.kp, joint.kv, joint.torque_limit)
         lines.append(f"{joint.name:22s}" + "".join(f"{x:8.3f}" for x in figures))
+    lines += [f"{x.joint:22s} = {x.offset:.3f} + {x.ratio:.3f} {x.leader}" for x in hand.couplings]
+    lower, upper = motor_limits(hand)
+    for motor, low, high in zip(hand.motors, lower, upper, strict=True):
+        if len(motor.joints) > 1:
+            pulls = " + ".join(f"{c:g} {name}" for name, c in motor.joints.items())
+            gains = f"kp {motor.kp:.3f}, kv {motor.kv:.3f}, limit {motor.torque_limit:.3f}"
+            lines.append(f"one motor for {pulls}, from {low:.3f} to {high:.3f}: {gains}")
     return [*lines, "rad, N.m/rad, N.m.s/rad, N.m", *(f"note: {note}" for note in proposal.notes)]
 
 
@@ -114,203 +141,100 @@ def _text(vector: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
 
 
-def _name(model: mujoco.MjModel, body: int) -> str:
-    """A body's name as an identifier."""
-    return re.sub(r"\W+", "_", model.body(body).name) or f"body_{body}"
-
-
-def _joint_name(model: mujoco.MjModel, j: int) -> str:
-    """A joint's name as an identifier."""
-    return re.sub(r"\W+", "_", model.joint(j).name) or f"joint_{j}"
-
-
-def _hinges(model: mujoco.MjModel, body: int) -> list[int]:
-    """Indices of a body's joints."""
-    start, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-    return list(range(start, start + count))
-
-
-def _palm(model: mujoco.MjModel, wanted: str) -> int:
-    """The first body, from the root, off which at least two bodies with hinges branch."""
-    names = [model.body(i).name for i in range(model.nbody)]
-    if wanted:
-        if wanted not in names:
-            raise CongraspError(f"There is no body '{wanted}'.", f"Name one of: {', '.join(filter(None, names))}.")
-        return names.index(wanted)
-    moves = np.array(model.body_jntnum) > 0
-    for body in range(model.nbody - 1, 0, -1):
-        moves[model.body_parentid[body]] |= moves[body]
-    palm = 0
-    while True:
-        below = [b for b in range(1, model.nbody) if model.body_parentid[b] == palm and moves[b]]
-        if len(below) != 1:
-            return palm
-        palm = below[0]
-
-
-def _bodies(model: mujoco.MjModel, palm: int) -> dict[int, list[int]]:
-    """Bodies that make up each link, by the body that moves it; those without a hinge belong to what carries them."""
-    owner = {palm: palm}
-    groups = {palm: [palm]}
-    for body in range(palm + 1, model.nbody):
-        parent = int(model.body_parentid[body])
-        if parent not in owner:
-            continue
-        owner[body] = body if model.body_jntnum[body] else owner[parent]
-        groups.setdefault(owner[body], []).append(body)
-    return groups
-
-
-def _links(
-    model: mujoco.MjModel, data: mujoco.MjData, palm: int, groups: dict[int, list[int]], notes: list[str]
-) -> list[Link]:
-    """The links, in the palm's frame at zero, from the bodies of each (`_bodies`); `notes` says what is proposed."""
-    turn, origin = data.xmat[palm].reshape(3, 3), data.xpos[palm]
-    owner = {body: moved for moved, group in groups.items() for body in group}
-    names = {moved: "palm" if moved == palm else _name(model, moved) for moved in groups}
-    carriers = {owner[int(model.body_parentid[moved])] for moved in groups if moved != palm}
-    links = []
-    bare = []
-    for moved, group in groups.items():
-        joints = () if moved == palm else tuple(_joint(model, data, j, turn, origin) for j in _hinges(model, moved))
-        at = np.array(joints[0].anchor) if joints else np.zeros(3)
-        points = [(p - origin) @ turn for body in group for p in _surface(model, data, body)]
-        ends = [
-            (data.xanchor[_hinges(model, m)[0]] - origin) @ turn
-            for m in groups
-            if m != palm and owner[int(model.body_parentid[m])] == moved
-        ]
+def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[str]) -> tuple[list[Link], Drive]:
+    """The links in the palm's frame at zero, and what moves them; `notes` says what is proposed."""
+    turn, origin = data.xmat[tree.palm].reshape(3, 3), data.xpos[tree.palm]
+    names = {link: "palm" if link == tree.palm else body_name(model, link) for link in tree.groups}
+    above = {link: tree.owner[int(model.body_parentid[link])] for link in tree.groups if link != tree.palm}
+    at = {link: np.zeros(3) if link == tree.palm else _anchor(model, data, link, turn, origin) for link in tree.groups}
+    shapes = {}
+    boxed: list[str] = []
+    empty: list[str] = []
+    for link, bodies in tree.groups.items():
+        points = [p for body in bodies for p in surface(model, data, body)]
         if not points:
-            bare.append(names[moved])
-            points = [at + d for end in (ends or [at]) for d in _ball(0.005, at, end)]
-        capsules = _capsules(np.array(points))
-        mass = float(sum(model.body_mass[body] for body in group))
-        tip = None
-        if moved != palm and moved not in carriers:
-            tip = max((c for x in capsules for c in (x.start, x.end)), key=lambda c: float(np.linalg.norm(c - at)))
+            points = [p for body in bodies for p in inertia_box(model, data, body)]
+            (boxed if points else empty).append(names[link])
+        local = [(p - origin) @ turn for p in points]
+        shapes[link] = fit_capsules(np.array(local or bare(at[link], *(at[x] for x in above if above[x] == link))))
+    tips = {link: far_end(shapes[link], at[link]) for link in tree.ends}
+    joints = _joint_names(model, tree, {*names.values()})
+    levers = _levers(model, data, tree, above, tips, turn, origin)
+    drive = Drive(model, data, joints, levers)
+    links = []
+    for link, bodies in tree.groups.items():
+        own = [] if link == tree.palm else hinges(model, link)
+        mass = float(sum(model.body_mass[body] for body in bodies))
+        if mass <= 0:
+            notes.append(f"'{names[link]}' has no mass: 1 g ('mass' in the hand file)")
         links.append(
             Link(
-                name=names[moved],
-                parent="" if moved == palm else names[owner[int(model.body_parentid[moved])]],
-                joints=joints,
-                capsules=capsules,
+                name=names[link],
+                parent="" if link == tree.palm else names[above[link]],
+                joints=tuple(_joint(model, data, j, joints[j], turn, origin, drive) for j in own),
+                capsules=shapes[link],
                 mass=max(mass, 1e-3),
-                contact_weight=3.0 if tip is not None else 1.0,
-                tip=tip,
+                contact_weight=3.0 if link in tips else 1.0,
+                tip=vector(tips[link].round(6)) if link in tips else None,
             )
         )
-        if mass <= 0:
-            notes.append(f"'{names[moved]}' has no mass: 1 g")
-    if bare:
-        notes.append(f"no geometry: {', '.join(bare)}")
-    return links
+    if boxed:
+        notes.append(f"no geometry, capsules follow from inertias ('capsules' in the hand file): {', '.join(boxed)}")
+    if empty:
+        notes.append(f"no geometry and no inertia, thin capsules ('capsules' in the hand file): {', '.join(empty)}")
+    return links, drive
 
 
-def _remarks(model: mujoco.MjModel, palm: int, groups: dict[int, list[int]]) -> list[str]:
-    """What the file does not say of its joints, and what of it is left out."""
-    found = []
-    hinges = [j for moved in groups if moved != palm for j in _hinges(model, moved)]
-    if limitless := [_joint_name(model, j) for j in hinges if not _motor(model, j)[1]]:
-        found.append(f"no torque limit, {TORQUE:g} N.m is proposed: {', '.join(limitless)}")
-    if model.neq:
-        found.append(f"{model.neq} couplings between joints are left out: every joint has its own motor here")
-    return found
+def _meshes(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree) -> Meshes:
+    """What the file draws of each link, in the palm's frame at zero."""
+    turn, origin = data.xmat[tree.palm].reshape(3, 3), data.xpos[tree.palm]
+    found = {
+        "palm" if link == tree.palm else body_name(model, link): link_mesh(model, data, bodies, turn, origin)
+        for link, bodies in tree.groups.items()
+    }
+    return {name: mesh for name, mesh in found.items() if mesh is not None}
 
 
-def _joint(model: mujoco.MjModel, data: mujoco.MjData, j: int, turn: np.ndarray, origin: np.ndarray) -> Joint:
-    """A hinge in the palm's frame, which `turn` (3, 3) brings to the world and whose origin lies at `origin` (3,) m.
+def _anchor(model: mujoco.MjModel, data: mujoco.MjData, link: int, turn: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(3,) where a link's first joint is, in the palm's frame."""
+    return np.asarray((data.xanchor[hinges(model, link)[0]] - origin) @ turn)
 
-    Without a gain of the file kp gives all the torque at `_REACH`, and kv is 1.4 sqrt(kp I) with the joint's inertia I.
-    """
-    name = _joint_name(model, j)
+
+def _joint_names(model: mujoco.MjModel, tree: Tree, taken: set[str]) -> dict[int, str]:
+    """Names of the hand's joints in its order, apart from those of links."""
+    order = [j for link in tree.groups if link != tree.palm for j in hinges(model, link)]
+    names = {j: identifier(model.joint(j).name, f"joint_{j}") for j in order}
+    return {j: f"{name}_joint" if name in taken else name for j, name in names.items()}
+
+
+def _levers(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    tree: Tree,
+    above: dict[int, int],
+    tips: dict[int, np.ndarray],
+    turn: np.ndarray,
+    origin: np.ndarray,
+) -> dict[int, float]:
+    """m from each joint of the hand to the farthest tip that it moves."""
+    levers = {j: _LEVER for link in tree.groups if link != tree.palm for j in hinges(model, link)}
+    for end, tip in tips.items():
+        link = end
+        while link != tree.palm:
+            for j in hinges(model, link):
+                levers[j] = max(levers[j], float(np.linalg.norm((data.xanchor[j] - origin) @ turn - tip)))
+            link = above[link]
+    return levers
+
+
+def _joint(
+    model: mujoco.MjModel, data: mujoco.MjData, j: int, name: str, turn: np.ndarray, origin: np.ndarray, drive: Drive
+) -> Joint:
+    """A hinge in the palm's frame, which `turn` (3, 3) brings to the world and whose origin lies at `origin` (3,) m."""
     if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
         raise CongraspError(f"The joint '{name}' is not a hinge.", "Hands of hinges alone can be imported.")
-    lower, upper = model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]]
     if not model.jnt_limited[j]:
         raise CongraspError(f"The joint '{name}' has no limits.", "Give it a range.")
-    dof = model.jnt_dofadr[j]
-    kp, limit = _motor(model, j)
-    limit = limit or TORQUE
-    kp = kp or limit / _REACH
-    armature = float(model.dof_armature[dof]) or 5e-4
-    inertia = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, inertia)
-    kv = 1.4 * np.sqrt(kp * max(float(inertia[dof, dof]) - model.dof_armature[dof] + armature, armature))
-    return Joint(
-        name,
-        vector(turn.T @ data.xaxis[j]),
-        vector((data.xanchor[j] - origin) @ turn),
-        round(float(lower), 6),
-        round(float(upper), 6),
-        kp=round(float(kp), 4),
-        kv=round(float(kv), 4),
-        torque_limit=round(float(limit), 4),
-        damping=round(float(model.dof_damping[dof]), 6),
-        armature=armature,
-    )
-
-
-def _motor(model: mujoco.MjModel, j: int) -> tuple[float, float]:
-    """Gain of the joint's position actuator and its torque limit, zero where the file has none."""
-    kp = limit = 0.0
-    if model.jnt_actfrclimited[j]:
-        limit = float(np.abs(model.jnt_actfrcrange[j]).max())
-    for a in range(model.nu):
-        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[a, 0] == j:
-            kp = max(0.0, -float(model.actuator_biasprm[a, 1]))
-            if model.actuator_forcelimited[a] and not limit:
-                limit = float(np.abs(model.actuator_forcerange[a]).max())
-    return kp, limit
-
-
-def _surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """World points on what collides of a body, or on what is drawn of it if nothing collides."""
-    mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
-    solid = [g for g in mine if model.geom_contype[g] | model.geom_conaffinity[g]] or mine
-    found = []
-    for g in solid:
-        kind, size = mujoco.mjtGeom(model.geom_type[g]), model.geom_size[g]
-        if kind == mujoco.mjtGeom.mjGEOM_MESH:
-            m = model.geom_dataid[g]
-            start = model.mesh_vertadr[m]
-            local = model.mesh_vert[start : start + model.mesh_vertnum[m]]
-        elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-            local = np.array(trimesh.creation.box(2 * size).vertices)
-        elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-            local = np.array(trimesh.creation.icosphere(1, size[0]).vertices)
-        elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-            local = np.array(trimesh.creation.capsule(2 * size[1], size[0], count=(8, 8)).vertices)
-        elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            local = np.array(trimesh.creation.cylinder(size[0], 2 * size[1], sections=12).vertices)
-        elif kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-            local = np.array(trimesh.creation.icosphere(1).vertices) * size
-        else:
-            continue
-        found += list(local @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g])
-    return found
-
-
-def _ball(radius: float, *centers: np.ndarray) -> list[np.ndarray]:
-    """Points around the centres, relative to the first."""
-    return [c - centers[0] + radius * d for c in centers for d in np.concatenate([np.eye(3), -np.eye(3)])]
-
-
-def _capsules(points: np.ndarray) -> tuple[Capsule, ...]:
-    """Capsules along the longest side of the points' box; several side by side where it is flat."""
-    to_box, extents = trimesh.bounds.oriented_bounds(points)
-    order = np.argsort(extents)[::-1]
-    length, breadth, height = np.maximum(extents[order], 1e-3)
-    center, axes = np.linalg.inv(to_box)[:3, 3], np.linalg.inv(to_box)[:3, order]
-    flat = breadth > _FLAT * height
-    radius = height / 2 if flat else (breadth + height) / 4
-    count = min(5, int(np.ceil(breadth / height))) if flat else 1
-    half = max(length / 2 - radius, 1e-3)
-    across = np.linspace(-1, 1, count) * (breadth / 2 - radius) if count > 1 else np.zeros(1)
-    return tuple(
-        Capsule(
-            vector((center + x * axes[:, 1] - half * axes[:, 0]).round(6)),
-            vector((center + x * axes[:, 1] + half * axes[:, 0]).round(6)),
-            round(float(radius), 6),
-        )
-        for x in across
-    )
+    lower, upper = model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]]
+    axis, anchor = vector(turn.T @ data.xaxis[j]), vector((data.xanchor[j] - origin) @ turn)
+    return drive.joint(j, lower, upper, Joint(name, axis, anchor, 0.0, 0.0, 0.0, 0.0, 0.0))

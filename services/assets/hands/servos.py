@@ -1,4 +1,4 @@
-"""How a hand's joints follow their targets, in free air: the response to a step, and closing without an object."""
+"""How a hand's motors follow their targets, in free air: the response to a step, and closing without an object."""
 
 import dataclasses
 from typing import NamedTuple
@@ -10,6 +10,7 @@ from actors.physics.engine import PhysicsState, ResetState
 from actors.physics.native import NativePhysics
 from common.config import TaskConfig
 from common.hands.kinematics import link_transforms
+from common.hands.motors import motor_limits, motor_positions
 from common.hands.spec import Hand
 from common.task import plausibility
 from services.assets.hands.grips import grip_objects
@@ -22,12 +23,12 @@ _FAR = (0.0, 0.0, -5.0)  # m, where the object that every scene has is out of re
 
 
 class Response(NamedTuple):
-    """A joint's response to a step of its target."""
+    """A motor's response to a step of its target."""
 
     overshoot: float
     """Beyond the target, as a share of the step."""
     unrest: float
-    """rad/s, the standard deviation of the joint's speed in the last tenth of a second; a slow joint has none."""
+    """rad/s, the standard deviation of the motor's speed in the last tenth of a second; a slow one has none."""
     error: float
     """Distance from the target in the end, as a share of the step."""
     diverged: bool
@@ -35,16 +36,16 @@ class Response(NamedTuple):
 
 
 def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
-    """The responses (F) of the joints, one after the other, to steps of `STEP` or half of their range from the open
-    pose towards the side with more room; the other joints are to stay, and links do not collide."""
+    """The responses (M) of the motors, one after the other, to steps of `STEP` or half of their range from the open
+    pose towards the side with more room; the other motors are to stay, and links do not collide."""
     task = dataclasses.replace(task, hand_self_collision=False, hand_table_collision=False)
-    count = len(hand.joints)
-    size = np.minimum(STEP, (hand.upper - hand.lower) / 2)
-    way = np.where(hand.upper - hand.q_open >= hand.q_open - hand.lower, size, -size)
-    states = _states(hand, task, np.tile(hand.q_open + np.diag(way), (_STEPS, 1, 1)), threads)
-    each = np.arange(count)
-    gone = (states.q[:, each, each] - hand.q_open) / way  # (T, F) shares of the step
-    speed = states.q_velocity[-_SETTLED:, each, each]
+    (lower, upper), opened = motor_limits(hand), motor_positions(hand, hand.q_open)
+    size = np.minimum(STEP, (upper - lower) / 2)
+    way = np.where(upper - opened >= opened - lower, size, -size)
+    states = _states(hand, task, np.tile(opened + np.diag(way), (_STEPS, 1, 1)), threads)
+    each = np.arange(len(hand.motors))
+    gone = (motor_positions(hand, states.q)[:, each, each] - opened) / way  # (T, M) shares of the step
+    speed = motor_positions(hand, states.q_velocity)[-_SETTLED:, each, each]
     return [
         Response(
             float(max(gone[:, j].max() - 1, 0.0)),
@@ -59,12 +60,13 @@ def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
 def closed_overlap(hand: Hand, task: TaskConfig, threads: int) -> float:
     """How deep in metres links are in one another once the empty hand has closed, as far as its contacts let it."""
     share = np.minimum(np.arange(1, 2 * _STEPS + 1) / _STEPS, 1.0)[:, None, None]
-    states = _states(hand, task, hand.q_open + share * (hand.q_closed - hand.q_open), threads)
+    opened, closed = (motor_positions(hand, q) for q in (hand.q_open, hand.q_closed))
+    states = _states(hand, task, opened + share * (closed - opened), threads)
     return float(plausibility.hand_hand(hand, link_transforms(hand, np.asarray(states.q[-1], np.float32)))[0])
 
 
 def _states(hand: Hand, task: TaskConfig, targets: np.ndarray, threads: int) -> PhysicsState:
-    """The states, with leading axis T, under finger targets (T, B, F) that begin with the open pose."""
+    """The states, with leading axis T, under targets (T, B, M) of the motors that begin with the open pose."""
     count = targets.shape[1]
     ones = np.ones(count)
     start = ResetState(

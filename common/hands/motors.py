@@ -1,0 +1,100 @@
+"""Motors and the joints that they move, for hands with fewer motors than joints: coupled and tendon-driven ones.
+
+What a policy commands are motors; what the task sees are joints. A motor is at the sum of its joints' angles times
+their coefficients. Of a tendon's joints contact decides which moves; where targets need an angle for each, they are
+thought to go from limit to limit together. For a hand with a motor for every joint all of this is the identity.
+
+Arrays are NumPy's or JAX's.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from common.hands.spec import Hand
+
+Array = Any
+
+
+class _Transmission(NamedTuple):
+    """How a hand's motors (M) and joints (F) belong together."""
+
+    pulled: np.ndarray
+    """(M, T) indices of the joints of each motor."""
+    coefficients: np.ndarray
+    """(M, T), 0 where a motor pulls fewer than T joints."""
+    motor: np.ndarray
+    """(F,) index of the motor that moves each joint, directly or by its leader."""
+    ratio: np.ndarray
+    """(F,) radians of a joint for one of its motor."""
+    rest: np.ndarray
+    """(F,) angle of a joint where its motor is at zero."""
+    limits: np.ndarray
+    """(2, M) lowest and highest position of each motor with all of its joints within their limits."""
+
+
+@functools.cache
+def transmission(hand: Hand) -> _Transmission:
+    """The hand's motors and joints, as arrays."""
+    index = {joint.name: j for j, joint in enumerate(hand.joints)}
+    most = max(len(motor.joints) for motor in hand.motors)
+    pulled, coefficients = np.zeros((len(hand.motors), most), int), np.zeros((len(hand.motors), most))
+    owner, ratio, rest = np.zeros(len(index), int), np.ones(len(index)), np.zeros(len(index))
+    for m, motor in enumerate(hand.motors):
+        joints, c = np.array([index[name] for name in motor.joints]), np.array([*motor.joints.values()])
+        pulled[m, : len(c)], coefficients[m, : len(c)] = joints, c
+        owner[joints] = m
+        if len(c) > 1:
+            lower, upper = (np.array([getattr(hand.joints[j], side) for j in joints]) for side in ("lower", "upper"))
+            start, end = np.where(c > 0, (lower, upper), (upper, lower))
+            ratio[joints] = (end - start) / (c @ (end - start))
+            rest[joints] = start - ratio[joints] * (c @ start)
+        else:
+            ratio[joints] = 1.0 / c
+    for coupling in hand.couplings:
+        j, leader = index[coupling.joint], index[coupling.leader]
+        owner[j], ratio[j] = owner[leader], coupling.ratio * ratio[leader]
+        rest[j] = coupling.offset + coupling.ratio * rest[leader]
+    ends = np.sort([((getattr(hand, side) - rest) / ratio) for side in ("lower", "upper")], axis=0)
+    limits = np.array(
+        [
+            [ends[0][owner == m].max() for m in range(len(pulled))],
+            [ends[1][owner == m].min() for m in range(len(pulled))],
+        ]
+    )
+    single = (x.astype(np.float32) for x in (ratio, rest, limits))
+    return _Transmission(pulled, coefficients.astype(np.float32), owner, *single)
+
+
+def motor_positions(hand: Hand, q: Array) -> Array:
+    """(..., M) positions of the motors at joint angles (..., F), rad."""
+    if len(hand.motors) == len(hand.joints):
+        return q
+    own = transmission(hand)
+    return (own.coefficients * q[..., own.pulled]).sum(-1)
+
+
+def joint_positions(hand: Hand, motors: Array) -> Array:
+    """(..., F) joint angles for positions (..., M) of the motors, rad; those of a tendon move together."""
+    if len(hand.motors) == len(hand.joints):
+        return motors
+    own = transmission(hand)
+    return own.ratio * motors[..., own.motor] + own.rest
+
+
+def motor_limits(hand: Hand) -> np.ndarray:
+    """(2, M) lowest and highest motor positions, rad."""
+    return transmission(hand).limits
+
+
+def coupled(hand: Hand, q: Array) -> Array:
+    """(..., F) joint angles with those that follow others where their leaders put them."""
+    if not hand.couplings:
+        return q
+    names = [joint.name for joint in hand.joints]
+    leader, ratio, offset = np.arange(len(names)), np.ones(len(names), np.float32), np.zeros(len(names), np.float32)
+    for coupling in hand.couplings:
+        j = names.index(coupling.joint)
+        leader[j], ratio[j], offset[j] = names.index(coupling.leader), coupling.ratio, coupling.offset
+    return ratio * q[..., leader] + offset

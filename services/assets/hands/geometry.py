@@ -1,0 +1,93 @@
+"""Capsules for what a link looks like in its file: collision geometry, else what is drawn, else its inertia."""
+
+import mujoco
+import numpy as np
+import trimesh
+
+from common.hands.spec import Capsule, vector
+
+_FLAT = 1.6  # broader than this, a link gets several capsules side by side
+_PLAUSIBLE = (0.002, 0.15)  # m, half of an inertia's box
+_BARE = 0.005  # m, radius of a link of which nothing is known
+
+
+def surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
+    """World points on what collides of a body, or on what is drawn of it if nothing collides."""
+    mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
+    solid = [g for g in mine if model.geom_contype[g] | model.geom_conaffinity[g]] or mine
+    found: list[np.ndarray] = []
+    for g in solid:
+        if (mesh := geom_mesh(model, g)) is not None:
+            local = np.asarray(mesh.vertices)
+            found += list(local @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g])
+    return found
+
+
+def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
+    """A geom as a mesh in its own frame; None of a plane."""
+    kind, size = mujoco.mjtGeom(model.geom_type[g]), model.geom_size[g]
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        m = model.geom_dataid[g]
+        vertices = slice(model.mesh_vertadr[m], model.mesh_vertadr[m] + model.mesh_vertnum[m])
+        faces = slice(model.mesh_faceadr[m], model.mesh_faceadr[m] + model.mesh_facenum[m])
+        return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        return trimesh.creation.box(2 * size)
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return trimesh.creation.icosphere(1, size[0])
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return trimesh.creation.capsule(2 * size[1], size[0], count=(8, 8))
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        return trimesh.creation.cylinder(size[0], 2 * size[1], sections=12)
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        ball = trimesh.creation.icosphere(1)
+        ball.vertices *= size
+        return ball
+    return None
+
+
+def inertia_box(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
+    """World corners of the box with a body's mass and inertia, if it is as large as a link can be."""
+    mass, (x, y, z) = model.body_mass[body], model.body_inertia[body]
+    if mass < 1e-4:
+        return []
+    half = np.sqrt(np.maximum(1.5 * np.array([y + z - x, x + z - y, x + y - z]) / mass, 0.0))
+    if half.max() > _PLAUSIBLE[1] or half.max() < _PLAUSIBLE[0]:
+        return []
+    corners = np.array(trimesh.creation.box(2 * np.maximum(half, _PLAUSIBLE[0])).vertices)
+    return list(corners @ data.ximat[body].reshape(3, 3).T + data.xipos[body])
+
+
+def bare(*centers: np.ndarray) -> list[np.ndarray]:
+    """Points around centres, for a link of which the file shows nothing."""
+    return [c + _BARE * d for c in centers for d in np.concatenate([np.eye(3), -np.eye(3)])]
+
+
+def fit_capsules(points: np.ndarray) -> tuple[Capsule, ...]:
+    """Capsules along the longest side of the points' box (n, 3); several side by side where it is flat."""
+    to_box, extents = trimesh.bounds.oriented_bounds(points)
+    order = np.argsort(extents)[::-1]
+    length, breadth, height = np.maximum(extents[order], 1e-3)
+    center, axes = np.linalg.inv(to_box)[:3, 3], np.linalg.inv(to_box)[:3, order]
+    flat = breadth > _FLAT * height
+    radius = height / 2 if flat else (breadth + height) / 4
+    count = min(5, int(np.ceil(breadth / height))) if flat else 1
+    half = max(length / 2 - radius, 1e-3)
+    across = np.linspace(-1, 1, count) * (breadth / 2 - radius) if count > 1 else np.zeros(1)
+    return tuple(
+        Capsule(
+            vector((center + x * axes[:, 1] - half * axes[:, 0]).round(6)),
+            vector((center + x * axes[:, 1] + half * axes[:, 0]).round(6)),
+            round(float(radius), 6),
+        )
+        for x in across
+    )
+
+
+def far_end(capsules: tuple[Capsule, ...], origin: np.ndarray) -> np.ndarray:
+    """(3,) mean of the capsules' ends that are farther from a point (3,): where a finger has its tip."""
+    ends = [
+        max((capsule.start, capsule.end), key=lambda end: float(np.linalg.norm(np.subtract(end, origin))))
+        for capsule in capsules
+    ]
+    return np.mean(ends, axis=0)

@@ -1,0 +1,301 @@
+"""What moves a hand's joints in its file: motors with gains and limits, couplings between joints, tendons.
+
+MuJoCo reads URDF's mimic joints as joint equalities. Everything is relative to the pose in which the file shows the
+hand, which is zero here.
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from common.hands.spec import Coupling, Joint, Motor
+
+FINGERTIP_FORCE = 15.0
+"""N, with which a joint without a torque limit can press its fingertip."""
+LARGEST_FORCE = 40.0
+"""N, above which a torque limit is no finger's."""
+_REACH = 0.3  # rad of error at which a joint gives all its torque, where the file has no gain
+_SLACK = 0.3  # rad that a limited tendon may leave between two joints to count as a coupling
+_ROOM = 0.25  # least share of its range that a coupling leaves a joint
+_SLOW = 0.1  # s, longest time in which damping holds a joint back
+
+
+@dataclasses.dataclass(frozen=True)
+class Servo:
+    """A motor as a file has it: gains of the joint or tendon that it pulls; 0 where the file is silent."""
+
+    joints: dict[int, float]
+    kp: float
+    limit: float
+    reach: tuple[float, float] | None
+    """Range of its targets, where it is a position servo that has one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Follow:
+    """Joint a = offset + ratio * joint b, by their indices in the model."""
+
+    a: int
+    b: int
+    ratio: float
+    offset: float
+
+
+def servos(model: mujoco.MjModel) -> tuple[list[Servo], int]:
+    """The motors of joints and of fixed tendons, and how many muscles there are beside."""
+    found, muscles = [], 0
+    for a in range(model.nu):
+        kind, gear = mujoco.mjtTrn(model.actuator_trntype[a]), float(model.actuator_gear[a, 0])
+        if model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
+            muscles += 1
+            continue
+        target = int(model.actuator_trnid[a, 0])
+        if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+            joints = {target: 1.0}
+        elif kind == mujoco.mjtTrn.mjTRN_TENDON and (joints := _tendon(model, target)):
+            pass
+        else:
+            continue
+        kp = max(0.0, -float(model.actuator_biasprm[a, 1])) * gear**2
+        limit = float(np.abs(model.actuator_forcerange[a]).max()) if model.actuator_forcelimited[a] else 0.0
+        if not limit and not kp and model.actuator_ctrllimited[a]:
+            limit = float(np.abs(model.actuator_ctrlrange[a]).max() * abs(model.actuator_gainprm[a, 0]))
+        position = kp > 0 and model.actuator_ctrllimited[a] and gear == 1 and len(joints) == 1
+        position = position and np.isclose(model.actuator_gainprm[a, 0], kp)
+        reach = tuple(model.actuator_ctrlrange[a] - model.qpos0[model.jnt_qposadr[target]]) if position else None
+        found.append(Servo(joints, kp, limit * abs(gear), reach))  # type: ignore[arg-type]
+    return found, muscles
+
+
+def couplings(model: mujoco.MjModel, hand: set[int], driven: set[int], notes: list[str]) -> list[Follow]:
+    """Joints that follow others, each but once, with leaders that follow none.
+
+    Args:
+      model: the model.
+      hand: the hand's joints.
+      driven: joints that a motor moves.
+      notes: what is left out or simplified is added to it.
+    """
+    found: dict[int, Follow] = {}
+    for a, b, ratio, offset in (*_equalities(model, notes), *_limited_tendons(model, driven)):
+        if a not in hand or b not in hand or not ratio:
+            continue
+        if (a in driven and b not in driven) or a in found:
+            a, b, ratio, offset = b, a, 1.0 / ratio, -offset / ratio
+        if a not in found and a != b:
+            found[a] = Follow(a, b, ratio, offset)
+    settled = []
+    for first in found.values():
+        link, passed = first, {first.a}
+        while link.b in found and link.b not in passed:
+            above = found[link.b]
+            passed.add(link.b)
+            link = Follow(first.a, above.b, link.ratio * above.ratio, link.offset + link.ratio * above.offset)
+        if link.b in passed:
+            notes.append(f"joints are coupled in a circle: the coupling of '{model.joint(first.a).name}' is left out")
+        elif _fits(model, link):
+            settled.append(link)
+        else:
+            joints = f"'{model.joint(link.a).name}' to '{model.joint(link.b).name}'"
+            notes.append(f"the coupling of {joints} is left out: their limits leave it no room ('couplings')")
+    return settled
+
+
+def _fits(model: mujoco.MjModel, link: Follow) -> bool:
+    """Whether a follower's limits leave its leader a part of its range."""
+    lower, upper = _limits(model, link.b)
+    ends = sorted((limit - link.offset) / link.ratio for limit in _limits(model, link.a))
+    return bool(min(upper, ends[1]) - max(lower, ends[0]) > _ROOM * (upper - lower))
+
+
+def _limits(model: mujoco.MjModel, j: int) -> np.ndarray:
+    """(2,) limits of a joint from the file's pose."""
+    return np.asarray(model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]])
+
+
+def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[tuple[int, int, float, float]]:
+    """(follower, leader, ratio, offset) of equalities between joints or between the joints of a fixed tendon."""
+    found = []
+    for e in range(model.neq):
+        kind, data = model.eq_type[e], model.eq_data[e, :5]
+        one, two = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        if not model.eq_active0[e]:
+            continue
+        if kind == mujoco.mjtEq.mjEQ_JOINT and two >= 0:
+            ratio, offset = float(data[1]), float(data[0])
+            if np.abs(data[2:]).max() > 0:
+                where = np.linspace(float(_limits(model, two)[0]), float(_limits(model, two)[1]), 50)
+                ratio, offset = map(float, np.polyfit(where, np.polynomial.polynomial.polyval(where, data), 1))
+                notes.append(f"'{model.joint(one).name}' follows by a curve: a straight line through it is taken")
+            found.append((one, two, ratio, offset))
+        elif kind == mujoco.mjtEq.mjEQ_TENDON and two < 0 and len(pulled := _tendon(model, one)) == 2:
+            (b, own), (a, other) = pulled.items()
+            found.append((a, b, -own / other, float(data[0]) / other))
+        elif kind == mujoco.mjtEq.mjEQ_CONNECT:
+            notes.append("closed loops of links are left open (name a URDF whose joints mimic one another)")
+    return found
+
+
+def _limited_tendons(model: mujoco.MjModel, driven: set[int]) -> list[tuple[int, int, float, float]]:
+    """The same for tendons whose limits leave two joints, of which one has no motor, next to no way of their own."""
+    found = []
+    for t in range(model.ntendon):
+        pulled = _tendon(model, t)
+        if not model.tendon_limited[t] or len(pulled) != 2 or len(driven & {*pulled}) != 1:
+            continue
+        b = next(j for j in pulled if j in driven)
+        a = next(j for j in pulled if j != b)
+        lower, upper = model.tendon_range[t]
+        if (upper - lower) / abs(pulled[a]) > _SLACK:
+            continue
+        middle = 0.5 * (lower + upper) - sum(c * model.qpos0[model.jnt_qposadr[j]] for j, c in pulled.items())
+        found.append((a, b, -pulled[b] / pulled[a], float(middle / pulled[a])))
+    return found
+
+
+def _tendon(model: mujoco.MjModel, t: int) -> dict[int, float]:
+    """Coefficients of a fixed tendon by joints; empty for one that runs through space."""
+    where = range(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
+    if any(model.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT for w in where):
+        return {}
+    return {int(model.wrap_objid[w]): float(model.wrap_prm[w]) for w in where}
+
+
+class Drive:
+    """Gains of a hand's joints and motors from a file, and what had to be proposed for want of them."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, joints: dict[int, str], levers: dict[int, float]):
+        """Reads motors and couplings.
+
+        Args:
+          model: the model.
+          data: its data in the file's pose.
+          joints: names of the hand's joints.
+          levers: m from each of them to the tip of its finger.
+        """
+        self.notes: list[str] = []
+        self._model, self._names, self._levers = model, joints, levers
+        self._inertia = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, self._inertia)
+        found, muscles = servos(model)
+        self._servos = [servo for servo in found if {*servo.joints} & {*joints}]
+        driven = {j for servo in self._servos for j in servo.joints if j in joints}
+        self.links = couplings(model, {*joints}, driven, self.notes)
+        self._leaders = {link.a: link for link in self.links}
+        if muscles:
+            self.notes.append(f"{muscles} muscles move it in the file: here every joint has a motor")
+        self._limitless: list[str] = []
+        self._strong: list[str] = []
+        self._damped: list[str] = []
+        passive = [name for j, name in joints.items() if j not in driven and j not in self._leaders]
+        if driven and passive:
+            self.notes.append(
+                f"no motor in the file, here one each ('couplings' in the hand file): {', '.join(passive)}"
+            )
+        self._tendons = [reduced for servo in self._servos if len(reduced := self._reduced(servo)) > 1]
+
+    def couplings(self) -> tuple[Coupling, ...]:
+        """As data."""
+        return tuple(
+            Coupling(self._names[x.a], self._names[x.b], round(x.ratio, 6), round(x.offset, 6)) for x in self.links
+        )
+
+    def joint(self, j: int, lower: float, upper: float, joint: Joint) -> Joint:
+        """A joint with the gains of its motor, zeros if it has none, within what its motor reaches."""
+        dof = self._model.jnt_dofadr[j]
+        armature = float(self._model.dof_armature[dof]) or 5e-4
+        damping = float(self._model.dof_damping[dof])
+        kp = kv = limit = 0.0
+        if j not in self._leaders and not any(j in tendon for tendon in self._tendons):
+            servo = next((x for x in self._servos if {*self._reduced(x)} == {j}), None)
+            scale = self._reduced(servo)[j] if servo else 1.0
+            kp, limit = self._gains(j, servo, scale, self._names[j])
+            if servo and servo.reach:
+                lower, upper = max(lower, servo.reach[0]), min(upper, servo.reach[1])
+            followers = {j: 1.0} | {x.a: x.ratio for x in self.links if x.b == j}
+            kv = self._damping(followers, kp)
+            if damping > _SLOW * kp:
+                self._damped.append(self._names[j])
+                damping = _SLOW * kp
+        return dataclasses.replace(
+            joint,
+            lower=round(float(lower), 6),
+            upper=round(float(upper), 6),
+            kp=round(kp, 4),
+            kv=round(kv, 4),
+            torque_limit=round(limit, 4),
+            damping=round(damping, 6),
+            armature=armature,
+        )
+
+    def tendons(self) -> tuple[Motor, ...]:
+        """Motors of tendons, with coefficients of at most one."""
+        found = []
+        for servo in self._servos:
+            pulled = self._reduced(servo)
+            if len(pulled) < 2:
+                continue
+            largest = max(map(abs, pulled.values()))
+            first = max(pulled, key=lambda j: self._levers[j])
+            name = "_".join(["tendon", *(self._names[j] for j in pulled)])
+            kp, limit = self._gains(first, servo, largest, name)
+            coefficients = {self._names[j]: round(c / largest, 6) for j, c in pulled.items()}
+            kv = self._damping({j: c / largest for j, c in pulled.items()}, kp)
+            found.append(Motor(name, coefficients, round(kp, 4), round(kv, 4), round(limit, 4)))
+        return tuple(found)
+
+    def remarks(self) -> list[str]:
+        """What was proposed, once all joints and tendons were asked for."""
+        found = []
+        if self._limitless:
+            found.append(
+                f"no torque limit, {FINGERTIP_FORCE:g} N at the fingertip is proposed ('torque_limit'): "
+                + ", ".join(self._limitless)
+            )
+        if self._strong:
+            found.append(
+                f"torque limits above {LARGEST_FORCE:g} N at the fingertip are lowered to that ('torque_limit'): "
+                + ", ".join(self._strong)
+            )
+        if self._damped:
+            found.append(
+                f"damping that holds joints for more than {_SLOW:g} s is lowered ('damping' in the hand file): "
+                + ", ".join(self._damped)
+            )
+        return [*self.notes, *found]
+
+    def _reduced(self, servo: Servo | None) -> dict[int, float]:
+        """What a servo pulls, with joints that follow others in the place of these."""
+        pulled: dict[int, float] = {}
+        for j, c in servo.joints.items() if servo else ():
+            link = self._leaders.get(j)
+            leader, share = (link.b, c * link.ratio) if link else (j, c)
+            if leader in self._names:
+                pulled[leader] = pulled.get(leader, 0.0) + share
+        return {j: c for j, c in pulled.items() if c}
+
+    def _gains(self, j: int, servo: Servo | None, scale: float, name: str) -> tuple[float, float]:
+        """kp and torque limit of a motor; without a gain of the file kp gives all the torque at `_REACH`."""
+        kp = servo.kp * scale**2 if servo else 0.0
+        limit = servo.limit * abs(scale) if servo else 0.0
+        if self._model.jnt_actfrclimited[j]:
+            own = float(np.abs(self._model.jnt_actfrcrange[j]).max())
+            limit = min(filter(None, (limit, own)), default=0.0)
+        lever = max(self._levers[j], 0.01)
+        if not limit:
+            self._limitless.append(name)
+            limit = FINGERTIP_FORCE * lever
+        elif limit > LARGEST_FORCE * lever:
+            self._strong.append(name)
+            limit = LARGEST_FORCE * lever
+        return kp or limit / _REACH, limit
+
+    def _damping(self, moved: dict[int, float], kp: float) -> float:
+        """kv = 1.4 sqrt(kp I) with the inertia I of all that a motor moves, by the joints' ratios."""
+        dofs = [self._model.jnt_dofadr[j] for j in moved]
+        ratios = np.array([*moved.values()])
+        inertia = self._inertia[np.ix_(dofs, dofs)].copy()
+        armature = self._model.dof_armature[dofs]
+        inertia[np.diag_indices(len(dofs))] += np.where(armature > 0, 0.0, 5e-4)
+        return float(1.4 * np.sqrt(kp * max(ratios @ inertia @ ratios, 1e-6)))

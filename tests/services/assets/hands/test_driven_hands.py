@@ -1,0 +1,166 @@
+"""Files with fewer motors than joints, on arms and in scenes, left and right, of hands of our own making."""
+
+import pathlib
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from common.errors import CongraspError
+from common.hands import VARIABLE, get_hand
+from common.hands.files import hand_from_text, hand_text
+from common.hands.kinematics import grasp_frame
+from common.hands.spec import chain_of
+from services.assets.hands.model_files import describe, import_hand
+from services.assets.hands.visual import MAX_FACES, load_meshes, save_meshes
+from services.cli import main
+from services.viz.hand_sheets import hands_sheet
+
+HANDS = pathlib.Path(__file__).parents[3] / "hands"
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return import_hand(HANDS / "driven.xml")
+
+
+def _mirrored(path, out):
+    """A file with the mirror image, at y = 0, of an MJCF hand whose bodies are not turned."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    for body in spec.bodies:
+        body.pos = body.pos * [1, -1, 1]
+    for joint in spec.joints:
+        joint.axis = joint.axis * [-1, 1, -1]
+    for geom in spec.geoms:
+        geom.pos, geom.fromto = geom.pos * [1, -1, 1], geom.fromto * [1, -1, 1, 1, -1, 1]
+    spec.compile()
+    out.write_text(spec.to_xml())
+    return out
+
+
+def test_one_motor_moves_a_gripper_of_two_fingers():
+    proposal = import_hand(HANDS / "pincher.urdf")
+    hand = proposal.hand
+    assert (len(hand.joints), len(hand.motors), len(hand.tip_links), proposal.palm) == (4, 1, 2, "housing")
+    follow = {x.joint: (x.leader, x.ratio, x.offset) for x in hand.couplings}
+    assert follow == {  # that of the last joint through the one that it mimics
+        "left_parallel": ("left", -1.0, 0.0),
+        "right": ("left", 1.0, 0.0),
+        "right_parallel": ("left", 1.0, 0.0),
+    }
+    assert hand.closed_pose["left"] > 0.5 > 0.0 > hand.open_pose["left"]
+    assert hand.motors[0].torque_limit == 2.0
+    frame = grasp_frame(hand)
+    np.testing.assert_allclose(frame.heading, (0.0, 0.0, 1.0), atol=0.1)
+    assert abs(frame.cross[1]) > 0.99
+    words = "\n".join(describe(proposal))
+    assert "left_parallel          = 0.000 + -1.000 left" in words
+    assert "capsules follow from inertias ('capsules' in the hand file): right_pad" in words
+
+
+def test_palm_and_thumb_are_found_on_an_arm_beside_a_door_without_names(driven):
+    hand = driven.hand
+    assert driven.palm == "base" and hand.thumb == "side_end"
+    chains = [chain_of(hand, hand.links[i].name) for i in hand.tip_links]
+    assert [len(chain) for chain in chains] == [3, 3, 3, 3]
+    assert not {"arm", "wrist", "door"} & {joint.name for joint in hand.joints}
+
+
+def test_tendons_and_curves_become_couplings_and_motors(driven):
+    hand = driven.hand
+    assert (len(hand.joints), len(hand.motors)) == (16, 13)
+    (tendon,) = hand.tendons
+    assert tendon.joints == {"index_middle_joint": 1.0, "index_end_joint": 0.8}  # apart from links of those names
+    # 30,000 N/m and 60 N at a radius of 0.01 m.
+    assert (tendon.kp, tendon.torque_limit) == pytest.approx((3.0, 0.6))
+    follow = {x.joint: x for x in hand.couplings}
+    ring, middle = follow["ring_end_joint"], follow["middle_end_joint"]
+    assert (ring.leader, ring.ratio, ring.offset) == ("ring_middle_joint", pytest.approx(5 / 7, abs=1e-5), 0.0)
+    x = np.linspace(0.0, 1.57, 200)
+    assert np.abs(middle.offset + middle.ratio * x - (0.5 * x + 0.1 * x**2)).max() < 0.05
+    assert any("'middle_end' follows by a curve" in note for note in driven.notes)
+    assert hand_from_text(hand_text(hand)) is hand
+
+
+def test_the_thumb_of_the_open_hand_is_turned_against_the_fingers(driven):
+    hand = driven.hand
+    assert hand.open_pose["side_turn"] > 1.2
+    frame = grasp_frame(hand)
+    assert frame.heading[0] > 0.9 and frame.cross[2] > 0.9  # objects lie on the side +x, between fingers and thumb
+    closing = [name for name in hand.closed_pose if name.endswith(("root", "middle", "side_end_joint"))]
+    assert all(hand.closed_pose[name] > hand.open_pose.get(name, 0.0) for name in closing)
+
+
+def test_a_left_hand_is_the_mirror_image(driven, tmp_path):
+    left, right = import_hand(_mirrored(HANDS / "driven.xml", tmp_path / "left.xml")).hand, driven.hand
+    assert left.thumb == right.thumb and len(left.motors) == 13
+    np.testing.assert_allclose(left.q_open, right.q_open, atol=0.05)
+    np.testing.assert_allclose(left.q_closed, right.q_closed, atol=0.1)
+    ours, theirs = grasp_frame(left), grasp_frame(right)
+    np.testing.assert_allclose(ours.heading, theirs.heading * [1, -1, 1], atol=0.05)
+    np.testing.assert_allclose(ours.center, theirs.center * [1, -1, 1], atol=0.005)
+
+
+def test_what_cannot_be_kept_is_said_with_its_remedy(tmp_path):
+    text = (HANDS / "driven.xml").read_text()
+    for old, new in {
+        'polycoef="0 0.5 0.1 0 0"': 'polycoef="3 1 0 0 0"',
+        'forcerange="-60 60"': "",
+        'forcerange="-1 1"': 'forcerange="-50 50"',
+        'damping="0.02"': 'damping="2"',
+    }.items():
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "hand.xml").write_text(text)
+    notes = "\n".join(import_hand(tmp_path / "hand.xml").notes)
+    assert "coupling of 'middle_end' to 'middle_middle' is left out" in notes and "'couplings'" in notes
+    assert "no motor in the file, here one each ('couplings' in the hand file): middle_end_joint" in notes
+    assert "above 40 N at the fingertip are lowered to that ('torque_limit'): index_spread, index_root" in notes
+    assert "damping that holds joints for more than 0.1 s is lowered ('damping' in the hand file)" in notes
+    assert "no torque limit, 15 N at the fingertip is proposed ('torque_limit'): middle_end_joint" in notes
+
+
+def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    get_hand.cache_clear()
+    path = tmp_path / "driven.json"
+    path.write_text(hand_text(driven.hand))
+    save_meshes(path, driven.meshes)
+    found = load_meshes(path, driven.hand)
+    assert found.keys() == {link.name for link in driven.hand.links}
+    vertices, faces = found["palm"]  # the box of the file, in the palm's frame
+    np.testing.assert_allclose([vertices.min(0), vertices.max(0)], [[-0.012, -0.04, -0.005], [0.012, 0.04, 0.085]])
+    assert len(faces) == 12
+    with_meshes, bare = (hands_sheet([driven.hand], [x], size=(40, 40)) for x in (found, {}))
+    assert np.abs(with_meshes.astype(int) - bare).max() > 30
+    assert main.run(["hands", "sheet", "driven", "--out", str(tmp_path / "sheet.png")]) == 0
+
+    def refused(word, meshes):
+        save_meshes(path, meshes)
+        with pytest.raises(CongraspError, match=word) as raised:
+            load_meshes(path, driven.hand)
+        assert "\n" not in str(raised.value)
+
+    refused("holds no mesh of 'palm'", {"palm": (vertices, faces + len(vertices))})
+    refused("has no link 'wing'", {"wing": (vertices, faces)})
+    save_meshes(path, {})
+    assert load_meshes(path, driven.hand) == {}
+
+
+def test_a_fine_mesh_is_simplified(tmp_path):
+    trimesh.creation.icosphere(5, 0.009).export(tmp_path / "pad.stl")
+    text = (
+        (HANDS / "claw.urdf").read_text().replace('<sphere radius="0.009"/>', '<mesh filename="package://x/pad.stl"/>')
+    )
+    (tmp_path / "claw.urdf").write_text(text)
+    proposal = import_hand(tmp_path / "claw.urdf")
+    vertices, faces = proposal.meshes["left_upper"]
+    assert 1000 < len(faces) <= MAX_FACES < 20_000
+    # The pad's centre is 5 cm along the link, whose capsule is fitted to it as well.
+    joints = {joint.name: joint for joint in proposal.hand.joints}
+    reach = np.linalg.norm(vertices - np.array(joints["left_middle"].anchor), axis=-1).max()
+    assert reach == pytest.approx(0.059, abs=1e-3)
+    assert not any("meshes were not found" in note for note in proposal.notes)
+    (tmp_path / "pad.stl").unlink()
+    assert any("1 meshes were not found" in note for note in import_hand(tmp_path / "claw.urdf").notes)
