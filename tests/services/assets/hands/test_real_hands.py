@@ -13,6 +13,7 @@ import importlib.util
 import os
 import pathlib
 import re
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ class Known:
     fingers: int
     thumb: str
     """A word in the names of the thumb's links; empty where any finger may be it."""
-    flexes: dict[str, float]
+    flexes: Mapping[str, float]
     """The sign in which joints close."""
     opening: tuple[float, float]
     """m, between thumb and fingers of the open hand."""
