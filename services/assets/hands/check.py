@@ -230,7 +230,7 @@ def _opening(hand: Hand) -> Finding:
         _verdict(share, *_FITTING),
         f"{100 * clear:.1f} cm clear; {100 * share:.0f} % of the objects (x {hand.object_scale:g}) have a narrower "
         f"side, {100 * np.median(widths):.1f} cm in the middle",
-        f"object_scale {max(clear / scale, 0.1):.1f} (import with --object-scale), or open the open_pose",
+        f"object_scale {max(np.floor(10 * clear / scale) / 10, 0.1):.1f} (import with --object-scale), or open the open_pose",
     )
 
 

@@ -191,4 +191,4 @@ def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(hand,
     trained = bundles.load(policy_file(None, "claw"))
     assert trained.version == last and trained.spec.hand == hand.reference
     assert policy.read_bytes() == own_policy_file("claw").read_bytes()
-    assert first >= 2 and (run_dir / "mark").exists()  # one that begins anew clears its folder
+    assert first >= 1 and (run_dir / "mark").exists()  # one that begins anew clears its folder

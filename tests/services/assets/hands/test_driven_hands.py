@@ -13,7 +13,7 @@ from common.hands.files import hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import chain_of
 from services.assets.hands.model_files import describe, import_hand
-from services.assets.hands.visual import MAX_FACES, load_meshes, save_meshes
+from services.assets.hands.visual import MAX_FACES, load_meshes, save_meshes, skin_of_meshes
 from services.cli import main
 from services.viz.hand_sheets import hands_sheet
 
@@ -132,8 +132,10 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
     vertices, faces = found["palm"]  # the box of the file, in the palm's frame
     np.testing.assert_allclose([vertices.min(0), vertices.max(0)], [[-0.012, -0.04, -0.005], [0.012, 0.04, 0.085]])
     assert len(faces) == 12
-    with_meshes, bare = (hands_sheet([driven.hand], [x], size=(40, 40)) for x in (found, {}))
-    assert np.abs(with_meshes.astype(int) - bare).max() > 30
+    skin = skin_of_meshes(driven.hand, {"palm": found["palm"]})  # of the other links their capsules
+    assert np.abs(skin.points[:8] - vertices).max() == 0 and len(skin.weights.T) == len(driven.hand.links)
+    drawn, own = (hands_sheet([driven.hand], [x], size=(40, 40)) for x in (skin, None))
+    assert np.abs(drawn.astype(int) - own).max() > 30
     assert main.run(["hands", "sheet", "driven", "--out", str(tmp_path / "sheet.png")]) == 0
 
     def refused(word, meshes):
