@@ -34,7 +34,7 @@ from services.serve.load import example_episode, wait_until_ready
 
 STOPS = {"solref": (0.005, 1.0), "solimp": (0.9999, 0.9999, 0.001, 0.5, 2.0)}
 """MuJoCo's stops at the ends of the finger joints are springs: these are as stiff as its time step allows."""
-GIVE = 0.002
+GIVE = 0.003
 """rad that such a stop gives under contact: beyond that a joint has left its limits."""
 HOLD_STEPS = 200
 """Control steps without the table, after which a grasp is held or lost."""
