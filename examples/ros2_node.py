@@ -188,27 +188,23 @@ class PolicyNode:
 
     def step(self) -> congrasp.Command | None:
         """Reads the topics and commands; None until the episode has begun."""
-        seen = self._read()
-        if self._base is None and seen is not None:
-            self._begin(*seen)
+        joints, palm, thing = self._read()
+        if self._base is None and joints is not None and palm is not None and thing is not None:
+            self._begin(joints, palm, thing)
         if self._base is None:
             return None
-        command = self._guard.step(self._state(*seen) if seen is not None else {})
+        command = self._guard.step(self._state(joints, palm, thing))
         self._followed += command.mode == "follow"
         self._publish(command)
         return command
 
-    def _read(self) -> tuple[Any, Pose, Pose] | None:
-        """Joints, palm and object as the topics say; None while one of them is silent or says no pose."""
-        latest = self._bus.latest()
+    def _read(self) -> tuple[Any | None, Pose | None, Pose | None]:
+        """Joints, palm and object as the topics say; None for one that is silent or says no pose."""
         now = time.monotonic()
-        if len(latest) < len(INPUTS) or any(now - came > SILENT for _, came in latest.values()):
-            return None
-        joints, wrist, thing = (latest[topic][0] for topic in INPUTS)
-        palm, file = pose_of(wrist), pose_of(thing)
-        if palm is None or file is None:
-            return None
-        return joints, palm, (file[0] - file[1].apply(self._object.origin), file[1])  # its frame is about its centre
+        heard = {topic: message for topic, (message, came) in self._bus.latest().items() if now - came <= SILENT}
+        palm, file = (pose_of(heard[topic]) if topic in heard else None for topic in ("wrist_pose", "object_pose"))
+        thing = file and (file[0] - file[1].apply(self._object.origin), file[1])  # its frame is about its centre
+        return heard.get("joint_states"), palm, thing
 
     def _begin(self, joints: Any, palm: Pose, thing: Pose) -> None:
         """Begins an episode where hand and object are, unless a joint is missing."""
@@ -225,19 +221,19 @@ class PolicyNode:
         self._guard.reset(request)
         self._base = palm
 
-    def _state(self, joints: Any, palm: Pose, thing: Pose) -> dict[str, np.ndarray]:
-        """What `Policy.act` takes."""
+    def _state(self, joints: Any | None, palm: Pose | None, thing: Pose | None) -> dict[str, np.ndarray]:
+        """What `Policy.act` takes, as far as it is known."""
         assert self._base is not None
-        base, base_turn = self._base
-        state = {
-            "q": self._by_name(joints.name, joints.position),
-            "u": np.append(base_turn.inv().apply(palm[0] - base), (base_turn.inv() * palm[1]).as_euler("XYZ")),
-            "object_position": thing[0],
-            "object_quaternion": thing[1].as_quat(scalar_first=True),
-            "table": np.asarray(self._followed < self._approach_steps),
-        }
-        if len(joints.velocity) == len(joints.name):
-            state["q_velocity"] = self._by_name(joints.name, joints.velocity)
+        state = {"table": np.asarray(self._followed < self._approach_steps)}
+        if joints is not None:
+            state["q"] = self._by_name(joints.name, joints.position)
+            if len(joints.velocity) == len(joints.name):
+                state["q_velocity"] = self._by_name(joints.name, joints.velocity)
+        if palm is not None:
+            back = self._base[1].inv()
+            state["u"] = np.append(back.apply(palm[0] - self._base[0]), (back * palm[1]).as_euler("XYZ"))
+        if thing is not None:
+            state |= {"object_position": thing[0], "object_quaternion": thing[1].as_quat(scalar_first=True)}
         return state
 
     def _by_name(self, names: Any, values: Any) -> np.ndarray:

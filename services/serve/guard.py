@@ -126,22 +126,27 @@ class Guard:
         self._limits, self._open = limits, as_numbers(open_pose, fingers)
         self._period, self._wait, self._stale, self._hold = period, wait, stale, hold
         self._fallback, self._clock, self._fingers = fallback, clock, fingers
+        self._needed = {"q": fingers, "u": 6, "object_position": 3, "object_quaternion": 4}
         self._limiter: Limiter | None = None
         self._wanted, self._fresh = np.zeros(fingers + 6), clock()
         self._answer: Answer | None = None
         self._latched = False
         self._asker = _Asker(policy)
 
-    def reset(self, request: GraspRequest) -> None:
+    def reset(self, request: GraspRequest, *, moved: bool = False) -> None:
         """Begins an episode; what is under way of the one before counts no more.
 
         Args:
-          request: see `Policy.reset`; the targets start from its `q`.
+          request: see `Policy.reset`; the wrist's targets start from its `wrist`, where the hand must be, and those of
+            the fingers go on from the last command. The first episode's start from its `q`.
+          moved: somebody else has moved the fingers since the last command: they, too, start from `q`.
 
         Raises:
           CongraspError: its `q` is not a finite angle for each finger joint.
         """
         start = np.append(as_numbers(request.q, self._fingers), np.zeros(6))
+        if self._limiter is not None and not moved and np.isfinite(start).all():
+            start[: self._fingers] = self._limiter.target[: self._fingers]
         self._limiter = Limiter(self._limits, start, period=self._period)
         self._wanted, self._fresh = self._limiter.target, self._clock()
         self._answer, self._latched = None, False
@@ -151,7 +156,7 @@ class Guard:
         """The next command; returns after `wait` seconds at most, and raises nothing for what is wrong with a state.
 
         Args:
-          state: see `Policy.act`; with `q_velocity` and `u_velocity` the torque's damping counts.
+          state: see `Policy.act`; what it lacks counts as not measured, but for velocities, which are then taken as 0.
 
         Raises:
           RefusedError: there is no episode yet.
@@ -160,7 +165,8 @@ class Guard:
             raise RefusedError("There is no episode yet.", "Begin one with reset.")
         now = self._clock()
         targets = dict(zip(("q_target", "u_target"), np.split(self._limiter.target, [self._fingers]), strict=True))
-        self._take(self._asker.exchange({**state, **targets}, now, self._wait))
+        lacking = {name: np.full(size, np.nan) for name, size in self._needed.items() if name not in state}
+        self._take(self._asker.exchange({**state, **lacking, **targets}, now, self._wait))
         mode = self._mode()
         if mode == "open":
             self._wanted = np.append(self._open, self._limiter.target[self._fingers :])

@@ -109,6 +109,16 @@ def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episo
         assert guard.step(STATE).mode == "follow"
 
 
+def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_them():
+    clock, policy = Clock(), ScriptedPolicy(TransportError("Nobody is there."))
+    elsewhere = GraspRequest(q=np.array([-0.6, 0.2]))
+    with guarded(policy, clock) as guard:
+        guard.reset(elsewhere)
+        np.testing.assert_array_equal(guard.step({}).q_target, np.zeros(FINGERS))
+        guard.reset(elsewhere, moved=True)
+        np.testing.assert_array_equal(guard.step({}).q_target, elsewhere.q)
+
+
 def test_the_hand_goes_on_when_the_policy_is_back_while_it_holds():
     clock, policy = Clock(), ScriptedPolicy(TransportError("Nobody is there."))
     with guarded(policy, clock) as guard:
@@ -169,6 +179,19 @@ def test_a_policy_that_hangs_does_not_hold_the_loop_up():
     guard.close()
 
 
+def test_the_policy_is_told_what_is_not_measured():
+    """A client's query would have zeros there."""
+    policy = ScriptedPolicy(answer(np.zeros(FINGERS)))
+    with guarded(policy, Clock()) as guard:
+        guard.step({"u": np.zeros(6)})
+    (state,) = policy.states
+    assert {name: value.shape for name, value in state.items() if np.isnan(value).all()} == {
+        "q": (FINGERS,),
+        "object_position": (3,),
+        "object_quaternion": (4,),
+    }
+
+
 @pytest.mark.parametrize(
     ("outcome", "counter"),
     [
@@ -200,13 +223,19 @@ TIMES = st.one_of(st.floats(-0.1, 1.0), st.just(float("nan")))
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(OUTCOMES, STATES, TIMES), min_size=1, max_size=12), st.sampled_from(["freeze", "open"]))
+@given(
+    st.lists(st.tuples(OUTCOMES, STATES, TIMES, st.booleans()), min_size=1, max_size=12),
+    st.sampled_from(["freeze", "open"]),
+)
 def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(steps, fallback):
     clock, policy = Clock(), ScriptedPolicy(None)
     with guarded(policy, clock, fallback=fallback) as guard:
         last = np.zeros(FINGERS + 6)
-        for outcome, state, passed in steps:
+        for outcome, state, passed, begins in steps:
             policy.outcome = outcome
+            if begins:
+                guard.reset(GraspRequest(q=np.full(FINGERS, 9.0)))
+                last[FINGERS:] = 0.0
             clock.now += passed
             command = guard.step(state)
             target = np.append(command.q_target, command.u_target)
