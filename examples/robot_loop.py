@@ -144,6 +144,11 @@ class Server:
             env=environment,
         )
 
+    @property
+    def pid(self) -> int:
+        """Number of its process."""
+        return self._process.pid
+
     def kill(self) -> None:
         """Kills it (SIGKILL)."""
         self._process.kill()
