@@ -40,6 +40,7 @@ class JointLimits:
                 raise CongraspError(f"The limits' '{field.name}' must be one finite number for each joint.")
             if field.name not in ("lower", "upper") and not (value >= 0.0).all():
                 raise CongraspError(f"The limits' '{field.name}' must not be negative.")
+            value.flags.writeable = False
             object.__setattr__(self, field.name, value)
         if not (self.lower <= self.upper).all() or not (self.kp > 0.0).all():
             raise CongraspError("The limits have a lower bound above the upper one, or a kp that is not positive.")
@@ -65,12 +66,13 @@ class JointLimits:
           wrist_angular_speed: rad/s about each.
           reach: m that the wrist may be from where it was at the episode's begin, along each axis.
           turn: rad, likewise.
-          margin: rad that finger targets keep from the ends of their joints.
+          margin: rad that finger targets keep from the ends of their joints; narrow joints stay in their middle.
         """
         wrist, joints = hand.wrist, hand.joints
+        middle = (hand.lower + hand.upper) / 2
         return cls(
-            lower=np.append(hand.lower + margin, np.repeat([-reach, -turn], 3)),
-            upper=np.append(hand.upper - margin, np.repeat([reach, turn], 3)),
+            lower=np.append(np.minimum(hand.lower + margin, middle), np.repeat([-reach, -turn], 3)),
+            upper=np.append(np.maximum(hand.upper - margin, middle), np.repeat([reach, turn], 3)),
             speed=np.append(np.full(len(joints), finger_speed), np.repeat([wrist_speed, wrist_angular_speed], 3)),
             torque=np.append([j.torque_limit for j in joints], np.repeat([wrist.slide_limit, wrist.hinge_limit], 3)),
             kp=np.append([j.kp for j in joints], np.repeat([wrist.slide_kp, wrist.hinge_kp], 3)),
@@ -160,6 +162,6 @@ def as_numbers(value: Any, size: int) -> np.ndarray:
     """(size,) float64; NaN throughout for what is no such array."""
     try:
         array = np.asarray(value, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return np.full(size, np.nan)
     return array if array.shape == (size,) else np.full(size, np.nan)

@@ -25,7 +25,19 @@ NEAR = st.floats(-2.0, 2.0)
 VALUES = st.one_of(
     st.lists(st.one_of(NEAR, ANY), min_size=JOINTS, max_size=JOINTS).map(np.array),
     st.lists(ANY, max_size=5),
-    st.sampled_from([None, "far", math.nan, [[0.0] * JOINTS], [None] * JOINTS, [1j] * JOINTS, ["x"] * JOINTS, {}]),
+    st.sampled_from(
+        [
+            None,
+            "far",
+            math.nan,
+            [[0.0] * JOINTS],
+            [None] * JOINTS,
+            [1j] * JOINTS,
+            [10**400] * JOINTS,
+            ["x"] * JOINTS,
+            {},
+        ]
+    ),
 )
 STEPS = st.lists(st.tuples(VALUES, VALUES, VALUES, st.one_of(st.floats(0.0, 1.0), ANY)), min_size=1, max_size=20)
 
@@ -83,6 +95,8 @@ def test_limits_of_a_hand_are_those_of_its_model():
     hand = get_hand("allegro")
     limits = JointLimits.of_hand(hand, margin=0.01)
     np.testing.assert_allclose(limits.lower[:16], hand.lower + 0.01, atol=1e-6)
+    narrow = JointLimits.of_hand(hand, margin=9.0)
+    np.testing.assert_allclose(narrow.lower[:16], (hand.lower + hand.upper) / 2, atol=1e-6)
     assert limits.torque[0] == 0.7 and limits.torque[16] == hand.wrist.slide_limit
     assert limits.kp[-1] == hand.wrist.hinge_kp and len(limits.speed) == 22
 
@@ -94,6 +108,8 @@ def test_limits_that_are_none_are_refused(wrong):
     fields = {"lower": [-1.0], "upper": [1.0], "speed": [1.0], "torque": [1.0], "kp": [1.0], "kv": [0.0]}
     with pytest.raises(CongraspError, match="limits"):
         JointLimits(**{name: np.array(value) for name, value in {**fields, **wrong}.items()})
+    with pytest.raises(ValueError, match="read-only"):
+        LIMITS.upper[0] = np.nan
     with pytest.raises(CongraspError, match="finite"):
         Limiter(LIMITS, np.array([0.0, math.inf, 0.0]))
 
