@@ -31,24 +31,31 @@ if TYPE_CHECKING:
     from services.export.motion_file import GraspMotion, load_motion, save_motion
     from services.grasp.grasper import Grasp, Grasper, grasp
     from services.serve.client import PolicyClient
+    from services.serve.guard import Command, Guard
+    from services.serve.limits import JointLimits
     from services.serve.local import load_policy
     from services.serve.policy import Answer, Policy
+    from services.serve.ticker import Ticker
 
 __all__ = [
     "Answer",
+    "Command",
     "CongraspError",
     "ContradictionError",
     "Grasp",
     "GraspMotion",
     "GraspRequest",
     "Grasper",
+    "Guard",
     "ImportOptions",
+    "JointLimits",
     "LateError",
     "OverloadedError",
     "PhysicsError",
     "Policy",
     "PolicyClient",
     "RefusedError",
+    "Ticker",
     "TransportError",
     "UnknownConstraintError",
     "grasp",
@@ -59,13 +66,17 @@ __all__ = [
 
 _MODULES = {
     "Answer": "services.serve.policy",
+    "Command": "services.serve.guard",
     "Grasp": "services.grasp.grasper",
     "GraspMotion": "services.export.motion_file",
     "GraspRequest": "common.request",
     "Grasper": "services.grasp.grasper",
+    "Guard": "services.serve.guard",
     "ImportOptions": "services.assets.objects.options",
+    "JointLimits": "services.serve.limits",
     "Policy": "services.serve.policy",
     "PolicyClient": "services.serve.client",
+    "Ticker": "services.serve.ticker",
     "grasp": "services.grasp.grasper",
     "load_motion": "services.export.motion_file",
     "load_policy": "services.serve.local",

@@ -21,6 +21,7 @@ import congrasp
 assert not [name for name in sys.modules if name.partition(".")[0] in ("common", "services", "numpy", "zenoh")]
 request = congrasp.GraspRequest({{"heading": {{"direction": (0, 0, -1)}}}})
 congrasp.Answer, congrasp.Policy, congrasp.UnknownConstraintError
+congrasp.Guard, congrasp.Command, congrasp.JointLimits, congrasp.Ticker
 try:
     congrasp.PolicyClient("tcp/127.0.0.1:1", wait=0.1)
 except congrasp.RefusedError:

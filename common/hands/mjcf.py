@@ -10,11 +10,13 @@ from common.hands.spec import Hand, Link, link_origin
 HAND_CONTYPE = 1
 """Collision bit of the hand: whatever collides with it has this bit in its conaffinity."""
 _COUPLING_TIME = 0.005  # s, within which a joint is again where its leader puts it
+CONTACT_TIME = 0.006
+"""Seconds, the time constant of contacts that are as stiff as a hand of flesh or rubber needs them."""
 WRIST_JOINTS = ("wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz")
 
 
 def add_hand(
-    spec: mujoco.MjSpec, hand: Hand, *, self_collision: bool = False, contact_time: float = 0.006
+    spec: mujoco.MjSpec, hand: Hand, *, self_collision: bool = False, contact_time: float = CONTACT_TIME
 ) -> mujoco.MjsBody:
     """Adds the hand under a fixed body `hand_base` and returns that body.
 
@@ -71,7 +73,7 @@ def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
             body.add_freejoint()
         for joint in link.joints:
             body.add_joint(name=joint.name, axis=joint.axis, pos=joint.anchor)
-        _add_capsules(body, link, np.zeros(3), True, 0.02)
+        _add_capsules(body, link, np.zeros(3), True, CONTACT_TIME)
     model = spec.compile()
     data = mujoco.MjData(model)
     found: set[tuple[int, int]] = set()

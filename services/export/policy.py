@@ -26,6 +26,7 @@ from common.policy.network import gated
 from common.task import observation
 from common.task.geometry import FORCE_SCALE
 from common.wire.codec import encode
+from services.serve.limits import JointLimits
 
 TOLERANCE = 1e-5
 """Largest absolute difference between an exported policy and the Flax policy that is let through, in action units."""
@@ -46,6 +47,7 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
         "bundle": content_hash(encode(bundle.to_message())),
         "units": "m, rad, s, N; quaternions (w, x, y, z); the world's z axis points up, the table's top is at z = 0",
         "control_dt": task.control_dt,
+        "rate_hz": 1.0 / task.control_dt,
         "layout": [[name, size] for name, size in bundle.spec.layout],
         "observation": observation_fields(bundle),
         "masks": list(gated(bundle.spec.layout)),
@@ -53,6 +55,7 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
         "action_std": np.exp(np.asarray(bundle.params["actor"]["log_std"])).tolist(),
         "joints": joints,
         "joint_limits": [[joint.lower, joint.upper] for joint in hand.joints],
+        "robot_limits": robot_limits(hand),
         "open_pose": hand.q_open.tolist(),
         "motors": motors(hand),
         "wrist_joints": list(WRIST_JOINTS),
@@ -85,6 +88,16 @@ def observation_fields(bundle: PolicyBundle) -> list[dict[str, Any]]:
         for block, _ in bundle.spec.layout
         for field in described[block]
     ]
+
+
+def robot_limits(hand: Hand) -> dict[str, list[float]]:
+    """Limits of targets and torques, and the servos' gains, in the order of the action: `JointLimits` by field.
+
+    Fingers in rad, rad/s, N.m, N.m/rad and N.m.s/rad; the wrist's slides in m, m/s, N, N/m and N.s/m, its hinges as
+    the fingers.
+    """
+    limits = JointLimits.of_hand(hand)
+    return {field.name: getattr(limits, field.name).tolist() for field in dataclasses.fields(limits)}
 
 
 def wrist_servos(hand: Hand) -> dict[str, dict[str, Any]]:
@@ -127,12 +140,18 @@ def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
     """The action's numbers in order: the motor or wrist joint, the scale, and how a target comes of them."""
     control = bundle.task.control
     fingers = [
-        {"joint": motor.name, "scale": control.finger_scale, "target": "clip(previous target + scale * action, limits)"}
+        {
+            "joint": motor.name,
+            "unit": "rad",
+            "scale": control.finger_scale,
+            "target": "clip(previous target + scale * action, limits)",
+        }
         for motor in get_hand(bundle.spec.hand).motors
     ]
     wrist = [
         {
             "joint": name,
+            "unit": "m" if i < 3 else "rad",
             "scale": control.wrist_position_scale if i < 3 else control.wrist_rotation_scale,
             "target": "joint + lead; lead = steady + limit(limit(limit(guidance - joint, L) + scale * action, L) "
             "- steady, inertia / kp * A), steady = kv / kp * velocity, limit shortens the three slides or hinges "

@@ -13,6 +13,7 @@ from common.wire.codec import Message
 from services.serve.policy import Answer, Policy, State
 
 _REQUIRED = ("surface", "q", "wrist", "object_pose")
+_MEASURED = ("q", "u", "object_position", "object_quaternion")
 
 
 class EpisodePolicy(Policy):
@@ -127,6 +128,8 @@ class _Packer:
         """The episode's query in each of several states."""
         vectors = np.tile(self._episode, (len(states), 1))
         for vector, state in zip(vectors, states, strict=True):
+            if lacking := [name for name in _MEASURED if name not in state]:
+                raise RefusedError(f"The query lacks the field '{lacking[0]}'.")
             for name, value in state.items():
                 self._write(vector, name, _numbers(name, value))
         return Message({"packed": vectors}, {**meta, "layout": self._digest})

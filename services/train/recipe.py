@@ -30,14 +30,13 @@ from common.config import (
     TaskConfig,
 )
 from common.hands.measures import tip_forces
+from common.hands.mjcf import CONTACT_TIME
 from common.hands.spec import Hand
 
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
 """Families that are hardest to hold by a part; twice as many of them are trained on."""
 ARM = ControlConfig(wrist_acceleration=15.0, wrist_angular_acceleration=150.0)
 """The wrist moves as an arm does."""
-CONTACT_TIME = 0.006
-"""Seconds; the task's default is what the pretrained policies learnt with."""
 _FORCE, _HEADING, _AFFORDANCE = 5.0, 12.0, 0.6  # of the human hand: N, weight, share of the episodes
 _STRONG = 0.3  # share of its fingertips' strength that a strong hand needs
 

@@ -224,13 +224,13 @@ def _opening(hand: Hand) -> Finding:
     clear = grasp_frame(hand).opening - float(radii[0] + radii[1:].mean())
     widths = hand.object_scale * np.array([np.ptp(obj.points, axis=0).min() for obj in _objects()])
     share = float((widths < clear).mean())
-    scale = float(np.quantile(widths, _FITTING[0])) / hand.object_scale
+    scale = hand.object_scale * clear / float(np.quantile(widths, _FITTING[0]))
     return _finding(
         "opening",
         _verdict(share, *_FITTING),
         f"{100 * clear:.1f} cm clear; {100 * share:.0f} % of the objects (x {hand.object_scale:g}) have a narrower "
         f"side, {100 * np.median(widths):.1f} cm in the middle",
-        f"object_scale {max(np.floor(10 * clear / scale) / 10, 0.1):.1f} (import with --object-scale), or open the open_pose",
+        f"object_scale {max(np.floor(10 * scale) / 10, 0.1):.1f} (import with --object-scale), or open the open_pose",
     )
 
 

@@ -30,6 +30,7 @@ from common.task.constraints import blocks, goal_of
 from common.task.features import scene_of
 from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from services.export import policy as exports
+from services.serve.limits import JointLimits, Limiter
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "examples" / "onnx_grasp.py"
@@ -77,6 +78,19 @@ def test_the_file_says_what_every_number_is(bundle: PolicyBundle, tmp_path: path
     assert session.get_inputs()[0].shape == ["batch", sum(field["size"] for field in meta["observation"])]
     assert session.get_outputs()[0].shape == ["batch", len(meta["action"])]
     assert "w, x, y, z" in meta["units"] and meta["version"] == 7
+    units = [entry["unit"] for entry in meta["action"]]
+    assert units == ["rad"] * 20 + ["m"] * 3 + ["rad"] * 3 and meta["rate_hz"] == 100.0
+
+
+def test_the_file_s_limits_and_gains_are_those_of_the_hand(bundle: PolicyBundle, tmp_path: pathlib.Path) -> None:
+    exports.export_policy(bundle, "onnx", tmp_path / "policy.onnx")
+    stored = onnxruntime.InferenceSession(tmp_path / "policy.onnx").get_modelmeta().custom_metadata_map
+    limits, joints = JointLimits(**json.loads(stored["robot_limits"])), get_hand("human").joints
+    for name, wanted in {"torque": "torque_limit", "kp": "kp", "kv": "kv"}.items():
+        np.testing.assert_allclose(getattr(limits, name)[:-6], [getattr(joint, wanted) for joint in joints])
+    q_open = np.append(get_hand("human").q_open, np.zeros(6))
+    limited = Limiter(limits, q_open).limit(np.full(26, np.nan), q_open, np.zeros(26), 0.0)
+    assert np.isfinite(limited.target).all() and limited.by == ("not_finite",)
 
 
 @pytest.mark.parametrize("kind", ["onnx", "stablehlo"])

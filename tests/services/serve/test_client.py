@@ -135,7 +135,11 @@ def test_a_server_of_another_layout_in_the_first_ones_place_is_asked_by_names(en
 
 @pytest.mark.parametrize(
     ("state", "words"),
-    [({**STATE, "weight": np.zeros(1)}, "unknown field 'weight'"), ({**STATE, "u": np.zeros(5)}, r"shape \(5,\)")],
+    [
+        ({**STATE, "weight": np.zeros(1)}, "unknown field 'weight'"),
+        ({**STATE, "u": np.zeros(5)}, r"shape \(5,\)"),
+        ({name: value for name, value in STATE.items() if name != "q"}, "lacks the field 'q'"),
+    ],
 )
 def test_a_bad_state_is_refused_with_the_same_error_before_and_after_packing(endpoint, state, words):
     server = CannedServer(endpoint)

@@ -1,0 +1,56 @@
+"""The clock of a control loop: ticks at a rate, with what became late counted; needs nothing but numpy."""
+
+import collections
+import time
+
+import numpy as np
+
+from common.errors import CongraspError
+
+_KEPT = 6000  # ticks whose jitter is kept: a minute at 100 Hz
+
+
+class Ticker:
+    """Ticks at multiples of a period.
+
+    A tick that is late by a period or more has missed its deadline: those that were missed are left out, so that they
+    do not come in a burst.
+
+    Attributes:
+      period: s.
+      ticks: how many there were.
+      missed: how many were left out.
+      longest_ms: greatest lateness of a tick.
+    """
+
+    def __init__(self, rate: float):
+        """The first tick is due at once.
+
+        Args:
+          rate: Hz, at most 100: the policies act every 10 ms.
+        """
+        if not 0.0 < rate <= 100.0:
+            raise CongraspError(f"The rate is {rate:g} Hz.", "The policies act at up to 100 Hz.")
+        self.period = 1.0 / rate
+        self.ticks = self.missed = 0
+        self.longest_ms = 0.0
+        self._due = time.monotonic()
+        self._late: collections.deque[float] = collections.deque(maxlen=_KEPT)
+
+    def wait(self) -> float:
+        """Waits until the next tick; returns the time of `time.monotonic` then."""
+        while (rest := self._due - time.monotonic()) > 0:
+            time.sleep(rest)
+        now = time.monotonic()
+        late = now - self._due
+        skipped = int(late / self.period)
+        self.ticks += 1
+        self.missed += skipped
+        self._due += (1 + skipped) * self.period
+        self._late.append(1e3 * late)
+        self.longest_ms = max(self.longest_ms, 1e3 * late)
+        return now
+
+    def jitter_ms(self, percentile: float) -> float:
+        """A percentile of how late the last minute's ticks were, ms."""
+        return float(np.percentile(self._late, percentile)) if self._late else 0.0

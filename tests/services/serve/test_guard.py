@@ -1,0 +1,271 @@
+"""What reaches a robot while its policy answers, is silent, late, wrong or away."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.errors import CongraspError, RefusedError, TransportError
+from common.request import GraspRequest
+from services.serve.guard import Guard
+from services.serve.limits import JointLimits
+from services.serve.policy import Answer
+from services.serve.ticker import Ticker
+
+FINGERS = 2
+OPEN = np.array([0.3, -0.3])
+LIMITS = JointLimits(
+    lower=np.append([-1.0, -0.4], np.full(6, -0.2)),
+    upper=np.append([1.0, 0.4], np.full(6, 0.2)),
+    speed=np.full(8, 5.0),
+    torque=np.full(8, 1.0),
+    kp=np.full(8, 2.0),
+    kv=np.full(8, 0.1),
+)
+REQUEST = GraspRequest(q=np.zeros(FINGERS))
+STATE = {"q": np.zeros(FINGERS), "u": np.zeros(6)}
+
+
+def answer(value: object, wrist: object = None) -> Answer:
+    wrist = np.zeros(6) if wrist is None else wrist
+    return Answer(value, wrist, np.zeros(8), 1, (), 0.0, 0.0)  # type: ignore[arg-type]
+
+
+class ScriptedPolicy:
+    """Gives `outcome` (an answer, an exception or a function of the state), and keeps what it was asked."""
+
+    def __init__(self, outcome):
+        self.outcome, self.states, self.requests = outcome, [], []
+
+    def reset(self, request):
+        self.requests.append(request)
+
+    def act(self, state):
+        self.states.append(state)
+        outcome = self.outcome(state) if callable(self.outcome) else self.outcome
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    def close(self):
+        pass
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def guarded(policy, clock, **options):
+    """A guard of a slow loop, so that the policy's thread has time to answer, in an episode."""
+    guard = Guard(policy, LIMITS, OPEN, period=0.5, wait=0.4, clock=clock, **{"stale": 0.6, "hold": 2.0, **options})
+    guard.reset(REQUEST)
+    return guard
+
+
+def test_answers_are_followed_from_the_targets_that_were_commanded():
+    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.9, 0.9])))
+    with guarded(policy, clock) as guard:
+        first = guard.step(STATE)
+        clock.now += 0.01
+        second = guard.step(STATE)
+    assert first.mode == second.mode == "follow" and second.answer is policy.outcome
+    np.testing.assert_allclose(first.q_target, [0.5, 0.4])  # 1 N.m over 2 N.m/rad ahead of the joint; its limit
+    np.testing.assert_allclose(first.q_torque, [1.0, 0.8])
+    np.testing.assert_array_equal(policy.states[0]["q_target"], np.zeros(FINGERS))
+    np.testing.assert_array_equal(policy.states[1]["q_target"], first.q_target)
+    assert policy.requests == [REQUEST]
+    assert guard.counters.follow == guard.counters.answers == 2 and guard.counters.position == 2
+
+
+@pytest.mark.parametrize("fallback", ["freeze", "open"])
+def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episode(fallback):
+    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    with guarded(policy, clock, fallback=fallback) as guard:
+        guard.step(STATE)
+        policy.outcome = TransportError("Nobody is there.")
+        modes = []
+        for _ in range(5):
+            clock.now += 0.5
+            command = guard.step(STATE)
+            modes.append(command.mode)
+        assert modes == ["follow", "hold", "hold", "hold", fallback]  # 0.5 s is fresh still; 2 s have gone at the last
+        assert guard.trouble == "Nobody is there." and guard.counters.lost == 5
+        np.testing.assert_allclose(command.q_target, OPEN if fallback == "open" else [0.2, 0.1])
+        policy.outcome = answer(np.array([-0.5, 0.0]))
+        clock.now += 0.5
+        latched = guard.step(STATE)
+        assert latched.mode == fallback and guard.trouble == ""
+        np.testing.assert_allclose(latched.q_target, command.q_target)
+        guard.reset(REQUEST)
+        assert guard.step(STATE).mode == "follow"
+
+
+def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_them():
+    clock, policy = Clock(), ScriptedPolicy(TransportError("Nobody is there."))
+    elsewhere = GraspRequest(q=np.array([-0.6, 0.2]))
+    with guarded(policy, clock) as guard:
+        guard.reset(elsewhere)
+        np.testing.assert_array_equal(guard.step({}).q_target, np.zeros(FINGERS))
+        guard.reset(elsewhere, moved=True)
+        np.testing.assert_array_equal(guard.step({}).q_target, elsewhere.q)
+
+
+def test_the_hand_goes_on_when_the_policy_is_back_while_it_holds():
+    clock, policy = Clock(), ScriptedPolicy(TransportError("Nobody is there."))
+    with guarded(policy, clock) as guard:
+        assert guard.step(STATE).mode == "hold"
+        policy.outcome = answer(np.array([0.1, 0.1]))
+        clock.now += 1.0
+        assert guard.step(STATE).mode == "follow"
+    assert len(policy.requests) == 2  # the first episode had not begun there
+
+
+def test_an_answer_to_an_old_state_is_thrown_away():
+    clock = Clock()
+
+    def late(state):
+        clock.now += 0.7
+        return answer(np.array([0.2, 0.2]))
+
+    with guarded(ScriptedPolicy(late), clock) as guard:
+        command = guard.step(STATE)
+    assert command.mode == "hold" and guard.counters.stale == 1
+    np.testing.assert_array_equal(command.q_target, np.zeros(FINGERS))
+
+
+def test_after_an_answer_that_came_late_the_next_is_waited_for():
+    slow, done = threading.Event(), threading.Event()
+
+    def act(state):
+        if not slow.is_set():
+            slow.set()
+            done.wait(20.0)
+        return answer(state["q"])
+
+    clock, policy = Clock(), ScriptedPolicy(act)
+    with Guard(policy, LIMITS, OPEN, period=0.5, wait=0.4, stale=0.6, hold=2.0, clock=clock) as guard:
+        guard.reset(REQUEST)
+        guard._wait = 0.0
+        assert guard.step(STATE).mode == "hold"
+        done.set()
+        while guard._asker._outcome is None:
+            time.sleep(0.001)
+        guard._wait = 0.4
+        clock.now += 0.1
+        assert guard.step({**STATE, "q": np.full(2, 0.1)}).answer.q_target[0] == 0.1
+
+
+def test_a_policy_that_hangs_does_not_hold_the_loop_up():
+    release, policy = threading.Event(), ScriptedPolicy(lambda state: (release.wait(20.0), answer(np.ones(2)))[1])
+    guard = Guard(policy, LIMITS, OPEN, period=0.01, wait=0.005, stale=0.02, hold=0.05, fallback="freeze")
+    guard.reset(REQUEST)
+    modes = []
+    while not modes or modes[-1] != "freeze":
+        modes.append(guard.step(STATE).mode)
+    assert len(policy.states) == 1 and guard.counters.late == len(modes) and set(modes[:-1]) == {"hold"}
+    guard.reset(REQUEST)
+    release.set()  # what comes back now is of the episode before
+    guard.step(STATE)
+    assert guard.counters.answers <= 1 and not guard.counters.stale
+    guard.close()
+
+
+def test_the_policy_is_told_what_is_not_measured():
+    """A client's query would have zeros there."""
+    policy = ScriptedPolicy(answer(np.zeros(FINGERS)))
+    with guarded(policy, Clock()) as guard:
+        guard.step({"u": np.zeros(6)})
+    (state,) = policy.states
+    assert {name: value.shape for name, value in state.items() if np.isnan(value).all()} == {
+        "q": (FINGERS,),
+        "object_position": (3,),
+        "object_quaternion": (4,),
+    }
+
+
+@pytest.mark.parametrize(
+    ("outcome", "counter"),
+    [
+        (answer(np.array([np.nan, 0.0])), "bad"),
+        (answer(np.zeros(3)), "bad"),
+        (answer(np.zeros(2), np.full(6, np.inf)), "bad"),
+        (RefusedError("No."), "refused"),
+        (TransportError("Away."), "lost"),
+        (ValueError("a fault"), "lost"),
+        (None, "lost"),
+    ],
+)
+def test_what_is_no_answer_is_counted_and_holds(outcome, counter):
+    with guarded(ScriptedPolicy(outcome), Clock()) as guard:
+        command = guard.step(STATE)
+    assert command.mode == "hold" and getattr(guard.counters, counter) == 1 and guard.counters.answers == 0
+    np.testing.assert_array_equal(command.q_target, np.zeros(FINGERS))
+
+
+NUMBERS = st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.floats(-2.0, 2.0))
+ARRAYS = st.one_of(
+    st.lists(NUMBERS, min_size=FINGERS, max_size=FINGERS).map(np.array),
+    st.lists(NUMBERS, min_size=6, max_size=6).map(np.array),
+    st.sampled_from([None, "x", np.zeros((2, 2)), np.zeros(0)]),
+)
+OUTCOMES = st.one_of(st.builds(answer, ARRAYS, ARRAYS), st.sampled_from([TransportError("away"), KeyError("q"), None]))
+STATES = st.dictionaries(st.sampled_from(["q", "u", "q_velocity", "u_velocity", "object_position"]), ARRAYS)
+TIMES = st.one_of(st.floats(-0.1, 1.0), st.just(float("nan")))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.tuples(OUTCOMES, STATES, TIMES, st.booleans()), min_size=1, max_size=12),
+    st.sampled_from(["freeze", "open"]),
+)
+def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(steps, fallback):
+    clock, policy = Clock(), ScriptedPolicy(None)
+    with guarded(policy, clock, fallback=fallback) as guard:
+        last = np.zeros(FINGERS + 6)
+        for outcome, state, passed, begins in steps:
+            policy.outcome = outcome
+            if begins:
+                guard.reset(GraspRequest(q=np.full(FINGERS, 9.0)))
+                last[FINGERS:] = 0.0
+            clock.now += passed
+            command = guard.step(state)
+            target = np.append(command.q_target, command.u_target)
+            assert (target >= LIMITS.lower).all() and (target <= LIMITS.upper).all()
+            assert (np.abs(target - last) <= LIMITS.speed * 0.5 + 1e-12).all()
+            assert (np.abs(np.append(command.q_torque, command.u_torque)) <= LIMITS.torque).all()
+            last = target
+    assert guard.counters.steps == len(steps)
+
+
+def test_what_makes_no_guard_is_refused():
+    for wrong in ({"wait": 0.01}, {"stale": 0.0}, {"hold": 0.01}, {"fallback": "wave"}, {"stale": float("nan")}):
+        with pytest.raises(CongraspError):
+            Guard(ScriptedPolicy(None), LIMITS, OPEN, **wrong)
+    with pytest.raises(CongraspError, match="open pose"):
+        Guard(ScriptedPolicy(None), LIMITS, np.zeros(3))
+    with Guard(ScriptedPolicy(None), LIMITS, OPEN) as guard:
+        with pytest.raises(RefusedError, match="no episode"):
+            guard.step(STATE)
+        with pytest.raises(CongraspError, match="finite"):
+            guard.reset(GraspRequest())
+
+
+def test_a_ticker_counts_the_ticks_that_it_leaves_out():
+    ticker = Ticker(100.0)
+    first = ticker.wait()
+    time.sleep(0.055)
+    late = ticker.wait()
+    assert late - first >= 0.055 and ticker.ticks == 2 and ticker.missed >= 4
+    assert ticker.longest_ms >= 40.0 and ticker.jitter_ms(100) == ticker.longest_ms
+    assert ticker.wait() > late  # at the next multiple of the period, not at once
+    with pytest.raises(CongraspError, match="100 Hz"):
+        Ticker(200.0)

@@ -1,0 +1,70 @@
+"""The example's robot keeps to its limits while its policy server is killed and comes back."""
+
+import dataclasses
+import importlib.util
+import pathlib
+import time
+
+import psutil
+import pytest
+
+import congrasp
+from common.config import NetworkConfig
+from common.hands import get_hand
+from common.policy import bundle as bundles
+from services.serve.load import wait_until_ready
+from services.train.command import untrained
+from services.train.presets import get_preset
+
+EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "robot_loop.py"
+SECONDS = 120.0
+"""That a server has to start."""
+
+
+@pytest.fixture(scope="module")
+def example():
+    spec = importlib.util.spec_from_file_location("robot_loop", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(example, tmp_path):
+    config = dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
+    bundles.save(untrained(config), tmp_path / "policy.safetensors")
+    task, hand = config.task, get_hand(config.task.hand)
+    limits = congrasp.JointLimits.of_hand(hand)
+    robot = example.MujocoRobot(hand, task, 1_000_000, limits)
+    server = example.Server(tmp_path / "policy.safetensors")
+    try:
+        client = congrasp.PolicyClient(server.url, hand=hand.name, timeout=0.2, wait=SECONDS)
+        wait_until_ready(client, SECONDS)
+        with congrasp.Guard(client, limits, hand.q_open, stale=0.1, hold=0.3, fallback="open") as guard:
+            grasps, ticker, counters = example.Grasps(robot, guard, task), congrasp.Ticker(100.0), guard.counters
+
+            def step_until(done):
+                deadline = time.monotonic() + SECONDS
+                while not done():
+                    assert time.monotonic() < deadline, f"{counters} {guard.trouble}"
+                    ticker.wait()
+                    grasps.step()
+
+            step_until(lambda: counters.follow >= 30)
+            process = psutil.Process(server.pid)
+            process.suspend()  # its link stays open, and silent
+            step_until(lambda: counters.fallback >= 5)
+            process.resume()
+            step_until(lambda: grasps.outcomes["given up"] >= 1)
+            before, fallback = grasps.outcomes["given up"], counters.fallback
+            server.kill()
+            answers = counters.answers
+            step_until(lambda: counters.fallback >= fallback + 30)
+            assert counters.hold > 0 and counters.lost > 0 and counters.answers <= answers + 1
+            server.start()
+            step_until(lambda: counters.answers >= answers + 30)
+    finally:
+        server.kill()
+    assert grasps.outcomes["given up"] > before and guard.trouble == ""
+    assert counters.steps == ticker.ticks
+    assert robot.beyond <= 0.0
+    assert robot.fastest <= 1.0 + 1e-6 and robot.strongest <= 1.0 + 1e-6
