@@ -12,6 +12,7 @@ import shutil
 import signal
 import statistics
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -68,7 +69,7 @@ def bench_faults(actors: int, tries: int, kinds: Sequence[str], seed: int = 0) -
     """
     if unknown := set(kinds) - FAULTS.keys():
         raise CongraspError(f"There is no fault '{min(unknown)}'.", f"Choose from: {', '.join(FAULTS)}.")
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 140)
     results: list[Result] = []
     for kind in kinds or FAULTS:
         with tempfile.TemporaryDirectory(prefix="congrasp-") as folder, _disk(folder, kind) as disk:
