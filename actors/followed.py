@@ -17,19 +17,14 @@ class Followed(NamedTuple):
     surface: Surface
     object_index: int
     trace: Trace
-    """As many steps as were wanted; the episode may end before."""
+    """To the episode's last step."""
 
 
 class Follower:
     """Puts the traces of successive rollouts together, from the beginning of an episode on."""
 
-    def __init__(self, steps: int):
-        """Follows nothing yet.
-
-        Args:
-          steps: of an episode that are wanted.
-        """
-        self._steps = steps
+    def __init__(self) -> None:
+        """Follows nothing yet."""
         self._begun: Followed | None = None
 
     def forget(self) -> None:
@@ -46,7 +41,8 @@ class Follower:
           due: whether to follow an episode that begins in it, where none is followed.
 
         Returns:
-          The episode once enough of it is there.
+          The episode with the rollout in which it ends, unless another one ends in it, too: what the rollout says of
+          its last episode would be said of the wrong one.
         """
         if self._begun is not None:
             parts = zip(self._begun.trace, trace, strict=True)
@@ -55,11 +51,11 @@ class Follower:
             self._begun = _begun(before, trace, 0)
         elif due and len(ends := np.flatnonzero(np.asarray(trace.terminal))) and ends[-1] + 1 < len(trace.terminal):
             self._begun = _begun(after, trace, int(ends[-1]) + 1)
-        if self._begun is None or len(self._begun.trace.terminal) < self._steps:
+        if self._begun is None or not len(ends := np.flatnonzero(self._begun.trace.terminal)):
             return None
-        whole = self._begun._replace(trace=Trace(*(field[: self._steps] for field in self._begun.trace)))
+        whole = self._begun._replace(trace=Trace(*(field[: ends[0] + 1] for field in self._begun.trace)))
         self._begun = None
-        return whole
+        return whole if len(ends) == 1 else None
 
 
 def _begun(state: EnvState, trace: Trace, first: int) -> Followed:

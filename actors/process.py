@@ -128,8 +128,7 @@ class _Actor:
         self._on_rollout = on_rollout
         self._bundle: PolicyBundle | None = None
         self._rollouts = self._next_episode = 0
-        task = self._config.task
-        self._follower = Follower(max(task.approach_steps + task.hold_steps, config.rollout_steps))
+        self._follower = Follower()
 
     def act(self, stop: threading.Event) -> None:
         """Rollouts until `stop` is set or the run ends."""

@@ -52,8 +52,6 @@ class Arguments:
     """A policy file instead."""
     object_seed: int = 1_000_000
     """Seed of the procedural object and of the heading."""
-    rate: float = 100.0
-    """Hz."""
     fallback: Literal["freeze", "open"] = "open"
     """What the hand does when half a second went by without a fresh answer."""
 
@@ -193,18 +191,20 @@ def run(arguments: Arguments) -> dict[str, object]:
     policy = policy_file(arguments.policy, arguments.hand)
     task = bundles.load(policy).task
     hand = get_hand(task.hand)
+    if len(hand.motors) != len(hand.joints):
+        raise congrasp.CongraspError(f"Joints of the hand '{hand.name}' are coupled.", "This loop is for other hands.")
     limits = congrasp.JointLimits.of_hand(hand)
     robot = MujocoRobot(hand, task, arguments.object_seed, limits)
     server, kills = Server(policy), 0
     try:
         client = congrasp.PolicyClient(server.url, hand=hand.name, timeout=0.2, wait=180.0)
         wait_until_ready(client)
-        period = 1.0 / arguments.rate
+        period = task.control_dt
         with congrasp.Guard(
             client, limits, hand.q_open, period=period, wait=0.6 * period, fallback=arguments.fallback
         ) as guard:
             grasps = Grasps(robot, guard, task)
-            ticker = congrasp.Ticker(arguments.rate)
+            ticker = congrasp.Ticker(1.0 / period)
             begin = ticker.wait()
             while (now := ticker.wait() - begin) < arguments.seconds:
                 grasps.step()
@@ -239,4 +239,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except congrasp.CongraspError as error:
+        sys.exit(str(error))

@@ -2,7 +2,7 @@
 
     congrasp serve --hand allegro
     python examples/ros2_node.py mug:7 --hand allegro                                 # where there is rclpy
-    python examples/ros2_node.py mug:7 --hand allegro --zenoh tcp/127.0.0.1:7500      # zenoh-bridge-ros2dds, or a robot
+    python examples/ros2_node.py mug:7 --hand allegro --zenoh tcp/127.0.0.1:7447      # zenoh-bridge-ros2dds, or a robot
 
 | topic | type | what |
 |---|---|---|
@@ -13,10 +13,12 @@
 | out: `wrist_command` | geometry_msgs/PoseStamped | where the palm should be |
 
 The episode begins where the hand is when all three have come: before the object, open. Commands keep to the limits of
-`congrasp.JointLimits`; while a topic is silent, or the policy, the hand holds and then opens. Over Zenoh the messages
-are CDR as in ROS 2, under the topics' names, as zenoh-bridge-ros2dds has them.
+`congrasp.JointLimits`; while a topic is silent, or the policy, the hand holds and then opens, and stays open until the
+node is started again. It is for hands with a motor for each joint. Over Zenoh the messages are CDR as in ROS 2, under
+the topics' names, as zenoh-bridge-ros2dds has them.
 """
 
+import contextlib
 import dataclasses
 import importlib
 import pathlib
@@ -273,14 +275,17 @@ def pose_of(message: Any) -> Pose | None:
 def main() -> int:
     """Runs the node until it is interrupted."""
     arguments = tyro.cli(Arguments, description=__doc__)
-    hand, period = get_hand(arguments.hand), 1.0 / arguments.rate
-    bus: Bus = ZenohBus(arguments.zenoh) if arguments.zenoh else RosBus()
+    hand, ticker = get_hand(arguments.hand), congrasp.Ticker(arguments.rate)
+    obj, heading, period = find_object(arguments.object), np.array(arguments.heading), 1.0 / arguments.rate
+    if not np.linalg.norm(heading) > 0.0:
+        raise congrasp.CongraspError("--heading is no direction.", "Give one, such as 0 0 -1.")
+    limits, steps = congrasp.JointLimits.of_hand(hand), round(arguments.approach * arguments.rate)
     client = congrasp.PolicyClient(arguments.connect, hand=hand.name, timeout=0.2, certs=arguments.certs)
-    limits = congrasp.JointLimits.of_hand(hand)
-    with congrasp.Guard(client, limits, hand.q_open, period=period, wait=0.6 * period, fallback="open") as guard:
-        steps = round(arguments.approach * arguments.rate)
-        node = PolicyNode(bus, guard, hand, find_object(arguments.object), np.array(arguments.heading), steps)
-        ticker, mode = congrasp.Ticker(arguments.rate), ""
+    with (
+        congrasp.Guard(client, limits, hand.q_open, period=period, wait=0.6 * period, fallback="open") as guard,
+        contextlib.closing(ZenohBus(arguments.zenoh) if arguments.zenoh else RosBus()) as bus,
+    ):
+        node, mode = PolicyNode(bus, guard, hand, obj, heading, steps), ""
         try:
             while True:
                 ticker.wait()
@@ -290,10 +295,11 @@ def main() -> int:
                     print(f"{mode} {guard.trouble}".rstrip(), flush=True)
         except KeyboardInterrupt:
             print(f"{guard.counters}, {ticker.missed} deadlines missed")
-        finally:
-            bus.close()
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except congrasp.CongraspError as error:
+        sys.exit(str(error))

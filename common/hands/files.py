@@ -28,6 +28,8 @@ _REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-h
 _ROUNDING = 1e-5  # rad, of single precision
 _TAKEN = {"hand_base", "table", "anchor", "object", "hold", "world"}
 _WRIST = {"wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz"}
+TAKEN_JOINTS = _WRIST | {"object", "hold"}
+"""Names that no joint and no tendon may have: the scene has joints, actuators and equalities of these names."""
 
 
 def hand_text(hand: Hand) -> str:
@@ -96,9 +98,11 @@ def faults(hand: Hand) -> list[str]:
         found.append(f"the name '{hand.name}' is more than letters, digits and underscores")
     for name in sorted({name for name in names + joints if (names + joints).count(name) > 1 or not name}):
         found.append(f"the name '{name}' is there more than once, or empty")
-    found += [f"the name '{name}' is taken" for name in sorted((_TAKEN & {*names}) | (_WRIST & {*joints}))]
+    found += [f"the name '{name}' is taken" for name in sorted((_TAKEN & {*names}) | (TAKEN_JOINTS & {*joints}))]
     if not hand.links or hand.links[0].joints or hand.links[0].parent:
         return [*found, "the first link must be the palm, without a parent and without joints"]
+    if not joints:
+        return [*found, "it has no joints"]
     for i, link in enumerate(hand.links):
         if i and link.parent not in names[:i]:
             found.append(f"the parent '{link.parent}' of '{link.name}' does not come before it")
@@ -140,6 +144,7 @@ def _coupling_faults(hand: Hand) -> list[str]:
     joints = [joint.name for joint in hand.joints]
     followers = [coupling.joint for coupling in hand.couplings]
     pulled = [name for tendon in hand.tendons for name in tendon.joints]
+    tendons = [tendon.name for tendon in hand.tendons]
     found = []
     for x in hand.couplings:
         if x.joint not in joints or x.leader not in joints or x.leader in followers or followers.count(x.joint) > 1:
@@ -152,7 +157,7 @@ def _coupling_faults(hand: Hand) -> list[str]:
             found.append(f"the tendon '{tendon.name}' pulls '{odd[0]}', which is no joint, follows another, or has two")
         if len(tendon.joints) < 2 or not all(tendon.joints.values()):
             found.append(f"the tendon '{tendon.name}' needs two joints at least, and coefficients that are not zero")
-        if tendon.name in joints or [x.name for x in hand.tendons].count(tendon.name) > 1 or not tendon.name:
+        if tendon.name in TAKEN_JOINTS | {*joints} or tendons.count(tendon.name) > 1 or not tendon.name:
             found.append(f"the name '{tendon.name}' of a tendon is taken, or empty")
     if not found:
         lower, upper = motor_limits(hand)
@@ -168,6 +173,8 @@ def _out_of_bounds(hand: Hand) -> str:
     """Why a hand is no hand at all, whatever else it says: numbers that are not finite, too many parts; or nothing."""
     if len(hand.links) > _LINKS or len(hand.joints) > _JOINTS:
         return f"it has more than {_LINKS} links or {_JOINTS} joints"
+    if max(len(hand.couplings), *(len(tendon.joints) for tendon in hand.tendons), len(hand.tendons)) > _JOINTS:
+        return f"it has more than {_JOINTS} couplings, tendons or joints of a tendon"
     if any(len(link.capsules) > _CAPSULES for link in hand.links):
         return f"it has a link of more than {_CAPSULES} capsules"
     fields = dataclasses.asdict(hand)

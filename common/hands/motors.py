@@ -34,7 +34,7 @@ class _Transmission(NamedTuple):
     """(2, M) lowest and highest position of each motor with all of its joints within their limits."""
 
 
-@functools.cache
+@functools.lru_cache(maxsize=64)
 def transmission(hand: Hand) -> _Transmission:
     """The hand's motors and joints, as arrays."""
     index = {joint.name: j for j, joint in enumerate(hand.joints)}

@@ -4,6 +4,7 @@ import pathlib
 
 from common.errors import CongraspError
 from common.hands import HANDS, get_hand, hands_folder, own_hands
+from common.policy import bundle as bundles
 
 _FOLDER = pathlib.Path(__file__).with_name("data")
 SUFFIX = ".safetensors"
@@ -45,9 +46,14 @@ def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path
     """The policy file that a command was given, or the pretrained one for this hand.
 
     Raises:
-      CongraspError: neither is there, or there is no such hand.
+      CongraspError: neither is there, there is no such hand, or the user's own policy is of another hand of its name.
     """
     path = given or pretrained_file(hand)
+    if not given and path is not None and (own := get_hand(hand)).text and bundles.load(path).spec.hand != own.text:
+        raise CongraspError(
+            f"{path} was trained for another hand of this name, or before the hand's file was changed.",
+            "Train it again with 'congrasp hands train', or give --policy FILE.",
+        )
     if path is None:
         raise CongraspError(
             f"No policy was named, and none comes with this installation for the hand '{get_hand(hand).name}'.",

@@ -21,6 +21,13 @@ def at_least(least: int, **counts: int) -> None:
             raise CongraspError(f"--{name} is {value}.", f"It must be at least {least}.")
 
 
+def at_most(most: float, unit: str, **amounts: float) -> None:
+    """Raises a CongraspError for the first option, by its name, that is negative or more."""
+    for name, value in amounts.items():
+        if not 0 <= value <= most:
+            raise CongraspError(f"--{name} is {value}.", f"It is from 0 to {most:g} {unit}.")
+
+
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Prints rows under the names of their columns."""
     table = Table(*columns)

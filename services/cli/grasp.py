@@ -79,25 +79,22 @@ def grasp(
     """
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
-    from services.cli.console import at_least, bars
+    from services.cli.console import at_least, at_most, bars
     from services.grasp.grasper import Grasper
     from services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
     at_least(1, tries=tries)
-    for name, value, most in (("approach", approach, 10.0), ("lift", lift, 0.5)):
-        if not 0 <= value <= most:
-            unit = "seconds" if name == "approach" else "metres"
-            raise CongraspError(f"--{name} is {value}.", f"It is from 0 to {most:g} {unit}.")
+    at_most(10.0, "seconds", approach=approach)
+    at_most(0.5, "metres", lift=lift)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
     file = policy_file(policy, hand)
-    loaded = bundles.load(file)
     found, results = find_objects(objects, folder)
     identity = (bundles.content_hash(file.read_bytes()), tries, seed, approach, lift)
     settings = Settings(out, options, dataclasses.asdict(constraints), identity, video, pictures, again, rest)
-    grasper = Grasper(loaded, attempts=tries, approach=approach, lift=lift, seed=seed)
+    grasper = Grasper(bundles.load(file), attempts=tries, approach=approach, lift=lift, seed=seed)
 
     for result in results:
         _show(result)

@@ -40,7 +40,7 @@ def episode(
       index: Which of the recorded episodes, from 0; -1 is the last.
       success: Count only episodes that succeeded.
       frames: Pictures on the sheet.
-      video: Also write the whole episode as an MP4, at half its speed while the table stands.
+      video: Also write the whole episode as an MP4, the grasp itself at half its speed.
     """
     from services.record.reader import pick_episode
     from services.viz.render import episode_sheet, save_episode_video

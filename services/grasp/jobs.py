@@ -164,7 +164,7 @@ def rest_pose(obj: GraspObject, text: str) -> int:
                 f"Set --rest to a number from 1 to {count}: congrasp objects rests {obj.name} --png rests.png",
             )
         return best
-    if not text.isdigit() or not 1 <= int(text) <= count:
+    if not text.isdecimal() or len(text) > 4 or not 1 <= int(text) <= count:
         raise CongraspError(f"--rest is '{text}'.", f"'{obj.name}' has resting poses 1 to {count}; or set upright.")
     return int(text) - 1
 

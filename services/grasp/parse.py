@@ -28,7 +28,7 @@ from services.assets.objects.headers import check_header
 from services.assets.objects.sizes import size_in_words
 from services.export.frames import continuous_quaternions
 from services.export.motion_file import GraspMotion, load_motion
-from services.record.goals import phases_of
+from services.record.goals import grasp_span
 
 ABOVE = "above"
 """The heading straight down, whatever the object's pose."""
@@ -260,7 +260,11 @@ def _trajectory(written: Written) -> dict[str, np.ndarray] | None:
 def numbered(text: str) -> tuple[pathlib.Path, int]:
     """The file and the number in FILE or FILE:NUMBER; 0 without."""
     name, colon, number = text.rpartition(":")
-    return (pathlib.Path(name), int(number)) if colon and number.isdigit() else (pathlib.Path(text), 0)
+    return (
+        (pathlib.Path(name), int(number))
+        if colon and number.isdecimal() and len(number) < 10
+        else (pathlib.Path(text), 0)
+    )
 
 
 def _motion(path: pathlib.Path, hand: Hand) -> GraspMotion:
@@ -273,10 +277,9 @@ def _motion(path: pathlib.Path, hand: Hand) -> GraspMotion:
 
 def grasp_part(motion: GraspMotion) -> tuple[int, int]:
     """The first frame of the grasp itself, and the last one before the lift or the table's removal."""
-    phases, last = phases_of(motion.about), len(motion.time) - 1
-    end = round(phases["lift"] / motion.control_dt) if "lift" in phases else int(motion.table.sum())
-    end = min(max(end - 1, 0), last)
-    return min(round(phases.get("grasp", 0.0) / motion.control_dt), end), end
+    first, end = grasp_span(motion.about, motion.control_dt, motion.table)
+    last = max(end - 1, 0)
+    return min(first, last), last
 
 
 def _wrist_on_object(motion: GraspMotion, frame: int) -> tuple[np.ndarray, np.ndarray]:

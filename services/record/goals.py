@@ -26,6 +26,19 @@ def active_constraints(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
     return tuple(c.name for c in CONSTRAINTS if not c.optional or any(blocks.get(block) for block in c.blocks))
 
 
+def grasp_span(meta: Mapping[str, Any], control_dt: float, table: np.ndarray) -> tuple[int, int]:
+    """The first step of the grasp itself, and the first one after it: of the lift, or without the table.
+
+    Args:
+      meta: of the episode or motion.
+      control_dt: s.
+      table: (T,) bool, where the table is there.
+    """
+    phases, steps = phases_of(meta), len(table)
+    end = round(min(phases["lift"] / control_dt, steps)) if "lift" in phases else int(np.sum(table))
+    return min(round(min(phases.get("grasp", 0.0) / control_dt, steps)), end), end
+
+
 def phases_of(meta: Mapping[str, Any]) -> dict[str, float]:
     """When phases of an episode or a motion begin (approach, grasp, lift, hold), s; what is no time is left out."""
     found = meta.get("phases")

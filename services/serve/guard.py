@@ -117,7 +117,10 @@ class Guard:
         """
         fingers = len(limits.lower) - 6
         if fingers < 1 or not np.isfinite(as_numbers(open_pose, fingers)).all():
-            raise CongraspError("The open pose must have a finite angle for each finger joint of the limits.")
+            raise CongraspError(
+                "The open pose must have a finite angle for each finger joint of the limits.",
+                "For a hand with fewer motors than joints, make limits of its joints by hand (docs/robots.md).",
+            )
         if not (0.0 <= wait < period and 0.0 < stale <= hold):
             raise CongraspError("The times must be: 0 <= wait < period, and 0 < stale <= hold.")
         if fallback not in ("freeze", "open"):

@@ -74,7 +74,8 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
     """
     _begin(request)
     _check(request, note)
-    note("" if request.full else _what_a_gpu_would_take(request))
+    if not request.full:
+        note(_what_a_gpu_would_take(request))
     policy = trained(request.run_dir)
     if policy is None:
         policy = _train(request, note)

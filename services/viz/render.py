@@ -12,7 +12,7 @@ from common.hands.skin import skin_of
 from common.hands.spec import Hand
 from common.parallel import cores
 from common.wire.codec import Message
-from services.record.goals import active_blocks, phases_of
+from services.record.goals import active_blocks, grasp_span, phases_of
 from services.record.palette import HEADING, OBJECT, WAYPOINT
 from services.viz.raster import render_scene, visible
 from services.viz.scene import Camera, Shape
@@ -239,10 +239,7 @@ def episode_strip(
 
 def grasp_steps(episode: Message) -> tuple[int, int]:
     """The first step of the grasp itself, and the first one after it: of the lift, or without the table."""
-    phases, dt = phases_of(episode.meta), float(episode.meta["control_dt"])
-    table = np.asarray(episode.arrays["table"], bool)
-    end = min(round(phases["lift"] / dt), len(table)) if "lift" in phases else int(table.sum())
-    return min(round(phases.get("grasp", 0.0) / dt), end), end
+    return grasp_span(episode.meta, float(episode.meta["control_dt"]), np.asarray(episode.arrays["table"], bool))
 
 
 def _phase(episode: Message, step: int) -> str:

@@ -138,6 +138,12 @@ def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, par
         (lambda h: h.update(links=h["links"] * 1000), "more than"),
         (lambda h: h.update(name="../../x"), "the name"),
         (lambda h: h.update(object_scale=INF), "not a finite number"),
+        (lambda h: h.update(links=h["links"][:1], open_pose={}, closed_pose={}), "it has no joints"),
+        (
+            lambda h: h.update(couplings=[{"joint": "a", "leader": "b", "ratio": 1.0}] * 20_000),
+            "more than 64 couplings",
+        ),
+        (lambda h: h["links"][1]["joints"][0].update(name="hold"), "the name 'hold' is taken"),
     ],
 )
 def test_hands_with_values_that_none_has_are_named(tmp_path, change, why):

@@ -175,6 +175,7 @@ def _joints(hand: Hand) -> list[Finding]:
         )
     ]
     carrier = [i for i, link in enumerate(hand.links) for _ in link.joints]
+    followers = {coupling.joint for coupling in hand.couplings}
     moved = 0
     for j, joint in enumerate(hand.joints):
         finger = int(hand.link_fingers[carrier[j]])
@@ -190,7 +191,9 @@ def _joints(hand: Hand) -> list[Finding]:
                     verdict,
                     f"closing '{joint.name}' moves the tip of '{hand.fingers[finger]}' {100 * path:.1f} cm, at a "
                     f"cosine of {cosine:.2f} to its opponent",
-                    f"turn its axis, or close it towards {limit:.2f} in closed_pose; leave it out if it spreads",
+                    "change its ratio or its leader in couplings"
+                    if joint.name in followers
+                    else f"turn its axis, or close it towards {limit:.2f} in closed_pose; leave it out if it spreads",
                 )
             )
     if not moved:

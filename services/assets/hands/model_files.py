@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from common.errors import CongraspError
-from common.hands.files import faults, hand_from_text, hand_text
+from common.hands.files import TAKEN_JOINTS, faults, hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.measures import fitting_scale
 from common.hands.motors import motor_limits
@@ -204,7 +204,7 @@ def _joint_names(model: mujoco.MjModel, tree: Tree, taken: set[str]) -> dict[int
     """Names of the hand's joints in its order, apart from those of links."""
     order = [j for link in tree.groups if link != tree.palm for j in hinges(model, link)]
     names = {j: identifier(model.joint(j).name, f"joint_{j}") for j in order}
-    return {j: f"{name}_joint" if name in taken else name for j, name in names.items()}
+    return {j: f"{name}_joint" if name in taken | TAKEN_JOINTS else name for j, name in names.items()}
 
 
 def _levers(

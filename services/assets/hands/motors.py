@@ -208,10 +208,11 @@ class Drive:
         damping = float(self._model.dof_damping[dof])
         kp = kv = limit = 0.0
         if j not in self._leaders and not any(j in tendon for tendon in self._tendons):
-            servo = next((x for x in self._servos if {*self._reduced(x)} == {j}), None)
+            mine = [x for x in self._servos if {*self._reduced(x)} == {j}]
+            servo = next((x for x in mine if j in x.joints), mine[0] if mine else None)
             scale = self._reduced(servo)[j] if servo else 1.0
             kp, limit = self._gains(j, servo, scale, self._names[j])
-            if servo and servo.reach:
+            if servo and servo.reach and j in servo.joints:
                 lower, upper = max(lower, servo.reach[0]), min(upper, servo.reach[1])
             followers = {j: 1.0} | {x.a: x.ratio for x in self.links if x.b == j}
             kv = self._damping(followers, kp)

@@ -52,6 +52,8 @@ def link_mesh(
     whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), faces)
     if len(whole.faces) > MAX_FACES:
         whole = whole.simplify_quadric_decimation(face_count=MAX_FACES)
+    if not 0 < len(whole.faces) <= MAX_FACES:  # many separate parts cannot be simplified so far
+        whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts])).convex_hull
     return np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32)
 
 

@@ -146,4 +146,4 @@ def find_object(text: str, folder: str = "objects") -> GraspObject:
 def _generated(path: pathlib.Path) -> GraspObject | None:
     """The object of the generator that FAMILY:SEED means; None for any other text."""
     family, colon, seed = str(path).partition(":")
-    return generate(int(seed), family) if colon and seed.isdigit() and not path.exists() else None
+    return generate(int(seed), family) if colon and seed.isdecimal() and len(seed) < 10 and not path.exists() else None
