@@ -174,9 +174,9 @@ class RolloutWorker:
 
     def begin(self, conditions: InitialConditions) -> None:
         """Goes on with these episodes, which are about to begin, one for each environment."""
-        kept = self.state
+        kept, conditions = self.state, _on_device(conditions)
         if self.physics.compiled:
-            self.state = self._begin_jit(*_on_device((conditions, kept)))
+            self.state = self._begin_jit(conditions, _on_device(kept))
             return
         if kept is None:
             self.physics.start(conditions.reset_state)
@@ -232,7 +232,7 @@ class RolloutWorker:
         """
         assert self.state is not None, "no episode was begun"
         self._key, key = _split(self._key)
-        self.state = self.state._replace(has_finished=_on_device(np.zeros(self.batch, bool)))
+        self.state = _on_device(self.state._replace(has_finished=np.zeros(self.batch, bool)))
         if self.physics.compiled:
             return self._collect_compiled(parameters, key, steps)
         return self._collect_stepwise(parameters, key, steps, progress)

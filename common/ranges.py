@@ -49,8 +49,9 @@ def network_faults(network: NetworkConfig, layout: Sequence[tuple[str, int]], ac
         yield f"hidden is {str(network.hidden)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} units"
     if not 1 <= network.encoder <= _UNITS:
         yield f"encoder is {network.encoder}, not 1 to {_UNITS}"
-    if not all(size >= 1 for _, size in layout) or not 1 <= sum(size for _, size in layout) <= MAX_INPUTS:
-        yield f"the observation has {str([size for _, size in layout])[:60]} values, not 1 to {MAX_INPUTS}"
+    sizes = [size for _, size in layout]  # a policy of headings alone has no mask
+    if not all(size >= (name != "mask") for name, size in layout) or not 1 <= sum(sizes) <= MAX_INPUTS:
+        yield f"the observation has {str(sizes)[:60]} values, not 1 to {MAX_INPUTS}"
     if not 1 <= action_size <= MAX_ACTIONS:
         yield f"the action has {action_size} values, not 1 to {MAX_ACTIONS}"
 

@@ -36,7 +36,7 @@ def test_an_episode_that_begins_within_a_rollout_is_followed_to_its_end():
     assert follower.add(rollout(1, 2, 3), None, state("none"), due=False) is None
     found = follower.add(rollout(4, 5, 0, ended=[1]), None, state("other"), due=False)
     assert (found.goal, found.object_index) == ("next", 3)
-    assert found.trace.q.ravel().tolist() == [0, 1, 2, 3, 4]
+    assert found.trace.q.ravel().tolist() == [0, 1, 2, 3, 4, 5]
     # It follows nothing then, until one is due again.
     assert follower.add(rollout(0, 1, 2, 3, 4, 5, ended=[5]), state("fresh"), state("none"), due=False) is None
     found = follower.add(rollout(0, 1, 2, 3, 4, 5, 0, ended=[5]), state("fresh", 2), state("none"), due=True)

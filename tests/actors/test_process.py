@@ -61,7 +61,7 @@ def invented(episodes: np.ndarray) -> Rollout:
         "terms": (T, len(terms(CONFIG.task))),
         "errors": (T, len(metrics.specs(CONFIG.task))),
     }
-    flags = dict.fromkeys(("table", "terminal"), np.zeros(T, bool))
+    flags = {"table": np.zeros(T, bool), "terminal": np.arange(T) == T - 1}
     given = {
         **FORM.zeros(),
         "episodes": episodes,

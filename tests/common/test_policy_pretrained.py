@@ -6,6 +6,7 @@ import tomllib
 
 import pytest
 
+from common.config import NetworkConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.files import hand_text
@@ -18,6 +19,7 @@ from common.policy.pretrained import (
     pretrained_file,
     pretrained_hands,
 )
+from services.train.command import untrained
 
 ROOT = pathlib.Path(module.__file__).resolve().parents[2]
 
@@ -43,13 +45,20 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
     assert pretrained_file("mine") is None and hands_with_policy() == pretrained_hands()
     with pytest.raises(CongraspError, match=r"for the hand 'mine'.*congrasp hands train"):
         policy_file(None, "mine")
-    own_policy_file("mine").touch()
+    task = TaskConfig(hand=get_hand("mine").reference, constraints=("heading",))
+    small = RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=4))
+    bundles.save(untrained(small), own_policy_file("mine"))
     assert policy_file(None, "mine") == tmp_path / "mine.safetensors" == pretrained_file(get_hand("mine").reference)
     assert hands_with_policy() == [*pretrained_hands(), "mine"]
     # Another hand of the same name as one of the package does not get the package's policy.
     (tmp_path / "human.json").write_text(hand_text(get_hand("human")))
     assert pretrained_file(str(tmp_path / "human.json")) is None
     assert pretrained_file("human").parent == module._FOLDER
+    # Nor has a hand that was changed since the policy of the hand as it was before.
+    (tmp_path / "mine.json").write_text(hand_text(dataclasses.replace(mine, object_scale=0.9)))
+    get_hand.cache_clear()
+    with pytest.raises(CongraspError, match=r"before the hand's file was changed.*--policy"):
+        policy_file(None, "mine")
     get_hand.cache_clear()
 
 

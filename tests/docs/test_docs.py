@@ -63,7 +63,7 @@ def test_metrics_of_episodes_are_documented():
 @pytest.mark.timeout(600)
 def test_the_commands_of_the_tutorials_run(tmp_path):
     """A stranger's first ten minutes, in an empty folder; what takes minutes is marked as text there."""
-    pages = [ROOT / "docs" / "tutorials" / f"{name}.md" for name in ("my-object", "constraints", "comparison")]
+    pages = [ROOT / "docs" / "tutorials" / f"{name}.md" for name in ("my-object", "constraints")]
     (python,) = blocks(pages[0], "python")
     binaries = pathlib.Path(sys.executable).parent
     environment = {**os.environ, "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
@@ -74,7 +74,7 @@ def test_the_commands_of_the_tutorials_run(tmp_path):
     ]
     for line in lines:
         done = subprocess.run(
-            re.sub(r"--episodes \d+", "--episodes 1 --pool 2", line),
+            line,
             shell=True,
             cwd=tmp_path,
             env=environment,
@@ -86,5 +86,3 @@ def test_the_commands_of_the_tutorials_run(tmp_path):
     for name in ("grasp.npz", "grasp.mcap", "object.png", "grasp.mp4"):
         assert (tmp_path / "grasps" / "can" / name).stat().st_size > 1000
     assert (tmp_path / "mug.png").stat().st_size > 1000
-    report = (tmp_path / "report.html").read_text()
-    assert report.count("data:image/png;base64,") == 7 and "--episodes 1 " in report

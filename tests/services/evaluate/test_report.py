@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from common.config import NetworkConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
 from common.policy import bundle as bundles
 from services.assets.hands.check import Finding, write_findings
@@ -87,6 +88,15 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
     (tmp_path / "check.json").write_text('{"findings": [{"name": 3}]}')
     with pytest.raises(CongraspError, match=r"check\.json holds no self-check"):
         main.run([*command, "--check", str(tmp_path / "check.json")])
+
+
+def test_the_command_evaluates_draws_and_writes(tmp_path):
+    config = RunConfig(task=TaskConfig(constraints=("heading",)), network=NetworkConfig(hidden=(8,), encoder=4))
+    bundles.save(untrained(config), tmp_path / "mine.safetensors")
+    command = ["report", str(tmp_path / "mine.safetensors"), "--out", str(tmp_path / "report.html")]
+    assert main.run([*command, "--episodes", "1", "--pool", "2", "--physics", "native"]) == 0
+    found = Reader(text := (tmp_path / "report.html").read_text())
+    assert len(found.sources) == 1 and "--episodes 1 " in text and "2 episodes" in text
 
 
 def test_a_runs_curves_are_pictures(tmp_path):
