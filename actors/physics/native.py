@@ -10,13 +10,17 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import psutil
 
 from actors.physics.engine import PhysicsState, ResetState
 from actors.physics.physics_state import has_diverged, physics_state
 from actors.physics.scene import TABLE_AWAY, addresses, compile_scene
 from common.config import TaskConfig
+from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.objects.spec import GraspObject
+
+_ENVIRONMENT = 860_000  # bytes of an environment that has been stepped: model, data and their stack
 
 
 class Scene:
@@ -76,8 +80,18 @@ class NativePhysics:
         self._physics_state = jax.jit(functools.partial(physics_state, jnp, self._where))
 
     def start(self, reset_state: ResetState) -> "NativePhysics":
-        """Fresh environments; see `Physics.start`."""
+        """Fresh environments; see `Physics.start`.
+
+        Raises:
+          CongraspError: they would not fit into the memory that is free.
+        """
         batch = len(np.asarray(reset_state.object_index))
+        if (free := psutil.virtual_memory().available) < batch * _ENVIRONMENT:
+            raise CongraspError(
+                f"{batch:,} environments of MuJoCo C need {batch * _ENVIRONMENT / 1e9:.0f} GB of memory, and "
+                f"{free / 1e9:.0f} GB are free.",
+                "Start the run with fewer --environments, or act on a GPU.",
+            )
         self.scenes = [self._scene(int(index)) for index in np.asarray(reset_state.object_index)]
         self.instances = [scene.take() for scene in self.scenes]
         model = self.instances[0].model

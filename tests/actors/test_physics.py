@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+import psutil
 import pytest
 
 from actors import initial
@@ -264,6 +265,15 @@ def test_jax_agrees_with_native(env):
     again = other.read(other.reset(b, mask, jax.tree.map(jnp.asarray, start)))
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(again.u[1:], y.u[1:], atol=1e-6)
+    native.close()
+
+
+def test_environments_that_do_not_fit_into_the_memory_are_one_clear_line(env, monkeypatch):
+    free = psutil.virtual_memory()._replace(available=1_500_000)
+    monkeypatch.setattr("actors.physics.native.psutil.virtual_memory", lambda: free)
+    native = NativePhysics(HAND, TASK, OBJECTS, 1)
+    with pytest.raises(CongraspError, match=r"environments of MuJoCo C need .* GB are free.*fewer --environments"):
+        native.start(env.reset_state)
     native.close()
 
 
