@@ -293,7 +293,8 @@ class RunConfig:
     collapse_patience: int = 60
     """Updates in a row without contact, or with less than half of the best success, that end the run; 0: none do."""
     episode_every: int = 10
-    """Rollouts of an actor between two episodes that it publishes for logs."""
+    """Rollouts of an actor between two episodes that it publishes for logs; at least so many, for only an episode that
+    ends in its rollout alone is published."""
     log_rollout_every: int = 20
     """Rollouts of an actor between two that it publishes for logs; 1 publishes all of them, 0 none."""
     log_rollout_worlds: int = 4

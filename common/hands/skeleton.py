@@ -56,5 +56,5 @@ def skeleton_of(hand: Hand) -> Skeleton:
         hand.capsule_links,
         np.array([joint.anchor for joint in hand.joints], float),
         np.array([joint.axis for joint in hand.joints], float),
-        np.array([i for i, link in enumerate(hand.links) for _ in link.joints]),
+        hand.joint_links,
     )

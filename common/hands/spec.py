@@ -142,6 +142,11 @@ class Hand:
         return tuple(joint for link in self.links for joint in link.joints)
 
     @functools.cached_property
+    def joint_links(self) -> np.ndarray:
+        """(F,) index of the link that each joint moves."""
+        return np.array([i for i, link in enumerate(self.links) for _ in link.joints])
+
+    @functools.cached_property
     def motors(self) -> tuple[Motor, ...]:
         """The M motors in the order of the first joints that they pull; see `common.hands.motors`."""
         tendons = {next(joint.name for joint in self.joints if joint.name in x.joints): x for x in self.tendons}

@@ -120,6 +120,12 @@ def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
     return poses
 
 
+def rest_tilts(obj: GraspObject) -> np.ndarray:
+    """(R,) rad by which the object's z axis is tilted from upright in each of its resting poses."""
+    up = [shapes.matrix(np.asarray(pose[3:], float))[2, 2] for pose in obj.rest_poses]
+    return np.arccos(np.clip(np.array(up, float), -1.0, 1.0))
+
+
 def quasi_static_poses(pieces: tuple[Piece, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Poses in which the object can lie still, from its convex hull, most likely first.
 

@@ -201,12 +201,12 @@ def rests(
     """
     import numpy as np
 
-    from common.objects.shapes import matrix
+    from common.objects.resting import rest_tilts
     from services.assets.objects.named import find_object
     from services.cli.console import show_table
 
     obj = find_object(object, folder)
-    tilts = [np.degrees(np.arccos(np.clip(matrix(np.asarray(pose[3:]))[2, 2], -1, 1))) for pose in obj.rest_poses]
+    tilts = np.degrees(rest_tilts(obj))
     rows = [
         (str(i), f"{100 * pose[2]:.1f}", f"{tilt:.0f}")
         for i, (pose, tilt) in enumerate(zip(obj.rest_poses, tilts, strict=True), 1)

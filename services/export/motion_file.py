@@ -140,7 +140,7 @@ def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
     index = {link.name: i for i, link in enumerate(hand.links)}
     return {
         "joint_names": np.array([joint.name for joint in hand.joints]),
-        "joint_link": np.array([i for i, link in enumerate(hand.links) for _ in link.joints], np.int32),
+        "joint_link": hand.joint_links.astype(np.int32),
         "joint_axis": np.array([joint.axis for joint in hand.joints]),
         "joint_anchor": np.array([joint.anchor for joint in hand.joints]),
         "joint_limits": np.array([(joint.lower, joint.upper) for joint in hand.joints]),

@@ -15,7 +15,7 @@ from common.errors import CongraspError
 from common.files import write_atomically
 from common.inputs import file_name
 from common.objects.procedural import MASS_RANGE
-from common.objects.shapes import matrix
+from common.objects.resting import rest_tilts
 from common.objects.spec import GraspObject
 from common.objects.store import Catalogue
 from services.assets.objects.named import ObjectAt, objects_at
@@ -156,9 +156,9 @@ def rest_pose(obj: GraspObject, text: str) -> int:
     """
     count = len(obj.rest_poses)
     if text == "upright":
-        up = [float(matrix(np.asarray(pose[3:]))[2, 2]) for pose in obj.rest_poses]
-        best = int(np.argmax(up))
-        if up[best] < _UPRIGHT:
+        tilts = rest_tilts(obj)
+        best = int(np.argmin(tilts))
+        if np.cos(tilts[best]) < _UPRIGHT:
             raise CongraspError(
                 f"'{obj.name}' does not rest with its z axis up in any of its {count} resting poses.",
                 f"Set --rest to a number from 1 to {count}: congrasp objects rests {obj.name} --png rests.png",

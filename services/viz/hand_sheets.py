@@ -92,9 +92,8 @@ def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarra
     rows["open"] += _frame(hand)
     names = [link.name for link in hand.links]
     parents = [names.index(link.parent) if link.parent else -1 for link in hand.links]
-    carrier = np.array([i for i, link in enumerate(hand.links) for _ in link.joints])
     for m, motor in enumerate(hand.motors):
-        moved = {int(i) for i in carrier[transmission(hand).motor == m]}
+        moved = {int(i) for i in hand.joint_links[transmission(hand).motor == m]}
         for i, parent in enumerate(parents):
             if parent in moved:
                 moved.add(i)

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from common.hands.human import HUMAN
 from common.hands.outline import outline
-from common.objects.shapes import matrix, tessellate
+from common.objects.resting import rest_tilts
+from common.objects.shapes import tessellate
 from common.objects.spec import GraspObject
 from common.task.sampling.headings import Headings, within_reach
 from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, PIECES
@@ -64,12 +65,12 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
 def rests_sheet(obj: GraspObject) -> np.ndarray:
     """(H, W, 3) uint8: the object in each of its resting poses, by the numbers that `congrasp grasp --rest` takes."""
     images, labels = [], []
-    for number, pose in enumerate(np.asarray(obj.rest_poses, float), 1):
+    tilts = np.degrees(rest_tilts(obj))
+    for number, (pose, tilt) in enumerate(zip(np.asarray(obj.rest_poses, float), tilts, strict=True), 1):
         shape = dataclasses.replace(_painted(obj), position=pose[:3], quaternion=pose[3:])
         shape = dataclasses.replace(shape, paint_points=None, paint_colours=None)
         camera = fit(shape_points(shape), np.array(_VIEW), _SMALL[0] / _SMALL[1])
         images.append(render_scene([shape, table_shape(pose[:3])], camera, _SMALL))
-        tilt = float(np.degrees(np.arccos(np.clip(matrix(pose[3:])[2, 2], -1, 1))))
         labels.append(f"{number}: {100 * pose[2]:.1f} cm high, z axis {tilt:.0f}° from up")
     title = f"{obj.name}: resting poses, the likeliest first"
     return contact_sheet(images, labels, columns=min(_COLUMNS, len(images)), title=title)

@@ -46,8 +46,7 @@ def _fingers(hand: Hand) -> tuple[np.ndarray, np.ndarray, int]:
         roots = [first if root in others else root for root in roots]
     names = [name for name in dict.fromkeys(roots) if name]
     of_link = np.array([names.index(root) if root else -1 for root in roots])
-    joints = [of_link[i] for i, link in enumerate(hand.links) for _ in link.joints]
-    return np.array(joints), of_link[hand.keypoint_links], len(names)
+    return of_link[hand.joint_links], of_link[hand.keypoint_links], len(names)
 
 
 @functools.partial(jax.jit, static_argnums=0)

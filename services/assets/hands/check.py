@@ -174,11 +174,10 @@ def _joints(hand: Hand) -> list[Finding]:
             "close further: raise the angles of closed_pose, and turn the thumb against the fingers in open_pose",
         )
     ]
-    carrier = [i for i, link in enumerate(hand.links) for _ in link.joints]
     followers = {coupling.joint for coupling in hand.couplings}
     moved = 0
     for j, joint in enumerate(hand.joints):
-        finger = int(hand.link_fingers[carrier[j]])
+        finger = int(hand.link_fingers[hand.joint_links[j]])
         cosine, path = _approach(hand, j, finger) if finger >= 0 else (0.0, 0.0)
         if path < _STAYS:
             continue

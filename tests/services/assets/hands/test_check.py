@@ -64,6 +64,16 @@ def moved(vector, by):
     return tuple(np.add(vector, by).tolist())
 
 
+def shifted(link, by):
+    """The link somewhere else, with its joints, capsules and tip."""
+    return dataclasses.replace(
+        link,
+        joints=tuple(dataclasses.replace(j, anchor=moved(j.anchor, by)) for j in link.joints),
+        capsules=tuple(dataclasses.replace(c, start=moved(c.start, by), end=moved(c.end, by)) for c in link.capsules),
+        tip=link.tip and moved(link.tip, by),
+    )
+
+
 def test_a_palm_that_is_far_from_the_grasp_frame_is_found():
     palm = CLAW.links[0]
     away = tuple(
@@ -75,17 +85,7 @@ def test_a_palm_that_is_far_from_the_grasp_frame_is_found():
     assert finding.verdict == "failed" and "20.1 cm" in finding.measured and "--palm" in finding.remedy
     # All of the hand at the end of a forearm of 40 cm, whose wrist does not move.
     by = np.array([0, 0, 0.4])
-    links = tuple(
-        dataclasses.replace(
-            link,
-            joints=tuple(dataclasses.replace(j, anchor=moved(j.anchor, by)) for j in link.joints),
-            capsules=tuple(
-                dataclasses.replace(c, start=moved(c.start, by), end=moved(c.end, by)) for c in link.capsules
-            ),
-            tip=link.tip and moved(link.tip, by),
-        )
-        for link in CLAW.links
-    )
+    links = tuple(shifted(link, by) for link in CLAW.links)
     finding = check._palm(dataclasses.replace(CLAW, links=links))
     assert finding.verdict == "failed" and re.search(r" 5\.\d fingers' lengths from the wrist", finding.measured)
 
@@ -114,19 +114,7 @@ def test_objects_that_are_too_large_and_fingers_in_one_another_are_found():
     wide = dataclasses.replace(CLAW, open_pose={}, closed_pose={})  # never closes
     assert check._joints(wide)[0].verdict == "failed" and "closed_pose" in check._joints(wide)[0].remedy
     by = np.array([0.0, 0.05, 0.0])
-    links = tuple(
-        dataclasses.replace(
-            link,
-            joints=tuple(dataclasses.replace(j, anchor=moved(j.anchor, by)) for j in link.joints),
-            capsules=tuple(
-                dataclasses.replace(c, start=moved(c.start, by), end=moved(c.end, by)) for c in link.capsules
-            ),
-            tip=link.tip and moved(link.tip, by),
-        )
-        if link.name.startswith("right")
-        else link
-        for link in CLAW.links
-    )
+    links = tuple(shifted(link, by) if link.name.startswith("right") else link for link in CLAW.links)
     crossed = dataclasses.replace(CLAW, links=links)
     assert check._open_overlap(crossed).verdict == "failed" and "left_lower" in check._open_overlap(crossed).measured
 
