@@ -1,9 +1,15 @@
 """TCP ports: where roles listen by default, the ports after a given one, and free ones of this machine."""
 
 import contextlib
+import fcntl
+import functools
+import os
+import pathlib
 import re
 import secrets
 import socket
+import tempfile
+import threading
 
 from common.errors import CongraspError
 from common.transport.keys import FLOWS
@@ -17,6 +23,7 @@ _URL = re.compile(r"(?P<address>[a-z]+/[^/]+):(?P<port>\d{1,5})(?P<rest>[?#].*)?
 _LOWEST, _COUNT = 15000, 15000
 """Below the ports that systems give to outgoing connections (from 32768 on Linux): none of those gets in between."""
 _ATTEMPTS = 1000
+_lock, _reserved = threading.Lock(), set[int]()
 
 
 def shifted(url: str, offset: int) -> str:
@@ -52,13 +59,36 @@ def reachable_url(url: str) -> str:
 def free_port(count: int = len(FLOWS)) -> int:
     """A port of the loopback interface that is free together with the `count` - 1 after it.
 
+    As long as this process lives, none of them is returned again: not here, and not to another process of this user.
+
     Raises:
       OSError: there seems to be none.
     """
     for _ in range(_ATTEMPTS):
-        port = _LOWEST + secrets.randbelow(_COUNT - count)
+        ports = range(start := _LOWEST + secrets.randbelow(_COUNT - count), start + count)
         with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
-            for each in range(port, port + count):
-                stack.enter_context(socket.socket()).bind(("127.0.0.1", each))
-            return port
+            for port in ports:
+                stack.enter_context(socket.socket()).bind(("127.0.0.1", port))
+            _reserve(ports)
+            return start
     raise OSError(f"No {count} neighbouring TCP ports are free on the loopback interface.")
+
+
+def _reserve(ports: range) -> None:
+    """Locks a byte for each port in a file of this user's; the system takes the locks back when the process ends.
+
+    Raises:
+      OSError: one is reserved already.
+    """
+    with _lock:
+        if not _reserved.isdisjoint(ports):
+            raise OSError("A port is reserved by this process.")
+        fcntl.lockf(_reservations(), fcntl.LOCK_EX | fcntl.LOCK_NB, len(ports), ports.start)
+        _reserved.update(ports)
+
+
+@functools.cache
+def _reservations() -> int:
+    """Descriptor of the file, open until the process ends: closing it would give up every lock."""
+    path = pathlib.Path(tempfile.gettempdir()) / f"congrasp-ports-{os.getuid()}"
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)

@@ -9,7 +9,7 @@ import pytest
 import tests.socket_transport  # noqa: F401  adds its scheme
 from actors.link import ActorLink
 from common.errors import CongraspError, TransportError
-from common.transport import urls
+from common.transport import ports, urls
 from common.transport.keys import FLOWS, Keys, flow
 from common.transport.ports import free_port, local_url, rank_url, reachable_url
 from common.transport.security import RIGHTS, Credentials
@@ -157,3 +157,29 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
         actor.join(10)
         assert not actor.is_alive() and getattr(actor, "exitcode", 0) == 0
         hub.close()
+
+
+def _reserve_ports(number: int, ours) -> None:
+    ports._COUNT = FEW
+    ours.send([free_port(1) for _ in range(number)])
+    ours.recv()  # lives until told to end
+
+
+FEW = 61
+"""Ports to choose from, less one: so few that one would be chosen twice."""
+
+
+def test_no_port_is_given_twice_while_its_process_lives(monkeypatch):
+    monkeypatch.setattr(ports, "_COUNT", FEW)
+    context = multiprocessing.get_context("spawn")
+    theirs, ours = context.Pipe()
+    other = context.Process(target=_reserve_ports, args=(20, theirs))
+    other.start()
+    assert ours.poll(30)
+    taken = ours.recv()
+    mine = [free_port(1) for _ in range(20)]
+    assert len({*taken, *mine}) == 40
+    ours.send("end")
+    other.join(10)
+    assert other.exitcode == 0
+    assert len({free_port(1) for _ in range(30)}) == 30  # twenty were left: those of the ended process are free again
