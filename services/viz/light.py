@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.viz.spans import spans
+from services.viz.kernels import add_light, cover
 from services.viz.triangles import Triangles
 
 MANY, FEW = (24, 48), (10, 20)
@@ -24,48 +24,41 @@ def light_on(
       key: (3,) unit direction towards the key light.
       lamps: how many stand for the key light and for the sky.
     """
-    light = np.zeros((len(points), 2), np.float32)
-    for lamp in _disc(key, lamps[0], _KEY_SIZE).astype(np.float32):
-        light[:, 0] += _reached(points, normals, bodies, lamp) / np.float32(lamps[0])
-    whole = np.full(len(points), 1e-6, np.float32)
-    for lamp in _dome(lamps[1]).astype(np.float32):
+    light, whole = np.zeros((2, len(points))), np.full(len(points), 1e-6)
+    for lamp in _disc(key, lamps[0], _KEY_SIZE):
+        _add(lamp, np.full(len(points), 1 / lamps[0]), points, normals, bodies, light[0])
+    for lamp in _dome(lamps[1]):
         facing = np.clip(0.75 * (normals @ lamp) + 0.25, 0, None)  # a lamp of the sky stands for a patch of it
-        light[:, 1] += facing * _reached(points, normals, bodies, lamp)
+        _add(lamp, facing, points, normals, bodies, light[1])
         whole += facing
-    light[:, 1] /= whole
-    return light
+    light[1] /= whole
+    return light.T
 
 
-def _reached(points: np.ndarray, normals: np.ndarray, bodies: Triangles, lamp: np.ndarray) -> np.ndarray:
-    """(n,) shares of a far lamp in the direction (3,) that bodies let through to points (n, 3) with normals (n, 3).
-
-    The four samples of the lamp's picture around a point are compared with it and mixed by how near they are, so that
-    a shadow's edge is a sample wide.
-    """
+def _add(
+    lamp: np.ndarray,
+    strength: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    bodies: Triangles,
+    total: np.ndarray,
+) -> None:
+    """Adds to the light (n,) of points what reaches them of a far lamp in the direction (3,), times a strength (n,)."""
     if not len(bodies.faces):
-        return np.ones(len(points), np.float32)
+        total += strength
+        return
     side = np.cross(lamp, [1.0, 0.0, 0.0])
     side = side / np.linalg.norm(side)
-    axes = np.stack([side, np.cross(lamp, side), lamp]).astype(np.float32)  # right, up, towards the lamp
-    local = bodies.points @ axes.T
-    low, high = local.min(0), local.max(0)
-    sample = (high - low)[:2].max() / (_GRID - 3)
-    corners = bodies.faces.T
+    axes = np.stack([side, np.cross(lamp, side), lamp])  # right, up, towards the lamp
+    x, y, height = axes @ bodies.points.T
+    sample = max(np.ptp(x), np.ptp(y)) / (_GRID - 3)
     # One empty sample on each side: what is beyond the picture is in the light.
-    x, y = ((local[:, 0] - low[0]) / sample + 1)[corners], ((high[1] - local[:, 1]) / sample + 1)[corners]
-    seen = spans(x, y, bodies.closed, _GRID, _GRID)
-    top = np.full(_GRID**2, -np.inf, np.float32)
-    np.maximum.at(top, seen.sample, seen.scaled(local[:, 2][corners]).total())
-    x, y, height = ((points + _SKIN * sample * normals) @ axes.T).T
-    column = ((x - low[0]) / sample + 1).clip(0, _GRID - 1.001)
-    row = ((high[1] - y) / sample + 1).clip(0, _GRID - 1.001)
-    first = row.astype(np.int64) * _GRID + column.astype(np.int64)
-    right, below = column % 1, row % 1
-    height = height + sample
-    upper, lower = (
-        (1 - right) * (top[first + step] <= height) + right * (top[first + step + 1] <= height) for step in (0, _GRID)
-    )
-    return (1 - below) * upper + below * lower
+    left, upper = x.min() - sample, y.max() + sample
+    top, owner = np.full((_GRID, _GRID), -np.inf), np.empty((_GRID, _GRID), np.int32)
+    corners = np.stack([x - left, upper - y], -1) / sample
+    cover(corners, height, bodies.faces, bodies.closed, top, owner)
+    lifted = points + np.float32(_SKIN * sample) * normals
+    add_light(lifted, strength, axes, np.array([left, upper, sample]), sample, top, total)
 
 
 def _disc(direction: np.ndarray, count: int, radius: float) -> np.ndarray:

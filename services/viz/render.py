@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from common.hands import known_hand
@@ -95,6 +96,7 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
 def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -> Camera:
     """A camera that holds everything that happens in the steps, from where object and touching links show most."""
     points = np.concatenate([_extent(episode, step) for step in steps])
+    points = points[ConvexHull(points).vertices]  # what holds these holds all
     pictured = [_worths(episode, steps[i]) for i in sorted({len(steps) // 2, len(steps) - 1})]
 
     def score(camera: Camera) -> float:

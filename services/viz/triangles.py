@@ -9,10 +9,9 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from services.viz.kernels import GAMMA
 from services.viz.scene import Shape
 
-GAMMA = 2.2
-"""sRGB is about linear light to the power of one over this."""
 CREASE = np.cos(np.radians(35.0))
 """Faces whose normals differ by more than this angle (given as its cosine) meet in a sharp edge."""
 _SIDE = 0.005  # longest side of a mesh's triangles, m

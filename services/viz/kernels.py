@@ -1,0 +1,185 @@
+"""Compiled loops over triangles and over the samples of a picture, which Numba keeps between processes."""
+
+import numba
+import numpy as np
+
+GAMMA = 2.2
+"""sRGB is about linear light to the power of one over this."""
+NOTHING = -1
+"""Stands where no triangle is."""
+_KEY_STRENGTH, _SKY_STRENGTH, _BOUNCE = 0.70, 0.50, 0.05
+_HIGHLIGHT = 60  # exponent: how sharp the highlight is
+_ROUNDING = 1e-9  # of weights: a sample on an edge belongs to both sides
+_SMALL = 1e-6  # samples: a triangle of a smaller area covers nothing
+
+_Weights = tuple[tuple[float, float, float], tuple[float, float, float]]
+_compiled = numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "afn", "reassoc"}
+)
+
+
+@_compiled
+def cover(
+    corners: np.ndarray, value: np.ndarray, faces: np.ndarray, closed: np.ndarray, top: np.ndarray, owner: np.ndarray
+) -> None:
+    """Keeps at each sample of a grid the triangle of the greatest value there.
+
+    Args:
+      corners: (V, 2) columns and rows of points, in samples; rows count downwards.
+      value: (V,) of the points, linear in between; a triangle with a NaN covers nothing.
+      faces: (F, 3) the triangles.
+      closed: (F,) bool: only what winds outwards and faces the viewer is wanted.
+      top: (height, width) greatest value so far; changed in place.
+      owner: (height, width) the triangle that has it; changed in place.
+    """
+    height, width = top.shape
+    for face in range(len(faces)):
+        i, j, k = faces[face]
+        area, weights = _weights(corners, i, j, k)
+        # Rows count downwards: what winds outwards and faces the viewer has a negative area.
+        if not abs(area) > _SMALL or (closed[face] and area > 0) or not np.isfinite(value[i] + value[j] + value[k]):
+            continue
+        (x0, x1, x2), (y0, y1, y2) = _each(corners, i, j, k, 0), _each(corners, i, j, k, 1)
+        left, right = max(int(np.ceil(min(x0, x1, x2))), 0), min(int(np.floor(max(x0, x1, x2))), width - 1)
+        upper, lower = max(int(np.ceil(min(y0, y1, y2))), 0), min(int(np.floor(max(y0, y1, y2))), height - 1)
+        for row in range(upper, lower + 1):
+            for column in range(left, right + 1):
+                first, second, third = _at(weights, column, row)
+                if min(first, second, third) >= -_ROUNDING:
+                    here = first * value[i] + second * value[j] + third * value[k]
+                    if here > top[row, column]:
+                        top[row, column] = here
+                        owner[row, column] = face
+
+
+@_compiled
+def _each(points: np.ndarray, i: int, j: int, k: int, axis: int) -> tuple[float, float, float]:
+    """One coordinate of three points."""
+    return points[i, axis], points[j, axis], points[k, axis]
+
+
+@_compiled
+def _weights(corners: np.ndarray, i: int, j: int, k: int) -> tuple[float, _Weights]:
+    """Twice a triangle's signed area, and the weights of its first two corners as a x + b y + c.
+
+    Weights are linear over the grid, each zero on the side across from its corner, and one in sum.
+    """
+    (x0, x1, x2), (y0, y1, y2) = _each(corners, i, j, k, 0), _each(corners, i, j, k, 1)
+    area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+    first = (y1 - y2) / area, (x2 - x1) / area, (x1 * y2 - x2 * y1) / area
+    second = (y2 - y0) / area, (x0 - x2) / area, (x2 * y0 - x0 * y2) / area
+    return area, (first, second)
+
+
+@_compiled
+def _at(weights: _Weights, column: int, row: int) -> tuple[float, float, float]:
+    """The weights of all three corners at a sample."""
+    (a, b, c), (d, e, f) = weights
+    first, second = a * column + b * row + c, d * column + e * row + f
+    return first, second, 1 - first - second
+
+
+@_compiled
+def shade(
+    corners: np.ndarray,
+    nearness: np.ndarray,
+    faces: np.ndarray,
+    values: np.ndarray,
+    owner: np.ndarray,
+    eye: np.ndarray,
+    key: np.ndarray,
+    alpha: float,
+    image: np.ndarray,
+) -> None:
+    """Draws what each sample of a picture shows: a key light with a highlight, the sky, and some light from all around.
+
+    Args:
+      corners: (V, 2) columns and rows of points, in samples.
+      nearness: (V,) one over their depths.
+      faces: (F, 3) the triangles.
+      values: (V, 12) place, normal, linear colour, shares of key light and sky, and strength of the highlight.
+      owner: (height, width) the triangle that a sample shows, or `NOTHING`.
+      eye: (3,) where the camera is.
+      key: (3,) unit direction towards the key light.
+      alpha: how much of it covers what was drawn before.
+      image: (height, width, 3) sRGB; changed in place.
+    """
+    here = np.empty(values.shape[1])
+    for row in range(owner.shape[0]):
+        for column in range(owner.shape[1]):
+            if owner[row, column] == NOTHING:
+                continue
+            i, j, k = faces[owner[row, column]]
+            first, second, third = _at(_weights(corners, i, j, k)[1], column, row)
+            first, second, third = first * nearness[i], second * nearness[j], third * nearness[k]
+            depth = 1 / (first + second + third)
+            for n in range(len(here)):
+                here[n] = depth * (first * values[i, n] + second * values[j, n] + third * values[k, n])
+            place, normal, colour, lit, sky, shine = here[:3], here[3:6], here[6:9], here[9], here[10], here[11]
+            ray, length = np.sqrt(_dot(place - eye, place - eye)), np.sqrt(_dot(normal, normal)) + 1e-12
+            half = key - (place - eye) / ray
+            facing = max(_dot(normal, key) / length, 0.0)
+            light = _KEY_STRENGTH * lit * facing + _SKY_STRENGTH * sky * (0.6 + 0.4 * normal[2] / length) + _BOUNCE
+            gloss = shine * lit * max(_dot(normal, half) / length / np.sqrt(_dot(half, half)), 0.0) ** _HIGHLIGHT
+            for n in range(3):
+                srgb = min(max(colour[n] * light + gloss, 0.0), 1.0) ** (1 / GAMMA)
+                image[row, column, n] = alpha * srgb + (1 - alpha) * image[row, column, n]
+
+
+@_compiled
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Of two vectors (3,)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@_compiled
+def add_light(
+    points: np.ndarray,
+    strength: np.ndarray,
+    axes: np.ndarray,
+    origin: np.ndarray,
+    sample: float,
+    top: np.ndarray,
+    total: np.ndarray,
+) -> None:
+    """Adds what a far lamp gives to points, as far as nothing is before them.
+
+    The four samples of the lamp's picture around a point are compared with it and mixed by how near they are, so that a
+    shadow's edge is a sample wide.
+
+    Args:
+      points: (n, 3).
+      strength: (n,) what the lamp gives where nothing is before it.
+      axes: (3, 3) rows: the lamp's right, up, and the direction towards it.
+      origin: (3,) along these, of the first sample of the lamp's picture, and what is added to a point's height.
+      sample: the size of a sample, m.
+      top: (height, width) how near the nearest body is to the lamp.
+      total: (n,) changed in place.
+    """
+    for n in range(len(points)):
+        x = min(max((_dot(axes[0], points[n]) - origin[0]) / sample, 0.0), top.shape[1] - 1.001)
+        y = min(max((origin[1] - _dot(axes[1], points[n])) / sample, 0.0), top.shape[0] - 1.001)
+        height = _dot(axes[2], points[n]) + origin[2]
+        left, above = int(x), int(y)
+        share = 0.0
+        for j in range(2):
+            for i in range(2):
+                if top[above + j, left + i] <= height:
+                    share += (x - left if i else 1 - x + left) * (y - above if j else 1 - y + above)
+        total[n] += share * strength[n]
+
+
+@_compiled
+def averaged(image: np.ndarray, samples: int) -> np.ndarray:
+    """(h, w, 3) uint8 of an image (h * samples, w * samples, 3) in [0, 1]."""
+    height, width = image.shape[0] // samples, image.shape[1] // samples
+    picture = np.empty((height, width, 3), np.uint8)
+    for row in range(height):
+        for column in range(width):
+            for i in range(3):
+                total = 0.0
+                for y in range(row * samples, (row + 1) * samples):
+                    for x in range(column * samples, (column + 1) * samples):
+                        total += image[y, x, i]
+                picture[row, column, i] = int(255 * min(max(total / samples**2, 0.0), 1.0) + 0.5)
+    return picture
