@@ -83,6 +83,7 @@ def _frames(hand: Hand, q: Array, wrist_position: Array, wrist_quaternion: Array
 def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
     """The object's convex pieces and its mesh, as arrays of the message."""
     pieces = obj.pieces
+    colours = {"colour_points": obj.colours.points, "colour_values": obj.colours.values} if obj.colours else {}
     return {
         "piece_kind": np.array([PIECE_KINDS.index(piece.kind) for piece in pieces], np.int32),
         "piece_size": np.array([piece.size for piece in pieces], np.float64),
@@ -91,6 +92,7 @@ def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
         "piece_part": np.array([piece.part for piece in pieces], np.int32),
         "visual_vertices": obj.visual_vertices,
         "visual_faces": obj.visual_faces.astype(np.int32),
+        **colours,
     }
 
 

@@ -76,8 +76,13 @@ def _shapes(obj: GraspObject) -> Iterator[str]:
         "visual_vertices": ("f", (None, 3)),
         "visual_faces": ("iu", (None, 3)),
     }
+    arrays = {name: np.asarray(getattr(obj, name)) for name in wanted}
+    if obj.colours:
+        arrays |= {"colour_points": obj.colours.points, "colour_values": obj.colours.values}
+        count = max(len(obj.colours.points), 1)
+        wanted |= {"colour_points": ("f", (count, 3)), "colour_values": ("u", (count, 3))}
     for name, (kinds, shape) in wanted.items():
-        array = np.asarray(getattr(obj, name))
+        array = arrays[name]
         fits = len(array.shape) == len(shape) and all(w in (None, n) for w, n in zip(shape, array.shape, strict=True))
         if array.dtype.kind not in kinds or not fits:
             words = ", ".join("n" if size is None else str(size) for size in shape)
@@ -86,8 +91,8 @@ def _shapes(obj: GraspObject) -> Iterator[str]:
 
 def _arrays(obj: GraspObject) -> Iterator[str]:
     """Values of arrays that cannot be."""
-    for name in ("inertia", "points", "normals", "rest_poses", "visual_vertices"):
-        values = np.asarray(getattr(obj, name))
+    placed = {name: getattr(obj, name) for name in ("inertia", "points", "normals", "rest_poses", "visual_vertices")}
+    for name, values in (placed | ({"colour_points": obj.colours.points} if obj.colours else {})).items():
         if not np.isfinite(values).all():
             yield f"its {name} holds numbers that are not finite"
         elif values.size and np.abs(values).max() > (HEAVIEST * LARGEST**2 if name == "inertia" else LARGEST):

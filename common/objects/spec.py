@@ -4,12 +4,14 @@ The object frame has its origin at the centre of mass; its orientation is the au
 """
 
 import dataclasses
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 PieceKind = Literal["box", "cylinder", "capsule", "ellipsoid", "mesh"]
 SURFACE_POINTS = 512
+COLOUR_POINTS = 16_384
+"""Points of an object's surface whose colours are known, if it has any of its own."""
 PRIMITIVE_SLOTS = {"box": 3, "cylinder": 2, "capsule": 3, "ellipsoid": 2}
 """Most pieces of each kind in a primitive object: the geoms that a batched environment keeps for its object."""
 MAX_MESH_PIECES = 48
@@ -33,6 +35,15 @@ class Piece:
     vertices: np.ndarray | None = None
     part: int = 0
     """Index into the object's `part_names`."""
+
+
+class Colours(NamedTuple):
+    """What a surface looks like at points of it; in between it looks like the nearest of them."""
+
+    points: np.ndarray
+    """(P, 3) float32, m."""
+    values: np.ndarray
+    """(P, 3) uint8 sRGB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +79,8 @@ class GraspObject:
     """Hausdorff distance of the pieces' surface from the mesh's that was imported, m."""
     volume_error: float | None = None
     """(Volume of the pieces' union - the mesh's) / the mesh's; None where the mesh was open, too."""
+    colours: Colours | None = None
+    """Its own, in the object frame."""
 
     @property
     def non_graspable_points(self) -> np.ndarray:
@@ -104,4 +117,5 @@ class GraspObject:
             origin=longer(self.origin),
             file_scale=factor * self.file_scale,
             surface_error=None if self.surface_error is None else factor * self.surface_error,
+            colours=self.colours and self.colours._replace(points=factor * self.colours.points),
         )

@@ -11,7 +11,7 @@ from common.errors import CongraspError
 from common.files import write_atomically
 from common.inputs import file_name, read_file
 from common.objects.checks import faults
-from common.objects.spec import GraspObject, Piece
+from common.objects.spec import Colours, GraspObject, Piece
 from common.wire.codec import Message, decode, encode
 
 SUFFIX = ".safetensors"
@@ -106,6 +106,8 @@ class Catalogue:
 def _to_message(obj: GraspObject) -> Message:
     """The object as a message."""
     arrays = {name: np.asarray(getattr(obj, name)) for name in _ARRAYS}
+    if obj.colours:
+        arrays |= {"colour_points": obj.colours.points, "colour_values": obj.colours.values}
     pieces = obj.pieces
     meshes = [np.zeros((0, 3)) if piece.vertices is None else piece.vertices for piece in pieces]
     arrays["piece_kind"] = np.array([_KINDS.index(piece.kind) for piece in pieces], np.int32)
@@ -163,4 +165,5 @@ def _from_message(message: Message) -> GraspObject:
         surface_error=meta.get("surface_error"),
         volume_error=meta.get("volume_error"),
         **{name: arrays[name] for name in _ARRAYS},
+        colours=Colours(arrays["colour_points"], arrays["colour_values"]) if "colour_points" in arrays else None,
     )

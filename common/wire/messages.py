@@ -96,6 +96,8 @@ EPISODE = MessageSpec(
         "piece_part": ArraySpec(_INDEX, ("n",)),
         "visual_vertices": ArraySpec(REAL, ("V", 3)),
         "visual_faces": ArraySpec(_INDEX, ("Fc", 3)),
+        "colour_points": ArraySpec(REAL, ("P", 3), optional=True),
+        "colour_values": ArraySpec(("uint8",), ("P", 3), optional=True),
         "surface_points": ArraySpec(REAL, ("N", 3)),
         "surface_minus": ArraySpec(("bool",), ("N",)),
     },

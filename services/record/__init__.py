@@ -10,7 +10,8 @@ episode: T control steps of one world. Arrays: `link_position` (T, L, 3), `link_
   (T, 3), `object_quaternion` (T, 4), `contact_force` (T, L, 3) in the world, m and N; `q`, `q_target` (T, F), `u`,
   `u_target` (T, 6), `action` (T, M + 6), `table` (T,) bool, `reward/<term>` (T,); `goal/<field>` of
   `common.task.types.Goal` for this world, in the object's frame; `surface_points` (N, 3), `surface_minus` (N,) bool,
-  `visual_vertices` (V, 3), `visual_faces` (F, 3), `piece_*` in the object's frame. Meta: `hand`, `object`,
+  `visual_vertices` (V, 3), `visual_faces` (F, 3), `piece_*` in the object's frame, and where the object has colours of
+  its own, `colour_values` (P, 3) uint8 at `colour_points` (P, 3). Meta: `hand`, `object`,
   `control_dt` (s), `version`, `actor`, `success`, `metrics` {name: number}. Quaternions are (w, x, y, z).
 
 Topics of a recording: `/metrics/<role>/<name>`, `/version/<role>/<name>`, `/events/<role>/<name>`, `/rollout/<actor>`,

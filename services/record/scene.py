@@ -15,6 +15,7 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
@@ -29,7 +30,7 @@ from services.record.goals import active_blocks
 from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, SKIN, TABLE, WAYPOINT
 
 EPISODE_SCHEMA = "congrasp.Episode"
-_MOST = {"T": 2000, "V": 200_000, "Fc": 400_000, "N": 4096, "n": 64}
+_MOST = {"T": 2000, "V": 200_000, "Fc": 400_000, "N": 4096, "n": 64, "P": 100_000}
 _GOAL, _ARRAYS = 10_000, 128
 _OPEN = ("reward/", "error/", "goal/", "active/")
 SPACING = 0.8
@@ -56,7 +57,7 @@ def check_episode(episode: Message) -> None:
     hand = known_hand(episode.meta.get("hand"))
     sizes = validate(episode, EPISODE, L=len(hand.links), F=len(hand.joints))
     for symbol, most in _MOST.items():
-        if not 1 <= sizes[symbol] <= most:
+        if not 1 <= sizes.get(symbol, 1) <= most:
             raise CongraspError(f"The episode's {symbol} is {sizes[symbol]}, not 1 to {most}.")
     if not 0.0 < episode.meta["control_dt"] <= 1.0:
         raise CongraspError("The episode's control_dt is not above 0 and at most 1 s.")
@@ -143,6 +144,10 @@ def _static_scene(
     for vertex in arrays["visual_vertices"]:
         _set_vector(body.points.add(), vertex)
     body.indices.extend(arrays["visual_faces"].ravel().tolist())
+    if "colour_values" in arrays:
+        near = cKDTree(arrays["colour_points"]).query(arrays["visual_vertices"])[1]
+        for colour in arrays["colour_values"][near] / 255:
+            _set_colour(body.colors.add(), (*colour, 1.0))
     _set_colour(body.color, _OBJECT)
     text = _entity(update, "label", frame, now).texts.add(billboard=True, font_size=0.015, text=_label(meta))
     _set_vector(text.pose.position, [0.0, 0.0, arrays["visual_vertices"][:, 2].max() + 0.12])

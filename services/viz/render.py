@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
 from common.hands import known_hand
@@ -50,11 +50,18 @@ def _bodies(episode: Message, step: int) -> list[Shape]:
 
 
 def _object(episode: Message, step: int) -> Shape:
-    """The object at a step, painted where its avoid region is a constraint."""
+    """The object at a step in its own colours, painted where its avoid region is a constraint."""
     arrays = episode.arrays
-    affordance = active_blocks(arrays).get("affordance", False)
     avoid = np.asarray(arrays["surface_minus"], bool)
-    painted = affordance and bool(avoid.any())
+    marked = active_blocks(arrays).get("affordance", False) and bool(avoid.any())
+    points = colours = None
+    if "colour_values" in arrays:
+        points, colours = arrays["colour_points"], arrays["colour_values"] / 255
+        if marked:
+            near = cKDTree(arrays["surface_points"]).query(points)[1]
+            colours = np.where(avoid[near, None], OBJECT_AVOID, colours)
+    elif marked:
+        points, colours = arrays["surface_points"], np.where(avoid[:, None], OBJECT_AVOID, OBJECT)
     return Shape(
         "mesh",
         (0, 0),
@@ -63,8 +70,8 @@ def _object(episode: Message, step: int) -> Shape:
         np.asarray(arrays["object_quaternion"][step], float),
         vertices=arrays["visual_vertices"],
         faces=arrays["visual_faces"],
-        paint_points=np.asarray(arrays["surface_points"]) if painted else None,
-        paint_colours=np.where(avoid[:, None], OBJECT_AVOID, OBJECT) if painted else None,
+        paint_points=points,
+        paint_colours=colours,
     )
 
 

@@ -18,10 +18,11 @@ from common.files import cache_folder
 from common.objects import shapes, store
 from common.objects.procedural import MASS_RANGE
 from common.objects.resting import rest_poses
-from common.objects.spec import GraspObject, Piece
+from common.objects.spec import Colours, GraspObject, Piece
 from common.objects.surface import halves, mass_properties, sample_mesh
 from common.parallel import cores
 from services.assets.objects import decompose, repair
+from services.assets.objects.colours import sample_colours
 from services.assets.objects.fidelity import Fidelity, fidelity
 from services.assets.objects.options import ImportOptions, check_options
 from services.assets.objects.pieces import SQUEEZE, merge, simplify, squeeze
@@ -30,7 +31,7 @@ from services.assets.objects.sources import MeshFile, Source, read_mesh
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""
-_CACHE_VERSION = 4
+_CACHE_VERSION = 5
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 _TOO_LARGE = 0.01  # share of the volume; pieces of thin walls fill the inside of their bends
 
@@ -173,8 +174,19 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         notes=tuple(notes),
         surface_error=errors.surface,
         volume_error=errors.volume,
+        colours=_colours(source, factor, center, seed, notes),
     )
     return dataclasses.replace(obj, rest_poses=rest_poses(obj))
+
+
+def _colours(source: Source, factor: float, center: np.ndarray, seed: int, notes: list[str]) -> Colours | None:
+    """Those of the files, in the object's frame."""
+    try:
+        found = sample_colours([file.path for file in source.visuals], seed)
+    except CongraspError as error:
+        notes.append(f"its colours are left out: {error}")
+        return None
+    return found and found._replace(points=(factor * found.points - center).astype(np.float32))
 
 
 def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
