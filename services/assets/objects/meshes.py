@@ -155,6 +155,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
             for piece, vote in zip(pieces, votes, strict=True)
         )
     picture = repair.with_few_faces(whole)
+    colours = _colours(source, factor, center, seed, notes)
     obj = GraspObject(
         name=source.name,
         family="imported",
@@ -174,7 +175,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         notes=tuple(notes),
         surface_error=errors.surface,
         volume_error=errors.volume,
-        colours=_colours(source, factor, center, seed, notes),
+        colours=colours,
     )
     return dataclasses.replace(obj, rest_poses=rest_poses(obj))
 
