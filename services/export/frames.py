@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from common.errors import CongraspError
 from common.hands.skeleton import Skeleton
 from common.hands.skin import Skin, skin_on
+from common.objects.painting import painted
 from services.export.motion_file import GraspMotion
 from services.record import palette
 
@@ -77,6 +78,13 @@ def capsules(motion: GraspMotion, link: int) -> Iterator[Capsule]:
         length = float(np.linalg.norm(end - start))
         turn = Rotation.align_vectors([end - start], [[0, 0, 1]])[0] if length else Rotation.identity()
         yield Capsule(int(k), length, float(motion.capsule_radius[k]), (start + end) / 2, turn)
+
+
+def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """The object's mesh (V, 3), (F, 3) and the sRGB (V, 3) in [0, 1] of its points; it is cut finer for these."""
+    if motion.colours is None:
+        return motion.object_vertices, motion.object_faces, None
+    return painted(motion.object_vertices, motion.object_faces, motion.colours)
 
 
 def skin_of_motion(motion: GraspMotion) -> Skin:
@@ -153,7 +161,8 @@ def error_mm(motion: GraspMotion, track: Track) -> float:
     distances = [np.linalg.norm(((expected[name] - track.poses[name]) @ points)[:, :3], axis=1) for name in expected]
     worst = max(float(distance.max()) for distance in distances)
     if track.triangles is not None:
-        corners = motion.object_vertices[motion.object_faces]
+        vertices, faces, _ = object_mesh(motion)
+        corners = vertices[faces]
         if track.triangles.shape != corners.shape:
             raise CongraspError("The file's mesh has other triangles than the object.")
         worst = max(worst, float(np.linalg.norm(track.triangles - corners, axis=-1).max()))

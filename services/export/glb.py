@@ -25,6 +25,7 @@ from services.export.frames import (
     bodies,
     continuous_quaternions,
     facts,
+    object_mesh,
     pose_matrices,
     skin_of_motion,
 )
@@ -52,8 +53,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         file.nodes[body.parent + 1].children.append(number)
         if body.name == OBJECT:
             node.mesh = len(file.meshes)
-            mesh = trimesh.Trimesh(motion.object_vertices, motion.object_faces, process=False)
-            file.meshes.append(gltf.Mesh(name=OBJECT, primitives=[_primitive(file, data, mesh)]))
+            file.meshes.append(gltf.Mesh(name=OBJECT, primitives=[_primitive(file, data, *object_mesh(motion))]))
         tracks = {"rotation": continuous_quaternions(body.rotation, scalar_first=False)}
         if len(body.translation) > 1:
             tracks["translation"] = body.translation
@@ -98,8 +98,11 @@ def _add(
     return len(file.accessors) - 1
 
 
-def _primitive(file: gltf.GLTF2, data: bytearray, mesh: trimesh.Trimesh) -> gltf.Primitive:
-    """The object's mesh with normals and its material."""
+def _primitive(
+    file: gltf.GLTF2, data: bytearray, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None
+) -> gltf.Primitive:
+    """The object's mesh with normals and its material, whose colour is white where the points have theirs."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
     normals = mesh.vertex_normals
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(lengths > 0.5, normals / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])  # of unused vertices
@@ -107,6 +110,9 @@ def _primitive(file: gltf.GLTF2, data: bytearray, mesh: trimesh.Trimesh) -> gltf
         POSITION=_add(file, data, mesh.vertices, gltf.ARRAY_BUFFER, bounds=True),
         NORMAL=_add(file, data, normals, gltf.ARRAY_BUFFER),
     )
+    if colours is not None:
+        attributes.COLOR_0 = _add(file, data, colours**2.2, gltf.ARRAY_BUFFER)  # linear, as glTF has them
+        file.materials[-1].pbrMetallicRoughness.baseColorFactor = [1.0, 1.0, 1.0, 1.0]
     indices = _add(file, data, mesh.faces.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
     return gltf.Primitive(attributes=attributes, indices=indices, material=len(file.materials) - 1)
 

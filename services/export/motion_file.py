@@ -21,6 +21,7 @@ from common.hands import known_hand
 from common.hands.spec import Hand, capsule_ends
 from common.inputs import file_name
 from common.npz import read_npz
+from common.objects.spec import Colours
 from common.task.constraints import CONSTRAINTS
 from common.wire.codec import Message
 from services.record.goals import active_constraints
@@ -29,7 +30,7 @@ FORMAT = 2
 MAX_BYTES = 256 << 20
 """Bytes that the arrays of a motion may have together."""
 _LARGEST = 1e6
-_INDICES = ("object_faces", "joint_link", "link_parent", "capsule_link")
+_INDICES = ("object_colour_values", "object_faces", "joint_link", "link_parent", "capsule_link")
 _META = "meta"
 _OLDER = {"pose_joints": "pose_q"}
 """Names of goal arrays in files of format 1."""
@@ -83,6 +84,8 @@ class GraspMotion:
     capsule_radius: Annotated[np.ndarray, "(C,) m"]
     surface_points: Annotated[np.ndarray, "(N, 3) m, object frame, points of the surface"]
     surface_minus: Annotated[np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"]
+    colours: Colours | None
+    """The object's own, in its frame."""
     goal: dict[str, np.ndarray]
     """Goal arrays of the constraints that the policy knows, by constraint and field: `heading_direction`, `pose_q`."""
 
@@ -95,7 +98,11 @@ _GOALS = {
 """Meaning of the goal arrays; it begins with the shape, as that of the others does."""
 _HINTS = get_type_hints(GraspMotion, include_extras=True)
 _ARRAYS = {name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")}
-_FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name != "goal")
+_FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name not in ("goal", "colours"))
+_COLOURS = {
+    "object_colour_points": "(P, 3) m, object frame, points of the surface whose colours are known",
+    "object_colour_values": "(P, 3) sRGB from 0 to 255 there",
+}
 
 
 def motion_of_episode(episode: Message) -> GraspMotion:
@@ -129,6 +136,7 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         **hand_arrays(hand),
         surface_points=arrays["surface_points"],
         surface_minus=arrays["surface_minus"].astype(bool),
+        colours=Colours(arrays["colour_points"], arrays["colour_values"]) if "colour_values" in arrays else None,
         goal={
             name.removeprefix("goal/"): value for name, value in arrays.items() if name.removeprefix("goal/") in _GOALS
         },
@@ -158,16 +166,17 @@ def save_motion(path: str | os.PathLike[str], motion: GraspMotion) -> None:
     Raises:
       CongraspError: the file cannot be written.
     """
+    own = dict(zip(_COLOURS, motion.colours, strict=True)) if motion.colours else {}
     meta = {
         "format": FORMAT,
         **{name: getattr(motion, name) for name in _FACTS},
         "units": "m, rad, s, N",
         "quaternions": "(w, x, y, z)",
         "world": "z up, table's top at z = 0",
-        "arrays": {**_ARRAYS, **{name: _GOALS[name] for name in motion.goal}},
+        "arrays": {**_ARRAYS, **{name: _COLOURS[name] for name in own}, **{name: _GOALS[name] for name in motion.goal}},
     }
     buffer = io.BytesIO()
-    arrays: dict[str, Any] = {**{name: getattr(motion, name) for name in _ARRAYS}, **motion.goal}
+    arrays: dict[str, Any] = {**{name: getattr(motion, name) for name in _ARRAYS}, **own, **motion.goal}
     arrays[_META] = np.array(json.dumps(meta))
     np.savez_compressed(buffer, **arrays)
     write_atomically(pathlib.Path(path), buffer.getvalue())
@@ -190,8 +199,10 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
         _check_facts(facts)
         named = {_OLDER.get(name, name): array for name, array in arrays.items()}
         goal = {name: array for name, array in named.items() if name in _GOALS}
-        _check_arrays({**arrays, **goal}, {**_ARRAYS, **{name: _GOALS[name] for name in goal}})
-        return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, goal=goal)
+        own = _COLOURS if _COLOURS.keys() & arrays.keys() else {}
+        _check_arrays({**arrays, **goal}, {**_ARRAYS, **own, **{name: _GOALS[name] for name in goal}})
+        colours = Colours(*(arrays[name] for name in own)) if own else None
+        return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise CongraspError(f"{path} is not a grasp motion ({str(error)[:200]}).", remedy) from None
 

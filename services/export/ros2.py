@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
-from services.export.frames import COLOURS, OBJECT, Body, Track, bodies, facts, pose_matrices
+from services.export.frames import COLOURS, OBJECT, Body, Track, bodies, facts, object_mesh, pose_matrices
 from services.export.motion_file import GraspMotion
 from services.export.urdf import forward_kinematics, hand_urdf
 
@@ -162,7 +162,8 @@ def _transforms(make: _Messages, found: Sequence[Body], t: int, stamp: int) -> A
 
 def _marker(make: _Messages, motion: GraspMotion) -> Any:
     """The object's mesh as a marker."""
-    corners = motion.object_vertices[motion.object_faces.ravel()]
+    vertices, faces, own = object_mesh(motion)
+    corners, colours = vertices[faces.ravel()], [] if own is None else own[faces.ravel()].tolist()
     image = make("sensor_msgs/CompressedImage", header=make.header(0, ""), format="", data=np.zeros(0, np.uint8))
     return make(
         "visualization_msgs/Marker",
@@ -177,7 +178,7 @@ def _marker(make: _Messages, motion: GraspMotion) -> Any:
         lifetime=make.duration(0),
         frame_locked=True,
         points=[make.vector(corner, "Point") for corner in corners],
-        colors=[],
+        colors=[make("std_msgs/ColorRGBA", **dict(zip("rgba", (*each, 1.0), strict=True))) for each in colours],
         texture_resource="",
         texture=image,
         uv_coordinates=[],

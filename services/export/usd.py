@@ -27,6 +27,7 @@ from services.export.frames import (
     continuous_quaternions,
     facts,
     identifiers,
+    object_mesh,
     pose_matrices,
     skin_of_motion,
 )
@@ -86,8 +87,13 @@ def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link:
 
 def _add_mesh(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion) -> None:
     """The object's mesh in its frame."""
-    mesh = _new_mesh(stage, parent.AppendChild("mesh"), motion.object_vertices, motion.object_faces)
-    mesh.CreateDisplayColorAttr([COLOURS[OBJECT]])
+    vertices, faces, colours = object_mesh(motion)
+    mesh = _new_mesh(stage, parent.AppendChild("mesh"), vertices, faces)
+    if colours is None:
+        mesh.CreateDisplayColorAttr([COLOURS[OBJECT]])
+    else:
+        own = mesh.CreateDisplayColorAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colours)))
+        UsdGeom.Primvar(own).SetInterpolation(UsdGeom.Tokens.vertex)
 
 
 def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body]) -> None:

@@ -15,13 +15,14 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands import known_hand
 from common.hands.mjcf import WRIST_JOINTS
 from common.hands.spec import Hand, Link, capsule_ends
+from common.objects.painting import nearest
+from common.objects.spec import Colours
 from common.wire.codec import Message, encode
 from common.wire.messages import EPISODE, validate
 from services.assets.hands.kinematics import mujoco_link_poses
@@ -145,8 +146,8 @@ def _static_scene(
         _set_vector(body.points.add(), vertex)
     body.indices.extend(arrays["visual_faces"].ravel().tolist())
     if "colour_values" in arrays:
-        near = cKDTree(arrays["colour_points"]).query(arrays["visual_vertices"])[1]
-        for colour in arrays["colour_values"][near] / 255:
+        own = Colours(arrays["colour_points"], arrays["colour_values"])
+        for colour in nearest(arrays["visual_vertices"], own).tolist():
             _set_colour(body.colors.add(), (*colour, 1.0))
     _set_colour(body.color, _OBJECT)
     text = _entity(update, "label", frame, now).texts.add(billboard=True, font_size=0.015, text=_label(meta))

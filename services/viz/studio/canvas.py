@@ -4,14 +4,12 @@ import itertools
 from typing import Any
 
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
 from common.errors import CongraspError
+from common.objects.painting import finer
 from common.objects.spec import GraspObject
 
-_EDGE = 0.006  # longest edge of the mesh that is painted on, m
-_MOST_FACES = 12_000  # beyond which a mesh is not cut finer
 _versions = itertools.count(1)
 
 
@@ -28,7 +26,7 @@ class Canvas:
     def __init__(self, obj: GraspObject):
         """Cuts the object's mesh finer."""
         self._obj = obj
-        self.vertices, self.faces = _finer(obj.visual_vertices, obj.visual_faces)
+        self.vertices, self.faces = finer(obj.visual_vertices, obj.visual_faces)
         self._set(np.zeros(len(obj.points), bool), np.zeros(len(self.vertices), bool))
 
     def brush(self, points: Any, radius: float, avoid: bool) -> None:
@@ -58,15 +56,3 @@ class Canvas:
     def _set(self, avoid: np.ndarray, shown: np.ndarray) -> None:
         """Takes new paint."""
         self.avoid, self.shown, self.version = avoid, shown, next(_versions)
-
-
-def _finer(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface, cut until its edges are short or it has many faces, so that paint has somewhere to be."""
-    if len(faces) >= _MOST_FACES:
-        return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
-    area = float(trimesh.Trimesh(vertices, faces, process=False).area)
-    edge = max(_EDGE, 2.2 * float(np.sqrt(area / _MOST_FACES)))
-    fine, cut = trimesh.remesh.subdivide_to_size(vertices, faces, edge, max_iter=12)[:2]
-    merged = trimesh.Trimesh(fine, cut, process=False)
-    merged.merge_vertices()
-    return np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32)

@@ -16,10 +16,11 @@ from scipy.spatial.transform import Rotation
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.skin import skin_of
+from common.objects.spec import Colours
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.cli.main import main
 from services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
-from services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
+from services.export.motion_file import GraspMotion, hand_arrays, load_motion, motion_of_episode, save_motion
 from services.record.channels import Entry
 from services.record.entries import Converter
 from services.record.writer import LogWriter
@@ -236,6 +237,7 @@ def test_pixars_library_moves_the_skin_of_a_usd(
     which: str, request: pytest.FixtureRequest, tmp_path: pathlib.Path
 ) -> None:
     motion = request.getfixturevalue(which)
+    export([motion], "ros2", tmp_path)
     path, _ = export([motion], "usd", tmp_path)
     stage = Usd.Stage.Open(str(path))
     root = UsdSkel.Root(stage.GetPrimAtPath("/grasp/skin"))
@@ -248,6 +250,36 @@ def test_pixars_library_moves_the_skin_of_a_usd(
         points = mesh.GetPointsAttr().Get()
         assert target.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(float(t)), points, float(t))
         np.testing.assert_allclose(np.array(points), expected_surface(motion, t), atol=2e-6)
+
+
+def test_glb_and_usd_have_the_colours_of_the_object(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    corners = human.object_vertices
+    red = np.where(corners[:, 2:] > corners[:, 2].mean(), (255, 0, 0), (0, 0, 255)).astype(np.uint8)
+    motion = dataclasses.replace(human, colours=Colours(corners, red))
+    save_motion(tmp_path / "motion.npz", motion)
+    again = load_motion(tmp_path / "motion.npz").colours
+    assert again is not None and (again.values == red).all() and (again.points == corners).all()
+
+    def red_above_blue(points: np.ndarray, colours: np.ndarray) -> bool:
+        z, middle = points[:, 2], corners[:, 2].mean()
+        top, bottom = colours[z > middle + 0.01], colours[z < middle - 0.01]
+        return len(top) > 0 < len(bottom) and bool(
+            (top[:, 0] > top[:, 2]).all() and (bottom[:, 2] > bottom[:, 0]).all()
+        )
+
+    path, _ = export([motion], "glb", tmp_path)
+    mesh = trimesh.load_scene(path, process=False).geometry["object"]
+    assert red_above_blue(mesh.vertices, mesh.visual.vertex_attributes["color"])
+    path, _ = export([motion], "usd", tmp_path)
+    stage = Usd.Stage.Open(str(path))
+    (shape,) = (
+        UsdGeom.Mesh(prim)
+        for prim in stage.Traverse()
+        if prim.GetName() == "mesh" and "skin" not in str(prim.GetPath())
+    )
+    shown = shape.GetDisplayColorPrimvar()
+    assert shown.GetInterpolation() == UsdGeom.Tokens.vertex
+    assert red_above_blue(np.array(shape.GetPointsAttr().Get()), np.array(shown.Get()))
 
 
 def test_a_bvh_has_the_skeleton_of_the_skin(human: GraspMotion, tmp_path: pathlib.Path) -> None:
