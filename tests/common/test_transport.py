@@ -138,7 +138,7 @@ def test_silence_has_a_deadline(pair):
     with pytest.raises(TransportError, match=r"within 0\.3 s") as caught:
         client.query(KEYS.act, Message(), timeout=0.3)
     assert not isinstance(caught.value, RefusedError)
-    assert 0.25 < time.monotonic() - start < 3
+    assert 0.25 < time.monotonic() - start < 15
     with pytest.raises(TransportError, match="No response"):
         client.query(KEYS.health, Message(), timeout=5)
     release.set()
@@ -246,7 +246,7 @@ def test_closed_subscription_lets_its_reader_go(pair):
     threading.Timer(0.2, subscription.close).start()
     start = time.monotonic()
     assert subscription.receive(20) is None
-    assert time.monotonic() - start < 5
+    assert time.monotonic() - start < 15
 
 
 def test_tokens_show_who_is_there(pair):
@@ -310,7 +310,7 @@ def test_absent_peer_is_an_error_with_a_deadline():
     start = time.monotonic()
     with pytest.raises(TransportError, match=f"No response from {endpoint}"):
         ZenohTransport(connect=[endpoint], wait=0.2)
-    assert time.monotonic() - start < 5
+    assert time.monotonic() - start < 15
 
 
 def test_flows_decide_the_ports():

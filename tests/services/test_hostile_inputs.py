@@ -126,4 +126,4 @@ def test_a_pipe_among_recordings_makes_nobody_wait(tmp_path):
     os.mkfifo(tmp_path / "log.mcap")
     began = time.monotonic()
     refused(lambda path: read_records(log_files(path)[0]), tmp_path, "no regular file")
-    assert time.monotonic() - began < 5.0
+    assert time.monotonic() - began < 15.0

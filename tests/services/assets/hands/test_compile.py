@@ -45,7 +45,7 @@ def test_hostile_files_are_refused_in_one_line_and_soon(tmp_path, body, why):
     with pytest.raises(CongraspError, match=why) as raised:
         compiled_model(_mjcf(tmp_path, body), [])
     assert str(tmp_path) in str(raised.value) and "\n" not in str(raised.value)
-    assert time.monotonic() - begin < 10
+    assert time.monotonic() - begin < 30
 
 
 def test_counts_that_multiply_meet_the_time_limit(tmp_path, monkeypatch):
