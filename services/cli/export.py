@@ -44,6 +44,7 @@ def motion(
     out: pathlib.Path | None = None,
     index: int = -1,
     success: bool = False,
+    camera: bool = False,
 ) -> int:
     """Write a grasp motion for another program, read the file back, and print its largest error in millimetres.
 
@@ -59,6 +60,7 @@ def motion(
       out: The file or folder to write; the first motion's name in the working directory otherwise.
       index: Which of the recorded episodes, from 0; -1 is the last.
       success: Count only episodes that succeeded.
+      camera: Also film the motions; lerobot alone has videos.
     """
     from services.export.frames import TOLERANCE_MM
     from services.export.motion_formats import FORMATS, export_motions, pick_motion
@@ -67,7 +69,7 @@ def motion(
         raise CongraspError("No motion was named.", "Name a .npz of 'congrasp grasp', a recording or a run's folder.")
     target = out or pathlib.Path(f"{paths[0].stem}{FORMATS[to] or f'-{to}'}")
     motions = [pick_motion(path, index, success=success) for path in paths]
-    error = export_motions(motions, to, target)
+    error = export_motions(motions, to, target, camera=camera)
     frames = sum(len(motion.time) for motion in motions)
     print(f"{target}: {frames} frames, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
     return 0

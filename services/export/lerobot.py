@@ -1,13 +1,14 @@
 """A LeRobot dataset, version 3.0: one episode a motion; written with pyarrow, read back by its own layout.
 
 `observation.state` is what the robot feels (finger joints, then the wrist's pose), `observation.environment_state` the
-object's pose, `action` the finger targets and the wrist's pose one step later. The hand is in `meta/hand.urdf`.
+object's pose, `action` the finger targets and the wrist's pose one step later. The hand is in `meta/hand.urdf`. With a
+camera there is `observation.images.front` too: one MP4 for all episodes, a frame for every row.
 """
 
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -16,9 +17,12 @@ import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
+from services.export.camera import SIZE, calibration, camera_for, pictures
 from services.export.frames import OBJECT, Track, facts, pose_matrices
 from services.export.motion_file import GraspMotion
 from services.export.urdf import forward_kinematics, hand_urdf
+from services.viz.scene import Camera
+from services.viz.sheets import save_video
 
 VERSION = "v3.0"
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -27,10 +31,14 @@ _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _COUNTERS = {"frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _STATE, _OBJECT, _ACTION = "observation.state", "observation.environment_state", "action"
+_CAMERA = "observation.images.front"
+_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+_KEYFRAMES = ("-g", "2")  # training reads frames anywhere
+_COUNTED = 64  # pixels from one that the statistics count, to the next
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
-    """Writes motions of one hand and one control step as a dataset, which is a folder."""
+def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = False) -> None:
+    """Writes motions of one hand and one control step as a dataset, which is a folder, with a camera's video or not."""
     first = motions[0]
     fps = round(1 / first.control_dt)
     if abs(fps * first.control_dt - 1) > 1e-6:
@@ -45,9 +53,10 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     for columns, start, length in zip(episodes, starts, lengths, strict=False):
         columns["index"] = start + np.arange(length)
     every = {name: np.concatenate([columns[name] for columns in episodes]) for name in episodes[0]}
-    rows = []
+    seen = _film(path, motions, fps) if camera else None
+    rows: list[dict[str, Any]] = []
     for i, columns in enumerate(episodes):
-        stats = {f"stats/{name}/{key}": value for name, c in columns.items() for key, value in _statistics(c).items()}
+        own = {f"stats/{name}/{key}": value for name, c in columns.items() for key, value in _statistics(c).items()}
         rows.append(
             {
                 "episode_index": i,
@@ -57,7 +66,8 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
                 "data/file_index": 0,
                 "dataset_from_index": int(starts[i]),
                 "dataset_to_index": int(starts[i + 1]),
-                **stats,
+                **own,
+                **(_filmed(seen.pixels[i], lengths[i], starts[i : i + 2] / fps) if seen else {}),
                 "meta/episodes/chunk_index": 0,
                 "meta/episodes/file_index": 0,
             }
@@ -75,10 +85,65 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     meta = path / "meta"
     (meta / "hand.urdf").write_text(hand_urdf(first))
     (meta / "congrasp.json").write_text(json.dumps(about, indent=1))
-    (meta / "stats.json").write_text(
-        json.dumps({name: _statistics(values) for name, values in every.items()}, indent=1)
-    )
-    (meta / "info.json").write_text(json.dumps(_info(first, len(motions), int(starts[-1]), len(tasks), fps), indent=1))
+    stats: dict[str, Any] = {name: _statistics(values) for name, values in every.items()}
+    info = _info(first, len(motions), int(starts[-1]), len(tasks), fps)
+    if seen:
+        stats[_CAMERA] = _image_statistics(np.concatenate(seen.pixels), int(starts[-1]))
+        info["video_path"], info["features"][_CAMERA] = _VIDEO, _video_feature(fps)
+        (meta / "camera.json").write_text(json.dumps(calibration(seen.camera), indent=1))
+    (meta / "stats.json").write_text(json.dumps(stats, indent=1))
+    (meta / "info.json").write_text(json.dumps(info, indent=1))
+
+
+class _Film(NamedTuple):
+    """What a camera saw."""
+
+    camera: Camera
+    pixels: list[np.ndarray]
+    """(n, 3) from 0 to 1 of each episode: some pixels of every frame."""
+
+
+def _film(path: pathlib.Path, motions: Sequence[GraspMotion], fps: int) -> _Film:
+    """Writes the video of all motions, one after the other, from a camera that holds them all."""
+    camera, pixels = camera_for(motions), list[np.ndarray]()
+
+    def frames() -> Iterator[np.ndarray]:
+        """Every frame, while its pixels are counted."""
+        for motion in motions:
+            counted = []
+            for picture in pictures(motion, camera):
+                counted.append(picture.reshape(-1, 3)[::_COUNTED] / 255)
+                yield picture
+            pixels.append(np.concatenate(counted))
+
+    save_video(path / _VIDEO.format(video_key=_CAMERA, **_PLACE), frames(), SIZE, fps, _KEYFRAMES)
+    return _Film(camera, pixels)
+
+
+def _filmed(pixels: np.ndarray, frames: int, seconds: np.ndarray) -> dict[str, Any]:
+    """What the row of an episode says of its part of the video, from one second (2,) to another."""
+    begin, end = seconds.tolist()
+    place = {**_PLACE, "from_timestamp": begin, "to_timestamp": end}
+    statistics = _image_statistics(pixels, frames)
+    return {
+        **{f"videos/{_CAMERA}/{name}": value for name, value in place.items()},
+        **{f"stats/{_CAMERA}/{name}": value for name, value in statistics.items()},
+    }
+
+
+def _image_statistics(pixels: np.ndarray, frames: int) -> dict[str, Any]:
+    """Statistics of pixels (n, 3): each has the shape (3, 1, 1), and what is counted are frames."""
+    found = {name: np.reshape(values, (-1, 1, 1)).tolist() for name, values in _statistics(pixels).items()}
+    return found | {"count": [frames]}
+
+
+def _video_feature(fps: int) -> dict[str, Any]:
+    """The camera among the features."""
+    width, height = SIZE
+    about = {"height": height, "width": width, "channels": 3, "codec": "h264", "pix_fmt": "yuv420p", "fps": fps}
+    about |= {"is_depth_map": False}
+    info = {**{f"video.{name}": value for name, value in about.items()}, "has_audio": False}
+    return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
 
 
 def _task(motion: GraspMotion) -> str:

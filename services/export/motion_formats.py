@@ -23,6 +23,8 @@ FORMATS = {
 """Name and suffix of each format; `services.export.<name>` writes and reads it. Those without a suffix are folders."""
 SEVERAL = ("lerobot",)
 """Formats that hold more than one motion."""
+FILMED = ("lerobot",)
+"""Formats that hold a camera's video."""
 _NUMBERS = (
     "time",
     "joint_position",
@@ -47,13 +49,14 @@ def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -
     return motion_of_episode(pick_episode(path, index, success=success))
 
 
-def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path) -> float:
+def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path, *, camera: bool = False) -> float:
     """Writes motions in a format, reads the file back and compares.
 
     Args:
       motions: one, or several where the format takes them.
       kind: one of `FORMATS`.
       path: the file or folder to write; a file that is there is replaced, a folder is not.
+      camera: also film them, where the format has videos.
 
     Returns:
       The largest error in mm (see `services.export.frames.error_mm`).
@@ -63,6 +66,8 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
     """
     if len(motions) > 1 and kind not in SEVERAL:
         raise CongraspError(f"A {kind} file holds one motion, and {len(motions)} were named.", "Name one at a time.")
+    if camera and kind not in FILMED:
+        raise CongraspError(f"A {kind} file holds no video.", f"Leave --camera out, or set --to {FILMED[0]}.")
     if (suffix := FORMATS[kind]) and path.suffix.lower() != suffix:
         name = path / f"grasp{suffix}" if path.is_dir() else f"{path}{suffix}"
         raise CongraspError(f"The name of a {kind} file ends in {suffix}, and {path} does not.", f"Use --out {name}")
@@ -78,7 +83,7 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
         raise CongraspError(f"{path} cannot be written: {error.strerror}.", "Choose another with --out.") from None
     try:
         draft = workplace / path.name
-        module.write(draft, motions)
+        module.write(draft, motions, **({"camera": True} if camera else {}))
         tracks = module.read(draft)
         if len(tracks) != len(motions):
             raise CongraspError(f"The {kind} file holds {len(tracks)} motions, not {len(motions)}.")

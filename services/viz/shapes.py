@@ -41,7 +41,18 @@ def hand_shape(
       alpha: below one the hand is seen through.
       skin: the surface; the hand's own by default.
     """
-    skin = skin or skin_of(hand)
+    return skin_shape(skin or skin_of(hand), position, quaternion, tint, shares, alpha)
+
+
+def skin_shape(
+    skin: Skin,
+    position: np.ndarray,
+    quaternion: np.ndarray,
+    tint: Colour = SKIN,
+    shares: Sequence[float] | np.ndarray | None = None,
+    alpha: float = 1.0,
+) -> Shape:
+    """A skin with its links' frames at positions (L, 3) and orientations (L, 4); the rest is that of `hand_shape`."""
     points, normals = skin.posed(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
     own = skin_colours(skin)
     share = (skin.weights @ np.asarray(shares, np.float32))[:, None] if shares is not None else 0.0

@@ -75,8 +75,16 @@ def save_png(path: pathlib.Path, image: np.ndarray) -> None:
     write_atomically(path, png_of(image))
 
 
-def save_video(path: pathlib.Path, frames: Iterable[np.ndarray], size: tuple[int, int], frame_rate: float) -> None:
+def save_video(
+    path: pathlib.Path,
+    frames: Iterable[np.ndarray],
+    size: tuple[int, int],
+    frame_rate: float,
+    encoding: Sequence[str] = (),
+) -> None:
     """Writes pictures (height, width, 3) uint8 of `size` (width, height, both even) as an MP4 (H.264).
+
+    `encoding` are further options of ffmpeg for the file.
 
     Raises:
       CongraspError: the package for videos is absent, or the file cannot be written.
@@ -87,7 +95,9 @@ def save_video(path: pathlib.Path, frames: Iterable[np.ndarray], size: tuple[int
         raise CongraspError("Videos need the package 'imageio-ffmpeg'.", "Run: pip install 'congrasp[viz]'") from None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writer = imageio_ffmpeg.write_frames(str(path), size, fps=frame_rate, quality=8, macro_block_size=2)
+        writer = imageio_ffmpeg.write_frames(
+            str(path), size, fps=frame_rate, quality=8, macro_block_size=2, output_params=[*encoding]
+        )
         with warnings.catch_warnings():  # JAX warns of forks; this one is another program at once
             warnings.simplefilter("ignore", RuntimeWarning)
             writer.send(None)

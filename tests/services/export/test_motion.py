@@ -6,7 +6,9 @@ import pathlib
 from collections.abc import Callable, Sequence
 from types import ModuleType
 
+import imageio_ffmpeg
 import numpy as np
+import pyarrow.parquet as pq
 import pygltflib
 import pytest
 import trimesh
@@ -20,6 +22,7 @@ from common.objects.spec import Colours
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.cli.main import main
 from services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
+from services.export.camera import camera_for, pictures
 from services.export.motion_file import GraspMotion, hand_arrays, load_motion, motion_of_episode, save_motion
 from services.record.channels import Entry
 from services.record.entries import Converter
@@ -333,8 +336,6 @@ def test_a_dataset_of_several_motions(human: GraspMotion, tmp_path: pathlib.Path
     assert error < 0.01
     info = json.loads((path / "meta" / "info.json").read_text())
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"], info["fps"]) == (3, 3 * T, 2, 100)
-    import pyarrow.parquet as pq
-
     table = pq.read_table(path / "data")
     assert table["index"].to_pylist() == list(range(3 * T))
     assert table["task_index"].to_pylist() == [0] * T + [1] * T + [0] * T
@@ -350,6 +351,42 @@ def test_a_dataset_of_several_motions(human: GraspMotion, tmp_path: pathlib.Path
     # pandas finds the tasks as its index
     schema = json.loads(pq.read_schema(path / "meta" / "tasks.parquet").metadata[b"pandas"])
     assert schema["index_columns"] == ["task"]
+
+
+def test_a_dataset_with_a_camera_has_a_frame_for_every_row(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    near = dataclasses.replace(human, object_position=human.wrist_position + 0.1)
+    path = tmp_path / "filmed"
+    assert motion_formats.export_motions([near, near], "lerobot", path, camera=True) < 0.01
+    info = json.loads((path / "meta" / "info.json").read_text())
+    feature = info["features"]["observation.images.front"]
+    assert feature["dtype"] == "video" and feature["shape"] == [240, 320, 3]
+    video = path / info["video_path"].format(video_key="observation.images.front", chunk_index=0, file_index=0)
+    frames = list(imageio_ffmpeg.read_frames(str(video)))
+    assert frames[0]["size"] == (320, 240) and frames[0]["fps"] == 100 and len(frames[1:]) == 2 * T
+    first, second = (np.frombuffer(frames[1 + i], np.uint8).reshape(240, 320, 3).astype(int) for i in (0, T))
+    assert np.abs(first - second).mean() < 2  # the same motion twice
+    rows = pq.read_table(path / "meta" / "episodes").to_pylist()
+    spans = [[row[f"videos/observation.images.front/{end}_timestamp"] for end in ("from", "to")] for row in rows]
+    np.testing.assert_allclose(spans, [[0, T / 100], [T / 100, 2 * T / 100]])
+    stats = json.loads((path / "meta" / "stats.json").read_text())["observation.images.front"]
+    np.testing.assert_allclose(np.ravel(stats["mean"]), np.mean([first, second], (0, 1, 2)) / 255, atol=0.03)
+    assert np.shape(stats["mean"]) == (3, 1, 1) and stats["count"] == [2 * T]
+    # The object is seen where the calibration says.
+    calibration = json.loads((path / "meta" / "camera.json").read_text())
+    to_world, intrinsics = np.array(calibration["camera_to_world"]), np.array(calibration["intrinsics"])
+    turn = Rotation.from_quat(near.object_quaternion[0], scalar_first=True)
+    corners = turn.apply(near.object_vertices) + near.object_position[0]
+    seen = ((corners - to_world[:3, 3]) @ to_world[:3, :3]) @ intrinsics.T
+    seen = seen[:, 1::-1] / seen[:, 2:]  # rows and columns
+    alone = dataclasses.replace(
+        near, link_position=near.link_position + np.array([0, 0, 50.0]), table=np.zeros(T, bool)
+    )
+    nothing = dataclasses.replace(alone, object_position=near.object_position + 50.0)
+    shown, blank = (next(pictures(motion, camera_for([near]))).astype(int) for motion in (alone, nothing))
+    changed = np.argwhere(np.abs(shown - blank).sum(-1) > 20)
+    np.testing.assert_allclose([changed.min(0), changed.max(0)], [seen.min(0), seen.max(0)], atol=1.5)
+    with pytest.raises(CongraspError, match="A glb file holds no video"):
+        motion_formats.export_motions([near], "glb", tmp_path / "motion.glb", camera=True)
 
 
 def test_a_described_hand_says_what_it_is(odd_hand: GraspMotion) -> None:

@@ -1,0 +1,75 @@
+"""What a camera that stands still sees of motions: hand, object and table, without what only a simulation knows."""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from common.parallel import cores
+from services.export.frames import skin_of_motion
+from services.export.motion_file import GraspMotion
+from services.record.palette import OBJECT
+from services.viz.raster import render_scene
+from services.viz.scene import Camera, Shape
+from services.viz.shapes import fit, skin_shape, table_shape
+
+SIZE = (320, 240)
+"""Width and height in pixels."""
+_DIRECTION = np.array([0.8, -1.0, 0.7])  # from the table's middle to the camera
+_STEP = 10  # frames from one that the camera is fitted to, to the next
+
+
+def camera_for(motions: Sequence[GraspMotion]) -> Camera:
+    """The camera that holds hands and objects of all motions."""
+    points = np.concatenate([_extent(motion) for motion in motions])
+    return fit(points[ConvexHull(points).vertices], _DIRECTION, SIZE[0] / SIZE[1])
+
+
+def _extent(motion: GraspMotion) -> np.ndarray:
+    """(n, 3) points of the hand's skin and of the object at some frames of a motion."""
+    found = []
+    for shapes in (_shapes(motion, frame) for frame in {*range(0, len(motion.time), _STEP), len(motion.time) - 1}):
+        hand, thing = shapes[:2]
+        found += [hand.vertices, Rotation.from_quat(thing.quaternion, scalar_first=True).apply(thing.vertices)]
+        found[-1] = found[-1] + thing.position
+    return np.concatenate(found)
+
+
+def pictures(motion: GraspMotion, camera: Camera) -> Iterator[np.ndarray]:
+    """(height, width, 3) uint8 of every frame of a motion."""
+    with ThreadPoolExecutor(cores()) as pool:
+        yield from pool.map(lambda frame: render_scene(_shapes(motion, frame), camera, SIZE), range(len(motion.time)))
+
+
+def calibration(camera: Camera) -> dict[str, Any]:
+    """The pinhole camera in the terms of computer vision: x right, y down, z forward."""
+    right, up, forward = camera.axes()
+    focal = SIZE[1] / 2 / np.tan(np.radians(camera.field_of_view) / 2)
+    return {
+        "model": "pinhole, no distortion; x right, y down, z forward; pixel (0, 0) is the upper left one's centre",
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "intrinsics": [[focal, 0.0, SIZE[0] / 2 - 0.5], [0.0, focal, SIZE[1] / 2 - 0.5], [0.0, 0.0, 1.0]],
+        "camera_to_world": [*np.column_stack([right, -up, forward, camera.position]).tolist(), [0.0, 0.0, 0.0, 1.0]],
+    }
+
+
+def _shapes(motion: GraspMotion, frame: int) -> list[Shape]:
+    """The hand, the object, and the table while it stands."""
+    hand = skin_shape(skin_of_motion(motion), motion.link_position[frame], motion.link_quaternion[frame])
+    colours = motion.colours
+    thing = Shape(
+        "mesh",
+        (0, 0),
+        OBJECT,
+        np.asarray(motion.object_position[frame], float),
+        np.asarray(motion.object_quaternion[frame], float),
+        vertices=motion.object_vertices,
+        faces=motion.object_faces,
+        paint_points=None if colours is None else colours.points,
+        paint_colours=None if colours is None else colours.values / 255,
+    )
+    return [hand, thing, *([table_shape(motion.object_position[0])] if motion.table[frame] else [])]
