@@ -6,17 +6,19 @@ from scipy.spatial import cKDTree
 
 from common.objects.spec import Colours
 
-_EDGE = 0.006  # m; no edge need be shorter
-_FINE_EDGE = 0.003  # m, where a surface has colours of its own
-_MOST_FACES = 12_000  # beyond which a mesh is not cut finer
+_EDGE, _MOST_FACES = 0.006, 12_000
+"""m, that no edge need be shorter than; faces beyond which a mesh is not cut finer."""
+_OWN_EDGE, _OWN_MOST_FACES = 0.003, 40_000  # where a surface has colours of its own
 
 
-def finer(vertices: np.ndarray, faces: np.ndarray, edge: float = _EDGE) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface (V, 3), (F, 3), cut until its edges are as short as `edge` (m) or it has many faces."""
-    if len(faces) >= _MOST_FACES:
+def finer(
+    vertices: np.ndarray, faces: np.ndarray, edge: float = _EDGE, most: int = _MOST_FACES
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface (V, 3), (F, 3), cut until its edges are as short as `edge` (m) or it has `most` faces."""
+    if len(faces) >= most:
         return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
     area = float(trimesh.Trimesh(vertices, faces, process=False).area)
-    longest = max(edge, 2.2 * float(np.sqrt(area / _MOST_FACES)))
+    longest = max(edge, 2.2 * float(np.sqrt(area / most)))
     fine, cut = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=12)[:2]
     merged = trimesh.Trimesh(fine, cut, process=False)
     merged.merge_vertices()
@@ -25,7 +27,7 @@ def finer(vertices: np.ndarray, faces: np.ndarray, edge: float = _EDGE) -> tuple
 
 def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A mesh (V, 3), (F, 3) cut finer, and (V', 3) sRGB in [0, 1] of its points: of each the nearest known one's."""
-    vertices, faces = finer(vertices, faces, _FINE_EDGE)
+    vertices, faces = finer(vertices, faces, _OWN_EDGE, _OWN_MOST_FACES)
     return vertices, faces, nearest(vertices, colours)
 
 

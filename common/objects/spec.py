@@ -10,7 +10,7 @@ import numpy as np
 
 PieceKind = Literal["box", "cylinder", "capsule", "ellipsoid", "mesh"]
 SURFACE_POINTS = 512
-COLOUR_POINTS = 16_384
+COLOUR_POINTS = 32_768
 """Points of an object's surface whose colours are known, if it has any of its own."""
 PRIMITIVE_SLOTS = {"box": 3, "cylinder": 2, "capsule": 3, "ellipsoid": 2}
 """Most pieces of each kind in a primitive object: the geoms that a batched environment keeps for its object."""

@@ -1,6 +1,6 @@
 """What an import made of a mesh, as a picture: before and after, beside a hand at true scale."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from common.hands.spec import Hand
 from common.objects.shapes import tessellate
-from common.objects.spec import GraspObject
+from common.objects.spec import Colours, GraspObject
 from services.assets.objects.repair import with_few_faces
 from services.assets.objects.sizes import length, size_in_words
 from services.assets.objects.sources import Source, read_mesh
@@ -18,13 +18,23 @@ from services.viz.scene import Shape
 from services.viz.shapes import fit, posed_hand, shape_points, upright
 from services.viz.sheets import contact_sheet
 
-Body = tuple[np.ndarray, np.ndarray, tuple[float, float, float]]
-"""Vertices (V, 3), faces (F, 3) and colour."""
 _SIZE = (460, 360)
 _VIEW = (0.9, -0.6, 0.45)
 _GAP = 0.03  # m between the hand and the object
 _LARGEST, _SMALLEST = 1.5, 0.01  # m; a mesh beyond is drawn at another scale before its import
 _LARGE_FILE = 30 << 20  # bytes
+
+
+class Body(NamedTuple):
+    """A mesh that stands beside the hand."""
+
+    vertices: np.ndarray
+    """(V, 3)."""
+    faces: np.ndarray
+    """(F, 3)."""
+    colour: tuple[float, float, float]
+    own: Colours | None = None
+    """Colours of its own."""
 
 
 def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -> np.ndarray:
@@ -46,14 +56,19 @@ def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -
         drawn = size if _SMALLEST <= size <= _LARGEST else max(sides)
         scaled = "" if drawn == size else " (not drawn to scale)"
         label = f"the file: {len(before.faces):,} triangles, {length(size)} long in metres{scaled}"
-        parts[label] = [(rest.apply(np.asarray(before.vertices) * drawn / size), np.asarray(before.faces), OBJECT)]
+        parts[label] = [Body(rest.apply(np.asarray(before.vertices) * drawn / size), np.asarray(before.faces), OBJECT)]
     parts[f"the object: {size_in_words(sides)}, {1000 * obj.mass:.0f} g"] = [
-        (rest.apply(obj.visual_vertices), obj.visual_faces, OBJECT)
+        Body(
+            rest.apply(obj.visual_vertices),
+            obj.visual_faces,
+            OBJECT,
+            obj.colours and obj.colours._replace(points=rest.apply(obj.colours.points)),
+        )
     ]
     pieces = enumerate(map(tessellate, obj.pieces))
     count = len(obj.pieces)
     parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [
-        (rest.apply(vertices), faces, PIECES[i % len(PIECES)]) for i, (vertices, faces) in pieces
+        Body(rest.apply(vertices), faces, PIECES[i % len(PIECES)]) for i, (vertices, faces) in pieces
     ]
     images = []
     for shapes in (_beside(hand, bodies) for bodies in parts.values()):
@@ -74,11 +89,20 @@ def mesh_of_file(source: Source) -> trimesh.Trimesh | None:
 
 def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
     """Meshes that stand at height zero, and the open hand, upright, beside them."""
-    points = np.concatenate([vertices for vertices, _, _ in bodies])
+    points = np.concatenate([body.vertices for body in bodies])
     low, high = points.min(0), points.max(0)
     middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     shapes = [
-        Shape("mesh", (0, 0), colour, vertices=vertices - middle, faces=faces) for vertices, faces, colour in bodies
+        Shape(
+            "mesh",
+            (0, 0),
+            body.colour,
+            vertices=body.vertices - middle,
+            faces=body.faces,
+            paint_points=body.own and body.own.points - middle,
+            paint_colours=body.own and body.own.values / 255,
+        )
+        for body in bodies
     ]
     turn = upright(hand)
     standing = posed_hand(hand, hand.q_open, np.zeros(3), turn)

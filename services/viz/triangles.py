@@ -14,8 +14,8 @@ from services.viz.scene import Shape
 
 CREASE = np.cos(np.radians(35.0))
 """Faces whose normals differ by more than this angle (given as its cosine) meet in a sharp edge."""
-_SIDE = 0.005  # longest side of a mesh's triangles, m
-_MOST = 12_000  # about how many triangles a mesh is cut into; those of a larger one stay longer
+_Size = tuple[float, int]
+_PLAIN, _PAINTED = (0.005, 12_000), (0.0025, 40_000)  # longest side of a mesh's triangles, m, and about how many
 _RINGS, _SECTIONS = 110, 256  # of a cylinder's faces
 
 
@@ -104,7 +104,8 @@ def _mesh(vertices: bytes, faces: bytes, paint_points: bytes, paint_colours: byt
     """A mesh; its arrays' contents tell meshes apart, so that one that moves from picture to picture is cut once."""
     corners, triples = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, int).reshape(-1, 3)
     closed = bool(trimesh.Trimesh(corners, triples).is_volume)
-    surface = _surface(*smooth_corners(corners, triples), closed, fine)
+    size = (_PAINTED if paint_points else _PLAIN) if fine else None
+    surface = _surface(*smooth_corners(corners, triples), closed, size)
     if not paint_points:
         return surface
     points, colours = (np.frombuffer(paint).reshape(-1, 3) for paint in (paint_points, paint_colours))
@@ -119,7 +120,7 @@ def _capsule(radius: float, half_length: float, fine: bool) -> _Surface:
     # As large as a round one, not inside of it, and pulled apart at its equator: what crosses it becomes the shaft.
     lift = np.where(normals[:, 2] > 1e-6, half_length, np.where(normals[:, 2] < -1e-6, -half_length, 0.0))
     points = radius * np.sqrt(4 * np.pi / ball.area) * normals + lift[:, None] * np.array([0.0, 0.0, 1.0])
-    return _surface(points[faces], normals[faces], True, fine)
+    return _surface(points[faces], normals[faces], True, _PLAIN if fine else None)
 
 
 @functools.lru_cache(maxsize=8)
@@ -129,13 +130,13 @@ def _cylinder(radius: float, half_length: float, fine: bool) -> _Surface:
     if fine:
         outline[-1:] = [(r, half_length) for r in radius * np.linspace(1, 0, _RINGS)[1:]]
     mesh = trimesh.creation.revolve(outline, sections=_SECTIONS)
-    return _surface(*smooth_corners(mesh.vertices, mesh.faces), True, False)
+    return _surface(*smooth_corners(mesh.vertices, mesh.faces), True, None)
 
 
-def _surface(corners: np.ndarray, normals: np.ndarray, closed: bool, fine: bool) -> _Surface:
-    """Triangles (F, 3, 3) with normals (F, 3, 3), cut if they are to be fine; equal corners become one point."""
-    if fine:
-        corners, normals = cut(corners, normals)
+def _surface(corners: np.ndarray, normals: np.ndarray, closed: bool, size: _Size | None) -> _Surface:
+    """Triangles (F, 3, 3) with normals (F, 3, 3), cut if a size is given; equal corners become one point."""
+    if size:
+        corners, normals = cut(corners, normals, *size)
     rows = np.concatenate([corners, normals], -1).reshape(-1, 6)
     found, faces = np.unique(np.round(rows, 5), axis=0, return_inverse=True)
     points, directions = np.split(found.astype(np.float32), 2, -1)
@@ -169,10 +170,17 @@ def smooth_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     return corners, (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).reshape(-1, 3, 3)
 
 
-def cut(corners: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface (F, 3, 3) in smaller triangles: those with a long side are halved across it, again and again."""
+def cut(corners: np.ndarray, normals: np.ndarray, side: float, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface (F, 3, 3) in smaller triangles: those with a long side are halved across it, again and again.
+
+    Args:
+      corners: (F, 3, 3).
+      normals: (F, 3, 3) there.
+      side: longest side wanted, m.
+      most: about how many triangles there may be; sides stay longer on a surface that needs more.
+    """
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum() / 2
-    longest = max(_SIDE, 3 * float(np.sqrt(area / _MOST)))
+    longest = max(side, 3 * float(np.sqrt(area / most)))
     rest, small = np.concatenate([corners, normals], -1), []
     while len(rest):
         sides = np.linalg.norm(rest[:, [1, 2, 0], :3] - rest[..., :3], axis=-1)

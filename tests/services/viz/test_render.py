@@ -127,7 +127,7 @@ def test_painted_regions_meet_where_their_points_do() -> None:
 
 def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
     sphere = trimesh.creation.icosphere(2, 0.1)
-    corners, smooth = cut(*smooth_corners(sphere.vertices, sphere.faces))
+    corners, smooth = cut(*smooth_corners(sphere.vertices, sphere.faces), 0.005, 12_000)
     exact = corners / np.linalg.norm(corners, axis=-1, keepdims=True)
 
     def degrees_off(normals: np.ndarray) -> float:
@@ -137,7 +137,7 @@ def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
     assert len(corners) > 2 * len(sphere.faces)
     assert degrees_off(flat_normals(corners)) > 5 and degrees_off(smooth) < 2
     box = trimesh.creation.box((1, 1, 1))
-    corners, smooth = cut(*smooth_corners(box.vertices, box.faces))
+    corners, smooth = cut(*smooth_corners(box.vertices, box.faces), 0.005, 12_000)
     np.testing.assert_allclose(smooth, np.broadcast_to(flat_normals(corners), smooth.shape), atol=1e-6)
 
 
@@ -148,7 +148,7 @@ def flat_normals(corners: np.ndarray) -> np.ndarray:
 
 def test_a_mesh_is_cut_without_a_change_of_its_surface() -> None:
     box = trimesh.creation.box((0.1, 0.06, 0.02))
-    corners, _ = cut(*smooth_corners(box.vertices, box.faces))
+    corners, _ = cut(*smooth_corners(box.vertices, box.faces), 0.005, 12_000)
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     assert sides.max() <= 0.00501  # at most 5 mm
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
