@@ -389,6 +389,17 @@ def test_a_dataset_with_a_camera_has_a_frame_for_every_row(human: GraspMotion, t
         motion_formats.export_motions([near], "glb", tmp_path / "motion.glb", camera=True)
 
 
+def test_lerobots_own_reader_gives_the_frame_of_each_row(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    reader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
+    motion_formats.export_motions([human, human], "lerobot", tmp_path / "filmed", camera=True)
+    data = reader.LeRobotDataset("congrasp/test", root=tmp_path / "filmed", video_backend="pyav")
+    assert len(data) == 2 * T and data.meta.camera_keys == ["observation.images.front"]
+    first, second = data[1], data[T + 1]
+    np.testing.assert_allclose(first["observation.state"][: len(human.joint_names)], human.joint_position[1], atol=1e-6)
+    assert tuple(first["observation.images.front"].shape) == (3, 240, 320)
+    assert abs(first["observation.images.front"] - second["observation.images.front"]).mean() < 0.01
+
+
 def test_a_described_hand_says_what_it_is(odd_hand: GraspMotion) -> None:
     text = urdf.hand_urdf(odd_hand)
     angles = dict(zip(odd_hand.joint_names, odd_hand.joint_position.T, strict=True))
