@@ -74,6 +74,10 @@ def evaluate(
       by: object: also print the rates of each object; --json always has them.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.
+
+    Examples:
+      congrasp evaluate --table single composed --episodes 200
+      congrasp evaluate --policy runs/mine/policy.safetensors --json evaluation.json
     """
     from actors.physics import resolve_physics
     from services.assets.objects.named import objects_of

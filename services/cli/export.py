@@ -1,4 +1,4 @@
-"""`congrasp export`: policies and motions for other programs, each file checked as it is written."""
+"""Policies and motions for other programs, each file checked as it is written."""
 
 import pathlib
 from typing import Annotated, Literal
@@ -19,13 +19,15 @@ def policy(
     Normalisation is inside; the file also holds the hand, the meaning and order of every input and output, and the
     hand's MuJoCo model. docs/exports.md says how to use it; examples/onnx_grasp.py does.
 
-    Examples: congrasp export policy; congrasp export policy --hand allegro --to stablehlo
-
     Args:
       policy: The policy file (.safetensors); the pretrained one otherwise.
       hand: Whose pretrained policy.
       to: The format.
       out: The file to write; policy.onnx or policy.stablehlo.zip otherwise.
+
+    Examples:
+      congrasp export policy
+      congrasp export policy --hand allegro --to stablehlo
     """
     from common.policy.bundle import load
     from common.policy.pretrained import policy_file
@@ -51,14 +53,16 @@ def motion(
     trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for each motion. docs/exports.md says what
     is in each.
 
-    Examples: congrasp export motion grasps/mug/grasp.npz; congrasp export motion runs/mine --success --to ros2
-
     Args:
       paths: Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot takes several.
       to: The format.
       out: The file or folder to write; the first motion's name in the working directory otherwise.
       index: Which of the recorded episodes, from 0; -1 is the last.
       success: Count only episodes that succeeded.
+
+    Examples:
+      congrasp export motion grasps/mug/grasp.npz --to glb
+      congrasp export motion runs/mine --success --to ros2 --out bag
     """
     from services.export.frames import TOLERANCE_MM
     from services.export.motion_formats import FORMATS, export_motions, pick_motion
@@ -81,6 +85,10 @@ def layout(
     Args:
       path: The run's folder, or one MCAP file, that the layout is to fit.
       out: The file to write; in Foxglove: Layout, Import from file.
+
+    Examples:
+      congrasp export layout runs/mine
+      congrasp export layout recordings/learner.mcap --out layout.json
     """
     from services.export.layout import export_layout
 

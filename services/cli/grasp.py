@@ -36,7 +36,7 @@ Constraints: Any = dataclasses.make_dataclass(
 def grasp(
     objects: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
     out: pathlib.Path = pathlib.Path("grasps"),
-    constraints: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = Constraints(),  # noqa: B008
+    constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = Constraints(),  # noqa: B008
     video: bool = False,
     pictures: bool = True,
     policy: pathlib.Path | None = None,
@@ -48,13 +48,12 @@ def grasp(
     rest: str = "",
     folder: str = "objects",
     again: bool = False,
-    options: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
+    mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
 ) -> int:
     """Make grasp motions for objects of your own.
 
     Every object gets a folder in --out: grasp.npz (arrays that say what they mean), grasp.mcap (Foxglove, Rerun),
     grasp.png, portrait.png, object.png (before and after its import, beside a hand at true scale) and result.json.
-    Examples: congrasp grasp mug.obj --approach 1 --lift 0.15 --video; congrasp grasp mug:7 --rest upright
 
     Several attempts are simulated at once, and the best is kept: first one that holds the object for two seconds
     without the table, then small errors, a quiet object and gentle forces. Interrupted runs resume where they stopped.
@@ -63,7 +62,7 @@ def grasp(
       objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, FAMILY:SEED of the generator (mug:7), or
         names in --folder.
       out: Folder for the results.
-      constraints: What the grasp must keep to.
+      constraint: What the grasp must keep to.
       video: Also write grasp.mp4, at half speed, with the constraints drawn.
       pictures: Write pictures.
       policy: A policy file; by default the one that comes with the package.
@@ -75,7 +74,11 @@ def grasp(
       rest: How the object lies on the table: upright, or a number from 1 on (congrasp objects rests shows them).
       folder: Folder of objects, whose names can stand for files.
       again: Also redo finished objects.
-      options: How meshes become objects.
+      mesh: How meshes become objects.
+
+    Examples:
+      congrasp grasp examples/mug.obj --video
+      congrasp grasp mug:7 --rest upright --approach 1 --lift 0.15
     """
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
@@ -93,7 +96,7 @@ def grasp(
     file = policy_file(policy, hand)
     found, results = find_objects(objects, folder)
     identity = (bundles.content_hash(file.read_bytes()), tries, seed, approach, lift)
-    settings = Settings(out, options, dataclasses.asdict(constraints), identity, video, pictures, again, rest)
+    settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, video, pictures, again, rest)
     grasper = Grasper(bundles.load(file), attempts=tries, approach=approach, lift=lift, seed=seed)
 
     for result in results:

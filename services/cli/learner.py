@@ -63,6 +63,10 @@ def learner(
       boards: Where the learner's metrics are written, too: tensorboard (files in the run's folder), wandb-offline
         (files there, for `wandb sync`), wandb (needs an account); with no name none.
       watch: How it is watched.
+
+    Examples:
+      congrasp learner --preset human --run-dir runs/human --listen tls/0.0.0.0:7447 --certs certs
+      congrasp learner --run-dir runs/human --resume
     """
     from common.errors import CongraspError
     from common.policy import bundle as bundles

@@ -3,7 +3,6 @@
 import contextlib
 import difflib
 import errno
-import functools
 import importlib
 import inspect
 import io
@@ -121,28 +120,12 @@ def run(arguments: list[str]) -> int:
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
     """The command's module as a function from its arguments to the call that they ask for."""
     module = importlib.import_module(f"services.cli.{name}")
-    import tyro
+    from services.cli import parser
 
     prog = f"congrasp {name}"
     if hasattr(module, "COMMANDS"):
-        description = inspect.getdoc(module)
-        commands = {key: _deferred(command) for key, command in module.COMMANDS.items()}
-        return lambda rest: tyro.extras.subcommand_cli_from_dict(
-            commands, prog=prog, description=description, args=rest
-        )
-    defaults: Callable[[list[str]], dict[str, Any]] = getattr(module, "defaults", lambda rest: {})
-    return lambda rest: tyro.cli(functools.partial(_deferred(module.COMMAND), **defaults(rest)), prog=prog, args=rest)
-
-
-def _deferred(command: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
-    """The command with its arguments bound, to be called once they are known to be right."""
-
-    @functools.wraps(command)
-    def bind(*args: Any, **options: Any) -> Callable[[], Any]:
-        return functools.partial(command, *args, **options)
-
-    bind.__annotations__ = {**command.__annotations__, "return": Any}
-    return bind
+        return parser.of_group(module.COMMANDS, prog, inspect.getdoc(module))
+    return parser.of_command(module.COMMAND, prog, getattr(module, "defaults", lambda rest: {}))
 
 
 def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: list[str]) -> Callable[[], Any]:
@@ -157,7 +140,7 @@ def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: li
         inside = [line.strip("│ ") for line in said.getvalue().splitlines() if line.startswith("│")]
         rules = [i for i, line in enumerate(inside) if line.startswith("─")] or [len(inside)]
         rest = inside[rules[0] :]
-        similar = [line.split()[0] for line in rest if line.startswith("--")] if "Perhaps you meant:" in rest else []
+        similar = [line.split()[0].rstrip(",") for line in rest if line.startswith("--")] if "Perhaps you meant:" in rest else []
         hint = f"Perhaps you meant {' or '.join(similar)}. " if similar else ""
         what = " ".join(inside[: rules[0]]).rstrip(".")
         raise CongraspError(f"{what}.", f"{hint}See 'congrasp {name} --help'.") from None

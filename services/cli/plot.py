@@ -13,13 +13,15 @@ def plot(
 ) -> int:
     """Draw a run's learning curves, reward terms and other metrics, or an evaluation's table, rates and errors.
 
-    Examples: congrasp plot runs/mine; congrasp plot evaluation.json --formats pdf
-
     Args:
       path: A run's folder, or one MCAP file; a run that is not over is drawn up to its last half second. Or the JSON
         file of 'congrasp evaluate --json'.
       out: Folder for the figures; 'plots' beside the recordings or the JSON file otherwise.
       formats: Of the files.
+
+    Examples:
+      congrasp plot runs/mine
+      congrasp plot runs/mine runs/other --out plots --formats png
     """
     from services.evaluate.plots import plot_evaluation
     from services.viz.plots import plot_run

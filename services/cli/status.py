@@ -27,6 +27,10 @@ def status(
       every: Seconds between two looks with --watch.
       certs: Folder of an observer's certificate (congrasp certs).
       json: Print JSON instead of tables; with --watch one object a line, and null while the learner is disconnected.
+
+    Examples:
+      congrasp status runs/mine --watch
+      congrasp status --connect tcp/10.0.0.5:7447 --run human --json
     """
     import json as json_module
 

@@ -66,6 +66,10 @@ def train(
       boards: Where the learner's metrics are written, too: tensorboard (files in the run's folder), wandb-offline
         (files there, for `wandb sync`), wandb (needs an account); with no name none.
       metrics_port: Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none.
+
+    Examples:
+      congrasp train --preset quickstart --run-dir runs/mine
+      congrasp train --preset human --run-dir runs/human --seed 5
     """
     from services.train.command import run_training
 

@@ -19,8 +19,6 @@ def view(
     With --connect it takes the newest weights of a run that is being trained and shows the run: its curves, its actors
     and their episodes. With --recordings a click on a curve finds the episodes of that time.
 
-    Examples: congrasp view --objects my-objects; congrasp view --connect tcp/10.0.0.5:7447 --run mine
-
     Args:
       objects: Your own objects: a mesh, a folder of meshes, or what 'congrasp objects import' made.
       policy: A policy file, read again when it changes; by default the pretrained ones.
@@ -31,6 +29,10 @@ def view(
       port: Port of the page; 0 takes a free one.
       insecure: Offer the page beyond loopback.
       certs: Folder of an observer's certificate (congrasp certs), for --connect.
+
+    Examples:
+      congrasp view runs/mine
+      congrasp view --objects my-objects --port 8080
     """
     from services.ops.shutdown import on_signal
     from services.viz.studio.app import open_view
