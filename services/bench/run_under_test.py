@@ -46,7 +46,7 @@ class RunUnderTest:
 
     def start(self) -> None:
         """Begins the run, or resumes it, and waits until its learner has taken rollouts from all actors."""
-        command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(self.run_dir), "--boards"]
+        command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(self.run_dir), "--metric-writers"]
         begun = (self.run_dir / "config.json").exists()
         command += ["--actors", str(self.count), "--evaluation", "0", *(["--resume"] if begun else [])]
         command += [] if begun else [*_SMALL, *self._options]

@@ -31,7 +31,7 @@ def train(
     certs: pathlib.Path | None = None,
     insecure: bool = False,
     evaluation: int | None = None,
-    boards: tuple[MetricWriter, ...] = ("tensorboard",),
+    metric_writers: tuple[MetricWriter, ...] = ("tensorboard",),
     metrics_port: int = 0,
 ) -> int:
     """Trains a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
@@ -63,7 +63,7 @@ def train(
       insecure: Listen beyond loopback without certificates.
       evaluation: Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out. By
         default 64, and before training for the quickstart preset alone.
-      boards: Where the learner's metrics are written, too: tensorboard (files in the run's folder), wandb-offline
+      metric_writers: Where the learner's metrics are written, too: tensorboard (files in the run's folder), wandb-offline
         (files there, for `wandb sync`), wandb (needs an account); with no name none.
       metrics_port: Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none.
 
@@ -88,7 +88,7 @@ def train(
         evaluation=64 if evaluation is None else evaluation,
         compared=evaluation is not None or preset == "quickstart",
         ranks=ranks,
-        writers=boards,
+        writers=metric_writers,
         metrics_port=metrics_port,
         listen=listen,
         certs=certs,
