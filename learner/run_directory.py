@@ -3,7 +3,8 @@
 It holds `config.json`, `initial.safetensors` where training does not begin with random weights, `checkpoints/`,
 `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `accepted/`
 (rollouts that no checkpoint holds yet), `version` (the newest version that was ever published, so that versions rise
-over a crash, too), `endpoint` (where its learner listens, while it runs) and, after an update that was not finite, `failure/`.
+over a crash, too), `endpoint` (where its learner listens, while it runs) and, after an update that was not finite,
+`failure/`.
 What a resume could not read, or does not go on from, is kept beside it as `*.aside`.
 """
 

@@ -61,8 +61,8 @@ def learner(
         --run-dir of rank 0; rank r listens 4 r ports above --listen.
       coordinator: Where the ranks find rank 0: its host and a port, which and the next of which must be free there.
       inside: An actor lives in this process, too, so that its rollouts never leave the device.
-      metric_writers: Where the learner's metrics are written, too: tensorboard (files in the run's folder), wandb-offline
-        (files there, for `wandb sync`), wandb (needs an account); with no name none.
+      metric_writers: Where the learner's metrics are written, too: tensorboard (files in the run's folder),
+        wandb-offline (files there, for `wandb sync`), wandb (needs an account); with no name none.
       watch: How it is watched.
 
     Examples:

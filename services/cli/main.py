@@ -140,7 +140,8 @@ def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: li
         inside = [line.strip("│ ") for line in said.getvalue().splitlines() if line.startswith("│")]
         rules = [i for i, line in enumerate(inside) if line.startswith("─")] or [len(inside)]
         rest = inside[rules[0] :]
-        similar = [line.split()[0].rstrip(",") for line in rest if line.startswith("--")] if "Perhaps you meant:" in rest else []
+        options = [line.split()[0].rstrip(",") for line in rest if line.startswith("--")]
+        similar = options if "Perhaps you meant:" in rest else []
         hint = f"Perhaps you meant {' or '.join(similar)}. " if similar else ""
         what = " ".join(inside[: rules[0]]).rstrip(".")
         raise CongraspError(f"{what}.", f"{hint}See 'congrasp {name} --help'.") from None

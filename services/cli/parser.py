@@ -21,7 +21,9 @@ _QUIET = ("", "None", "False", "''")
 _CONTINUED = re.compile(r"\s*\n\s*")
 
 
-def of_command(command: Command, prog: str, defaults: Callable[[list[str]], Mapping[str, Any]] = lambda rest: {}) -> Parser:
+def of_command(
+    command: Command, prog: str, defaults: Callable[[list[str]], Mapping[str, Any]] = lambda rest: {}
+) -> Parser:
     """The parser of a command; `defaults` finds values of its parameters that depend on the arguments."""
 
     def parse(rest: list[str]) -> Callable[[], Any]:

@@ -63,8 +63,8 @@ def train(
       insecure: Listen beyond loopback without certificates.
       evaluation: Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out. By
         default 64, and before training for the quickstart preset alone.
-      metric_writers: Where the learner's metrics are written, too: tensorboard (files in the run's folder), wandb-offline
-        (files there, for `wandb sync`), wandb (needs an account); with no name none.
+      metric_writers: Where the learner's metrics are written, too: tensorboard (files in the run's folder),
+        wandb-offline (files there, for `wandb sync`), wandb (needs an account); with no name none.
       metrics_port: Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none.
 
     Examples:

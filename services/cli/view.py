@@ -66,9 +66,7 @@ def view(
         return stop.exit_code
 
 
-def _of_folder(
-    run_dir: pathlib.Path, certs: pathlib.Path | None
-) -> tuple[str, str, pathlib.Path | None, pathlib.Path]:
+def _of_folder(run_dir: pathlib.Path, certs: pathlib.Path | None) -> tuple[str, str, pathlib.Path | None, pathlib.Path]:
     """--connect, --run, --policy and --recordings of a run: its learner if that responds, else its newest policy."""
     from common.errors import TransportError
     from common.transport import urls

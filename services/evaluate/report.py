@@ -115,9 +115,9 @@ def template(path: pathlib.Path = _REPORT) -> Any:
 def curves_of(run_dir: pathlib.Path) -> Iterator[Picture]:
     """Figures of a run's recordings, if it has any."""
     if any(run_dir.rglob("*.mcap")):
-        series = read_metrics(run_dir)
-        for title, panels in figures(series).values():
-            yield Picture(title, encoded(draw(title, panels, series)))
+        runs = {run_dir.name: read_metrics(run_dir)}
+        for title, panels in figures(runs).values():
+            yield Picture(title, encoded(draw(title, panels, runs)))
 
 
 def count_causes(causes: Sequence[str]) -> str:

@@ -61,7 +61,8 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
       The largest error in mm (see `services.export.frames.error_mm`).
 
     Raises:
-      CongraspError: the error is above `TOLERANCE_MM`, and nothing was written; or `path` is there already, or cannot be written.
+      CongraspError: the error is above `TOLERANCE_MM`, and nothing was written; or `path` is there already, or
+        cannot be written.
     """
     if len(motions) > 1 and kind not in SEVERAL:
         raise CongraspError(f"A {kind} file holds one motion, and {len(motions)} were named.", "Name one at a time.")

@@ -70,7 +70,7 @@ def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
 @pytest.mark.timeout(30)
 def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
     create_run(tmp_path / "run", dataclasses.replace(RunConfig(), name="r"))
-    with pytest.raises(CongraspError, match="No learner is running in .*congrasp plot"):
+    with pytest.raises(CongraspError, match=r"No learner is running in .*congrasp plot"):
         status(tmp_path / "run")
     with listening(tmp_path / "run", endpoint):
         assert status(tmp_path / "run", json=True) == 0
