@@ -21,6 +21,7 @@ Runs = Mapping[str, Series]
 _COLUMNS = 4
 QUIET, _GRID = "#6b7280", "#e3e6ea"
 COLOURS = ("#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a", "#c2478f", "#6b7280")
+_MEANINGLESS = {"episode/object_index"}
 _LEGEND = 8
 """Lines of one panel that a legend still names."""
 
@@ -122,10 +123,10 @@ def style(axes: Any, title: str, x: str, y: str) -> None:
 def figures(runs: Runs) -> dict[str, tuple[str, list[Panel]]]:
     """Title and panels of each figure by file name.
 
-    Every metric of the runs is in exactly one panel, but for those outside of the learning curves that have one value
-    throughout.
+    Every metric of the runs is in exactly one panel, but for those that mean nothing as a mean, and those outside of
+    the learning curves that have one value throughout.
     """
-    names = {_metric(name) for series in runs.values() for name in series}
+    names = {_metric(name) for series in runs.values() for name in series} - _MEANINGLESS
     learning = [
         dataclasses.replace(panel, metrics=shown)
         for panel in LEARNING
@@ -214,7 +215,8 @@ def _label(run: str, name: str, panel: Panel, runs: Runs) -> str:
     """The line's name in a legend."""
     role, process, metric = name.split("/", 2)
     processes = {found.rpartition(f"/{metric}")[0] for found in runs[run] if _metric(found) == metric}
-    several = f"{role} {process}" if len(processes) > 1 or len(runs) == 1 else ""
+    who = process if process.startswith(role) else f"{role} {process}"
+    several = who if len(processes) > 1 or len(runs) == 1 else ""
     words = [run if len(runs) > 1 else "", several if len(panel.metrics) == 1 or len(runs) > 1 else ""]
     return ", ".join(word for word in (*words, titled(metric)[0] if len(panel.metrics) > 1 else "") if word)
 

@@ -49,7 +49,7 @@ _TITLES = {
     "episode/force_sum": ("Contact force of all links", "N"),
     "episode/force_link_max": ("Contact force of the hardest pressing link", "N"),
     f"episode/{DIVERGED}": ("Diverged physics", "share of episodes"),
-    "episode/object_index": ("Index of the object (no meaning as a mean)", ""),
+    "episode/object_index": ("Mean index of the object", ""),
     "success/heading": ("Success with the heading alone", "share of episodes"),
     **{
         f"success/{constraint.name}": (f"Success with {constraint.title}", "share of episodes")
@@ -62,7 +62,7 @@ _TITLES = {
         for block in constraint.blocks
     },
     **{
-        f"episode/{spec.name}": (f"{constraint.title.capitalize()}: {_KINDS[spec.unit]}", spec.unit or "share")
+        f"episode/{spec.name}": (f"{constraint.title.capitalize()} error: {_KINDS[spec.unit]}", spec.unit or "share")
         for constraint in CONSTRAINTS
         for spec in constraint.errors
     },

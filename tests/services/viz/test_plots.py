@@ -47,7 +47,7 @@ def test_every_metric_is_in_exactly_one_panel() -> None:
     shown = [metric for _, panels in groups.values() for panel in panels for metric in panel.metrics]
     assert sorted(shown) == sorted(METRICS)
     assert [panel.metrics for panel in groups["reward_terms"][1]] == [("term/contact",), ("term/force_excess",)]
-    assert groups["episodes"][1] == [Panel("Heading: angle", "rad", ("episode/heading_rad",))]
+    assert groups["episodes"][1] == [Panel("Heading error: angle", "rad", ("episode/heading_rad",))]
     assert groups["details"][1] == [Panel("Queue length", "", ("queue_length",))]
     assert {panel.title for panel in groups["learning"][1]} == {
         panel.title for panel in LEARNING if set(panel.metrics) & set(METRICS)
@@ -92,7 +92,7 @@ def test_every_metric_of_an_episode_has_a_title_of_its_own() -> None:
     titles = {name: titled(name)[0] for name in episode_fields(task)}
     assert len(set(titles.values())) == len(titles)
     assert not [name for name, title in titles.items() if "_" in title or "/" in title or not title[0].isupper()]
-    assert titled("episode/heading_m") == ("Heading: distance", "m")
+    assert titled("episode/heading_m") == ("Heading error: distance", "m")
     assert titled("term/force_excess") == ("Force excess", "reward")
     assert titled("failure/bowl") == ("Lost objects: bowl", "share of episodes")
     assert titled("fetch_seconds") == ("Fetch", "s")
