@@ -250,7 +250,7 @@ def train(
         patience=60.0 * patience,
     )
     train_hand(request, lambda text: print(text, flush=True))
-    print(f"Try: congrasp grasp mug.obj --hand {reference}")
+    print(f"Try: congrasp grasp examples/mug.obj --hand {reference}")
     return 0
 
 

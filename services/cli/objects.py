@@ -60,7 +60,7 @@ def import_meshes(
       mesh: How meshes become objects.
 
     Examples:
-      congrasp objects import mug.obj
+      congrasp objects import examples/mug.obj
       congrasp objects import scans/ --unit mm --density 300 --out my-objects
     """
     from common.objects.store import Catalogue
@@ -273,7 +273,7 @@ def set_affordance(
       folder: Folder of objects, to which the new one goes.
 
     Examples:
-      congrasp objects affordance mug_7 --part-mesh handle.ply
+      congrasp objects affordance examples/mug.obj --part-mesh examples/mug-handle.obj
       congrasp objects affordance mug_7 --half-space 0 0 1 0.02 --name upper-mug
     """
     from common.objects.store import Catalogue

@@ -48,9 +48,7 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
             return of_command(commands[rest[0]], f"{prog} {rest[0]}")(rest[1:])
         deferred = {name: _deferred(command) for name, command in commands.items()}
         with _epilog([examples(command)[0] for command in commands.values()]):
-            return tyro.extras.subcommand_cli_from_dict(
-                deferred, prog=prog, description=description, args=rest, registry=_REGISTRY
-            )
+            return tyro.extras.subcommand_cli_from_dict(deferred, prog=prog, description=description, args=rest)
 
     return parse
 
