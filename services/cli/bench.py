@@ -74,24 +74,24 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
     return 0
 
 
-def shutdown(tries: int = 100, within: float = 45.0, seed: int = 0) -> int:
+def shutdown(repeats: int = 100, within: float = 45.0, seed: int = 0) -> int:
     """Whether a run with a learner and two actors ends within 5 s of a signal, and leaves no process behind.
 
     Starts one again and again, and sends SIGINT and SIGTERM in turn at random times, also while it starts. The exit
     code is 1 if any took longer or left something.
 
     Args:
-      tries: How often.
+      repeats: How often.
       within: Seconds in which the times lie; after some 30 it trains.
       seed: Seed of the times.
 
     Examples:
       congrasp bench shutdown
-      congrasp bench shutdown --tries 10
+      congrasp bench shutdown --repeats 10
     """
     from services.bench.shutdown import bench_shutdown
 
-    return 0 if bench_shutdown(tries, within, seed) else 1
+    return 0 if bench_shutdown(repeats, within, seed) else 1
 
 
 def security(repeats: int = 5, seconds: float = 5.0, turns: int = 3, attacks: tuple[str, ...] = ()) -> int:
@@ -161,7 +161,7 @@ def staleness(lag: int = 4, seeds: int = 5, updates: int = 40, worlds: int = 32)
     return 0
 
 
-def faults(actors: int = 2, tries: int = 20, kinds: tuple[str, ...] = (), seed: int = 0) -> int:
+def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed: int = 0) -> int:
     """What kills, stops, freezes, full disks and damaged files cost a real run of what it had acknowledged: nothing.
 
     Every kind of fault has a run of its own, whose journals are read twice, by code that has nothing in common. The
@@ -169,7 +169,7 @@ def faults(actors: int = 2, tries: int = 20, kinds: tuple[str, ...] = (), seed: 
 
     Args:
       actors: Actor processes.
-      tries: Faults of each kind.
+      repeats: Faults of each kind.
       kinds: Kinds of faults: sigterm, ctrl-c, kill-learner, kill-actor, kill-all, freeze-learner, freeze-actor,
         full-disk (which needs the right to mount), damage-checkpoint, damage-accepted (rollouts), damage-journal,
         damage-policy. All of them if none is named.
@@ -177,11 +177,11 @@ def faults(actors: int = 2, tries: int = 20, kinds: tuple[str, ...] = (), seed: 
 
     Examples:
       congrasp bench faults
-      congrasp bench faults --tries 5
+      congrasp bench faults --repeats 5
     """
     from services.bench.faults import bench_faults
 
-    return 0 if bench_faults(actors, tries, kinds, seed) else 1
+    return 0 if bench_faults(actors, repeats, kinds, seed) else 1
 
 
 def recovery(actors: int = 3, repeats: int = 3) -> int:

@@ -35,7 +35,7 @@ def generate(
 ) -> int:
     """Make the constraint sets of objects and write one file each, which says what its arrays mean.
 
-    For the whole surface and for the graspable region O+: 256 headings by the paper's rules, 20 reference poses, and
+    For the whole surface and for the graspable region: 256 headings by the paper's rules, 20 reference poses, and
     wrist trajectories that end at them, from 15 to 25 cm away, replayed through the wrist's controller. 80 % of them
     are for training, and the others are held out.
 
@@ -132,7 +132,7 @@ def import_captures(
       hand: Hand of the sets. Human finger angles fit no other hand: it follows the captured wrist by its own grasp
         axes, with the captured headings and affordance, and closes its fingers around the object at the end.
       headings: sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps.
-      affordance: What O+ is: parts that fingers touch; whatever they touch; or everything. auto: parts where they are
+      affordance: What the graspable region is: parts that fingers touch; whatever they touch; or everything. auto: parts where they are
         labelled.
       beyond: Radians by which a captured joint may exceed the human hand's limits; it is then moved to the limit. For
         another hand it does not count.

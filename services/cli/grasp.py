@@ -41,7 +41,7 @@ def grasp(
     pictures: bool = True,
     policy: pathlib.Path | None = None,
     hand: str = "human",
-    tries: int = 16,
+    attempts: int = 16,
     seed: int = 0,
     approach: float = 0.0,
     lift: float = 0.0,
@@ -67,7 +67,7 @@ def grasp(
       pictures: Write pictures.
       policy: A policy file; by default the one that comes with the package.
       hand: Hand whose pretrained policy is taken.
-      tries: Attempts that are simulated side by side.
+      attempts: How many are simulated side by side.
       seed: Draws what is attempted.
       approach: Seconds in which the hand first comes from beside the table; longer where an arm needs it (1 m/s).
       lift: Metres by which the hand then lifts the object, which stands on the table until then; 0 removes the table.
@@ -88,16 +88,16 @@ def grasp(
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
-    at_least(1, tries=tries)
+    at_least(1, attempts=attempts)
     at_most(10.0, "seconds", approach=approach)
     at_most(0.5, "metres", lift=lift)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
     file = policy_file(policy, hand)
     found, results = find_objects(objects, folder)
-    identity = (bundles.content_hash(file.read_bytes()), tries, seed, approach, lift)
+    identity = (bundles.content_hash(file.read_bytes()), attempts, seed, approach, lift)
     settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, video, pictures, again, rest)
-    grasper = Grasper(bundles.load(file), attempts=tries, approach=approach, lift=lift, seed=seed)
+    grasper = Grasper(bundles.load(file), attempts=attempts, approach=approach, lift=lift, seed=seed)
 
     for result in results:
         _show(result)

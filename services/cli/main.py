@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         code = run(arguments)
     except CongraspError as error:
-        code = _complain(str(error), error.exit_code, debug)
+        code = _fail(str(error), error.exit_code, debug)
     except BrokenPipeError:
         if _last_words(sys.stdout, "\n"):  # it is another pipe that broke
             raise
@@ -77,15 +77,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if error.errno not in _FULL:
             raise
         where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
-        code = _complain(f"{where}: {error.strerror}. Free space and start again.", USAGE_ERROR, debug)
+        code = _fail(f"{where}: {error.strerror}. Free space and start again.", USAGE_ERROR, debug)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("common", "actors", "learner", "services"):
             raise
         package = (error.name or "").partition(".")[0]
         extra = EXTRAS.get(package, "train")
-        code = _complain(
-            f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug
-        )
+        code = _fail(f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug)
     _last_words(sys.stdout)
     if code in SIGNALLED:  # no time for what an interpreter does at its end
         os._exit(code)
@@ -169,7 +167,7 @@ def _prepare_environment() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
-def _complain(text: str, code: int, debug: bool) -> int:
+def _fail(text: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
     if log_error(text):

@@ -100,4 +100,4 @@ def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
 
 def key_of(*parts: Any) -> str:
     """Sixteen hex digits that change when anything that makes a grasp does."""
-    return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps((_FORMAT, *parts), default=str).encode()).hexdigest()[:16]

@@ -84,8 +84,8 @@ class Grasp:
             "hand": self.motion.hand,
             "success": self.success,
             "held_quarter_second": self.motion.success,
-            "tries": self.attempts,
-            "tries_held": self.held,
+            "attempts": self.attempts,
+            "attempts_held": self.held,
             "rest": self.rest + 1,
             "phases": self.motion.about.get("phases", {}),
             "constraints": list(self.motion.constraints),
@@ -220,8 +220,8 @@ class Grasper:
         labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
         about = {
             "actor": "grasp",
-            "tries": attempts,
-            "tries_held": held,
+            "attempts": attempts,
+            "attempts_held": held,
             "object_file_scale": obj.file_scale,
             "object_file_origin": [-x for x in obj.origin],
         }
