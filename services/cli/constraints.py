@@ -132,8 +132,8 @@ def import_captures(
       hand: Hand of the sets. Human finger angles fit no other hand: it follows the captured wrist by its own grasp
         axes, with the captured headings and affordance, and closes its fingers around the object at the end.
       headings: sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps.
-      affordance: What the graspable region is: parts that fingers touch; whatever they touch; or everything. auto: parts where they are
-        labelled.
+      affordance: Graspable are parts that fingers touch; whatever they touch; or everything. auto: parts where they
+        are labelled.
       beyond: Radians by which a captured joint may exceed the human hand's limits; it is then moved to the limit. For
         another hand it does not count.
       out: Folder for the sets, and for import.json, which holds the outcome of each sequence.

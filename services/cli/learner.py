@@ -51,9 +51,9 @@ def learner(
       certs: Folder of a learner's certificate (congrasp certs): mutual TLS, and each role may do only what is its own.
       insecure: Listen beyond loopback without certificates.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
-      resume: Go on with the run in --run-dir, from its newest intact checkpoint; a run that has not come to one
+      resume: Resume the run in --run-dir from its newest intact checkpoint; a run that has not come to one
         begins anew.
-      or_resume: Begin the run, or go on with it if --run-dir holds one: for supervisors that give the same command
+      or_resume: Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command
         every time.
       rank: Number of this process among several that train together; each needs a GPU of its own
         (CUDA_VISIBLE_DEVICES).

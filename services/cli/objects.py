@@ -258,16 +258,16 @@ def set_affordance(
 ) -> int:
     """Divide an object's surface anew into graspable region and avoid region.
 
-    Graspable is what lies on the mesh of a part, what is painted in a colour, or what lies beyond a plane. It must have a
-    tenth of the surface at least. Sets of constraints and evaluation then keep to it.
+    Graspable is what lies on the mesh of a part, what is painted in a colour, or what lies beyond a plane. It must have
+    a tenth of the surface at least. Sets of constraints and evaluation then keep to it.
 
     Args:
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
       part_mesh: A mesh of the graspable part, in the frame and unit of the object's own file.
       painted: A PLY file of the object with coloured vertices, in the same frame and unit.
       colour: Of the graspable region in the painted file: red, green, blue, yellow, or #rrggbb.
-      half_space: Three numbers of a direction and one in metres: graspable is what lies farther than that along the direction.
-        In the object's frame, whose origin is its centre of mass.
+      half_space: Three numbers of a direction and one in metres: graspable is what lies farther than that along the
+        direction. In the object's frame, whose origin is its centre of mass.
       invert: What was found is the avoid region, and the rest may be grasped.
       name: Name of the new object; the old one otherwise, which it then replaces.
       folder: Folder of objects, to which the new one goes.

@@ -55,7 +55,7 @@ def train(
       constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp constraints import'); their
         objects are those of --objects.folder, and --objects.procedural puts others beside them.
       split: Of these sets the part for training (the default), what is held out, or all.
-      resume: Go on from the newest intact checkpoint in --run-dir, with the run's own configuration; what the learner
+      resume: Resume from the newest intact checkpoint in --run-dir, with the run's own configuration; what the learner
         alone uses, such as --updates and --ppo.…, may be changed.
       listen: Endpoint where actors of other machines may join, such as tls/0.0.0.0:7447; on this machine alone by
         default.

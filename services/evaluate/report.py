@@ -138,7 +138,7 @@ def _warning(rows: Sequence[Row]) -> str:
         return ""
     width = max(row.success_high - row.success_low for row in rows)
     return (
-        f"A first look: rows of {fewest} episodes, fewer than {_FEW}, with intervals of up to {100 * width:.0f} points. "
+        f"First look: rows of {fewest} episodes, fewer than {_FEW}, with intervals of {100 * width:.0f} points. "
         "Do not quote these figures or compare policies by them; --episodes 200 makes better ones."
     )
 

@@ -31,7 +31,7 @@ def turntable(episode: Message) -> Mapping[str, Any]:
       `data`, JSON whose arrays are base64 of little-endian numbers: for V points `position` and `normal` (V, 3)
       float32, `colour` (V, 3) uint8 sRGB, `bones` (V, 4) and `weights` (V, 4) uint8 of 255; `faces` (F, 3) uint32; and
       `frames` (T, B, 12) float32, the upper three rows of each bone's matrix. Then `seconds` between two frames, the
-      `removal` frame from which on the table is away, the `table`'s first and last corner in `faces`, and the `centre`
+      frame of the table's `removal`, the `table`'s first and last corner in `faces`, and the `centre`
       (3,) and `radius`, m, of what happens until then.
     """
     arrays, hand = episode.arrays, known_hand(episode.meta["hand"])

@@ -43,7 +43,7 @@ HOLD_SECONDS = 2.0
 """How long the object should be held without the table."""
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
 _SCALES |= {"moved_at_removal": 0.03, "force_link_max": 10.0, "slip": 0.02}
-"""What weighs as much as one another, among grasps that hold: errors, the object's way before the table goes (m), the
+"""What weighs as much as one another, among grasps that hold: errors, the object's way before table removal (m), the
 strongest link's force (N), and the object's way after it went (m)."""
 _UNLIKELY = 0.5
 """What each likelier resting pose weighs against a grasp, likewise."""

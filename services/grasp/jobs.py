@@ -210,8 +210,8 @@ def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> Non
     if drawn:
         images = [np.asarray(Image.open(out / result.name / THUMBNAIL).convert("RGB")) for result in drawn]
         labels = [
-            f"{r.name}: {'held' if r.facts['success'] else 'NOT HELD'}, {r.facts['attempts_held']} of {r.facts['attempts']}"
-            for r in drawn
+            f"{name}: {'held' if facts['success'] else 'NOT HELD'}, {facts['attempts_held']} of {facts['attempts']}"
+            for name, facts, *_ in drawn
         ]
         title = f"{hand} hand: {held} of {len(rows)} objects held for two seconds without the table"
         save_png(out / SHEET, contact_sheet(images, labels, columns=min(_COLUMNS, len(drawn)), title=title))

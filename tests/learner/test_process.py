@@ -190,7 +190,7 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     (kept / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
     (tmp_path / "version").write_bytes(bytes(21))
     policy = (tmp_path / "policy.safetensors").read_bytes()
-    with pytest.raises(CongraspError, match=r"holds checkpoints of a run\. Go on with --resume"):
+    with pytest.raises(CongraspError, match=r"holds checkpoints of a run\. Continue with --resume"):
         learn(tmp_path, hub)
     seen, said = [], []
     learn(

@@ -44,7 +44,7 @@ class Options:
     headings: Literal["sampled", "demonstrated"] = "sampled"
     """sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps."""
     affordance: Affordance = "auto"
-    """parts: graspable are the labelled parts that fingers touch; contacts: what fingers touch; auto: parts if labelled."""
+    """parts: graspable are labelled parts that fingers touch; contacts: what they touch; auto: parts if labelled."""
     beyond: float = BEYOND
     """Radians by which a captured joint may exceed its limits; it is then moved to the limit. For `human` alone."""
     waypoints: int = 15
