@@ -16,7 +16,7 @@ import tyro
 Command = Callable[..., Any]
 Parser = Callable[[list[str]], Callable[[], Any]]
 """From the arguments to the call that they ask for."""
-_QUIET = ("", "None", "False", "''")
+_QUIET = ("", "None", "False")
 """Defaults that say nothing: the help text has what happens without the option."""
 _CONTINUED = re.compile(r"\s*\n\s*")
 
@@ -103,7 +103,8 @@ def _value(kind: Any) -> str:
 
 def _hint(default: str) -> str:
     """What stands behind an option's help."""
-    return "" if default in _QUIET else f"(default: {default})"
+    shown = default.strip("[']")  # a choice is shown as a list
+    return "" if shown in _QUIET else f"(default: {shown})"
 
 
 _REGISTRY = tyro.constructors.ConstructorRegistry()

@@ -55,8 +55,8 @@ def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
             "congrasp export policy --policy FILE --to onnx",
         ),
         "data": (
-            "It learnt by reinforcement alone, from no recorded human grasp: objects are procedural or those of the "
-            "run's own folder, constraints are sampled.",
+            "It learnt by reinforcement in simulation. Objects are procedural, or those of the run's own folder; "
+            "constraints are sampled, or those of the run's constraint sets.",
             _trained(policy.task),
         ),
         "limits": (*limits(rows), *_ALWAYS),

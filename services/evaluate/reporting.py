@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from actors.physics import PhysicsName, resolve_physics
 from common.config import ObjectsConfig
+from common.engines import engine_title
 from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.parallel import cores
@@ -83,7 +84,7 @@ def report_on(
     )
     commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
     which = f"{len(given)} objects ({objects_label(policy, objects)})"
-    how = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
+    how = f"{episodes} episodes a row on {which}, {engine_title(engine)}, seed {seed}"
     write_report(out, policy, file.name, rows, how, sheets, curves, commands, check, _motion(evaluator, names))
     return Reported(rows, left_out)
 

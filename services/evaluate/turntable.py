@@ -21,7 +21,6 @@ from services.viz.shapes import skin_colours, table_shape
 from services.viz.triangles import triangles_of
 
 FRAME_SECONDS = 0.04
-_INFLUENCES = 4
 
 
 def turntable(episode: Message) -> Mapping[str, Any]:
@@ -31,8 +30,8 @@ def turntable(episode: Message) -> Mapping[str, Any]:
       `data`, JSON whose arrays are base64 of little-endian numbers: for V points `position` and `normal` (V, 3)
       float32, `colour` (V, 3) uint8 sRGB, `bones` (V, 4) and `weights` (V, 4) uint8 of 255; `faces` (F, 3) uint32; and
       `frames` (T, B, 12) float32, the upper three rows of each bone's matrix. Then `seconds` between two frames, the
-      frame of the table's `removal`, the `table`'s first and last corner in `faces`, and the `centre`
-      (3,) and `radius`, m, of what happens until then.
+      frame of the table's `removal`, the `table`'s first and last corner in `faces`, and the `centre` (3,)
+      and `radius`, m, of the grasp.
     """
     arrays, hand = episode.arrays, known_hand(episode.meta["hand"])
     every = max(1, round(FRAME_SECONDS / float(episode.meta["control_dt"])))
@@ -51,7 +50,8 @@ def turntable(episode: Message) -> Mapping[str, Any]:
     points, normals, colours, _, bone_of, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
     faces = np.concatenate([part[3] + first for part, first in zip(parts, counts[:-1], strict=True)])
     seen = np.concatenate([frames[:, :bones, :, 3] @ np.eye(3), arrays["object_position"][steps][:, None]], 1)
-    held = seen[: int(np.sum(arrays["table"][steps])) + 1].reshape(-1, 3)
+    removal = int(np.sum(arrays["table"][steps]))
+    held = seen[removal // 2 : removal + 1].reshape(-1, 3)
     centre = (held.min(0) + held.max(0)) / 2
     data = {
         "position": _encoded(points, "<f4"),
@@ -63,7 +63,7 @@ def turntable(episode: Message) -> Mapping[str, Any]:
         "frames": _encoded(frames, "<f4"),
         "count": bones + 2,
         "seconds": every * float(episode.meta["control_dt"]),
-        "removal": int(np.sum(arrays["table"][steps])),
+        "removal": removal,
         "table": [3 * (len(faces) - len(parts[-1][3])), 3 * len(faces)],
         "centre": centre.round(4).tolist(),
         "radius": round(float(np.linalg.norm(held - centre, axis=-1).max()) + 0.05, 4),
