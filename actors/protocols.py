@@ -1,4 +1,4 @@
-"""What is done to a grasp after the table is gone: the hand is carried upwards, and the object is pushed.
+"""What is done to a grasp after the table is removed: the hand is carried upwards, and the object is pushed.
 
 The lift is a frame that moves: the policy sees hand and object as they are in it, so that its features and goals know
 nothing of the lift, and the wrist's joint targets get the way of the frame. Pushes are forces on the object. Both

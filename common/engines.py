@@ -24,10 +24,19 @@ class Engine(NamedTuple):
     """JAX backend -> what this machine lacks for it, or nothing."""
     on_device: bool = False
     """Whether rollouts stay on the learner's device, so that by default one actor lives in the learner's process."""
+    title: str = ""
+    """Its name for people; that of the row if empty."""
 
 
 ENGINES: dict[str, Engine] = {}
 """Engines by the names that `--physics` takes beside `auto`."""
+
+
+def engine_title(name: str) -> str:
+    """An engine's name for people."""
+    return (name in ENGINES and ENGINES[name].title) or name
+
+
 PhysicsName = Annotated[
     str,
     tyro.conf.arg(

@@ -30,6 +30,12 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
         ) from None
 
 
+def check_free(path: pathlib.Path, *, force: bool = False) -> None:
+    """Raises a CongraspError where a command would overwrite a file, unless its user asked for that with --force."""
+    if path.exists() and not force:
+        raise CongraspError(f"{path} is there already.", "Name another with --out, or replace it with --force.")
+
+
 def cache_folder(name: str) -> pathlib.Path:
     """The user's folder for what is kept of one subject; `XDG_CACHE_HOME` names another place for all of them."""
     return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / name

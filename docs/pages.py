@@ -6,6 +6,7 @@ import inspect
 import io
 import os
 import re
+import textwrap
 import typing
 from collections.abc import Iterator, Sequence
 
@@ -19,6 +20,7 @@ from common.wire import messages
 from common.wire.messages import MessageSpec
 from services.cli import main
 
+_WIDTH = 100
 _DEFAULT = 60
 """Characters of a default value that are shown."""
 
@@ -68,10 +70,11 @@ def _words(command: str) -> Iterator[list[str]]:
 
 def _help(words: list[str]) -> str:
     said = io.StringIO()
-    os.environ["COLUMNS"] = "100"
+    os.environ["COLUMNS"] = str(_WIDTH)
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
         main.load(words[0])([*words[1:], "--help"])
-    return said.getvalue().rstrip()
+    lines = said.getvalue().rstrip().splitlines()
+    return "\n".join(textwrap.fill(line, _WIDTH) if len(line) > _WIDTH else line for line in lines)
 
 
 def _fields(config: typing.Any, prefix: str) -> Iterator[tuple[str, typing.Any, str]]:

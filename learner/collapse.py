@@ -11,7 +11,7 @@ class CollapseWatch:
     """Counts updates in a row that look like a collapse.
 
     Two things count: a success, averaged over ten updates, below half of its best, once that was 30 %; and less than
-    0.1 links in contact when the table goes ("never touch", the local optimum of penalties that outweigh contact).
+    0.1 links in contact at table removal ("never touch", the local optimum of penalties that outweigh contact).
     """
 
     def __init__(self, patience: int):

@@ -87,7 +87,7 @@ def run_learner(
         no array.
       transport: the learner's endpoint; it stays the caller's.
       stop_event: ends training after the update that is under way.
-      resume: go on from the newest intact checkpoint (of rank 0), which any number of ranks may have written.
+      resume: from the newest intact checkpoint (of rank 0), which any number of ranks may have written.
       ranks: the learner's processes, where there are several.
       audit: keep the journal in `audit/` and, where the configuration says so, accepted rollouts in `accepted/`; both
         need rollouts on the host, so not where they stay on a device.
@@ -206,7 +206,8 @@ class _Learner:
                 write_atomically(self._run_dir / CONFIG_FILE, to_json(config).encode())
             elif newest >= 0:
                 raise CongraspError(
-                    f"{self._run_dir} holds checkpoints of a run.", "Go on with --resume, or choose another --run-dir."
+                    f"{self._run_dir} holds checkpoints of a run.",
+                    "Continue with --resume, or choose another --run-dir.",
                 )
             version, newest = state.version + meta["skipped"], newest + meta["skipped"]
             meta = {**meta, "skipped": self._skip_lost_versions(version, newest) + meta["skipped"]}
@@ -259,7 +260,7 @@ class _Learner:
                 self._event("fatal", f"Training collapsed: {collapse}.")
                 raise CongraspError(
                     f"Training collapsed: {collapse}.",
-                    "See docs/training.md; --resume goes on from the last checkpoint.",
+                    "See docs/training.md; --resume starts from the last checkpoint.",
                 )
             due = due or self._state.version % self._config.checkpoint_every == 0
             if due and self._save_if_possible():
@@ -375,7 +376,7 @@ class _Learner:
         if odd := [rank for rank, entry in enumerate(everyone) if entry["state"] != everyone[0]["state"]]:
             raise ReplicasDiffer(
                 f"The weights of ranks {odd} differ from those of rank 0 after update {self._state.version}.",
-                "All ranks need the same GPUs and versions; --resume goes on from the last checkpoint.",
+                "All ranks need the same GPUs and versions; --resume starts from the last checkpoint.",
             )
         failure = ""
         if self._ranks.rank == 0:

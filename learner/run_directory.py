@@ -3,14 +3,16 @@
 It holds `config.json`, `initial.safetensors` where training does not begin with random weights, `checkpoints/`,
 `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `accepted/`
 (rollouts that no checkpoint holds yet), `version` (the newest version that was ever published, so that versions rise
-over a crash, too) and, after an update that was not finite, `failure/`.
+over a crash, too), `endpoint` (where its learner listens, while it runs) and, after an update that was not finite,
+`failure/`.
 What a resume could not read, or does not go on from, is kept beside it as `*.aside`.
 """
 
+import contextlib
 import dataclasses
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from common.config import RunConfig, run_config_from_json, to_json
 from common.errors import CongraspError
@@ -27,8 +29,10 @@ CONFIG_FILE = "config.json"
 LOGS = "logs"
 CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
+_ENDPOINT_FILE = "endpoint"
 _MAX_VERSION = 1 << 53
 _MAX_CONFIG = 1 << 20
+_MAX_ENDPOINT = 1 << 10
 CHANGEABLE = ("updates", "checkpoint_every", "write_ahead", "collapse_patience", "physics", "ppo")
 """Fields of the configuration that a run may go on with other values of; actors that are there do not use them."""
 
@@ -74,6 +78,25 @@ def open_run(run_dir: pathlib.Path) -> RunConfig:
         return run_config_from_json(text)
     except CongraspError as error:
         raise CongraspError(f"{path} cannot be used: {error}") from None
+
+
+@contextlib.contextmanager
+def listening(run_dir: pathlib.Path, url: str) -> Iterator[None]:
+    """Keeps in a run directory where its learner listens, while the block runs; a killed learner's stays."""
+    path = run_dir / _ENDPOINT_FILE
+    write_atomically(path, url.encode())
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def learner_url(run_dir: pathlib.Path) -> str:
+    """Where the learner of a run directory listens; empty where none runs."""
+    try:
+        return read_file(run_dir / _ENDPOINT_FILE, _MAX_ENDPOINT).decode(errors="replace")
+    except OSError:
+        return ""
 
 
 def has_checkpoints(run_dir: pathlib.Path) -> bool:

@@ -49,9 +49,11 @@ def _missing_warp(backend: str) -> CongraspError | None:
     return None
 
 
-ENGINES["warp"] = Engine(_make_warp, 4096, lambda backend: backend in _NVIDIA, _missing_warp, on_device=True)
-ENGINES["jax"] = Engine(_make_jax, 256, lambda backend: backend not in ("cpu", *_NVIDIA))
-ENGINES["native"] = Engine(_make_native, 64, lambda backend: backend == "cpu")
+ENGINES["warp"] = Engine(
+    _make_warp, 4096, lambda backend: backend in _NVIDIA, _missing_warp, on_device=True, title="MJX-Warp"
+)
+ENGINES["jax"] = Engine(_make_jax, 256, lambda backend: backend not in ("cpu", *_NVIDIA), title="MJX-JAX")
+ENGINES["native"] = Engine(_make_native, 64, lambda backend: backend == "cpu", title="MuJoCo C (CPU)")
 
 
 def resolve_physics(name: PhysicsName, backend: str = "") -> PhysicsName:

@@ -15,7 +15,7 @@ from common.task.types import CONTACTS_PER_LINK
 OBJECT_CONTYPE = 2
 """Collision bit of the object; the table answers to it."""
 TABLE_AWAY = (0.0, 0.0, -1000.0)
-"""Where the table goes when it is removed: a kilometre down, so that nothing reaches it again."""
+"""Where the table is when it is removed: a kilometre down, so that nothing reaches it again."""
 SENSOR_WIDTH = 13
 """Numbers of one contact: found, force (3, contact frame), position (3), normal (3), tangent (3)."""
 _CONTACT_FIELDS = (

@@ -100,7 +100,7 @@ class PolicyBundle:
     """Of returns."""
     version: int
     """Rises with every update of a run, also over restarts of its learner."""
-    epoch: str
+    run_id: str
     """Identity of the run's beginning: another one when training restarts from scratch, the same after a resume."""
     transitions: int
     """Environment steps that it was trained on."""
@@ -117,7 +117,7 @@ class PolicyBundle:
         meta = {
             "format": FORMAT,
             "version": self.version,
-            "epoch": self.epoch,
+            "epoch": self.run_id,
             "transitions": self.transitions,
             "schema": self.spec.schema,
             "hand": self.spec.hand,
@@ -150,7 +150,7 @@ class PolicyBundle:
                 network=_dataclass(NetworkConfig, meta["network"]),
             )
             task = _dataclass(TaskConfig, meta["task"])
-            version, epoch, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
+            version, run_id, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
             for fault in (*network_faults(spec.network, spec.layout, spec.action_size), *task_faults(task)):
                 raise ValueError(fault)
             shapes = _shapes(spec)
@@ -162,7 +162,7 @@ class PolicyBundle:
         _check_arrays(message.arrays, shapes, source)
         tree = flax.traverse_util.unflatten_dict(dict(message.arrays), sep="/")
         observation, value = (Statistics(**tree.pop(name)) for name in ("observation", "value"))
-        return PolicyBundle(spec, task, tree, observation, value, version, epoch, transitions)
+        return PolicyBundle(spec, task, tree, observation, value, version, run_id, transitions)
 
 
 def content_hash(encoded: bytes) -> str:

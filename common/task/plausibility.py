@@ -38,7 +38,7 @@ class Sample(NamedTuple):
     hand_hand: Array
     """(B,) deepest penetration of two links that are not neighbours, m; 0 where there is none, as below."""
     hand_table: Array
-    """(B,) deepest point of the hand below the table's top, m; 0 where the table is gone."""
+    """(B,) deepest point of the hand below the table's top, m; 0 where it is removed."""
     hand_object: Array
     """(B,) deepest penetration of a link and the object's real surface, m."""
     wrist_velocity: Array

@@ -211,7 +211,7 @@ def listen_in_memory(name: str) -> MemoryTransport:
 
 
 def connect_in_memory(name: str, wait: float) -> MemoryTransport:
-    """An endpoint of a named hub; a TransportError if nobody listens within `wait` seconds."""
+    """An endpoint of a named hub; a TransportError if there is no listener within `wait` seconds."""
 
     def found() -> MemoryHub | None:
         hub = _named.get(name)

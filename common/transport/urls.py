@@ -70,7 +70,7 @@ def connect(url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0, ru
     Raises:
       CongraspError: the URL is malformed, or the certificates are missing, expired, another role's or run's, or not
         accepted, or those of who listens are not for that.
-      TransportError: nobody listens there.
+      TransportError: there is no response.
     """
     return _open(Endpoint(url, role, listens=False, certs=certs, wait=wait, run=run))
 

@@ -103,7 +103,7 @@ def connect(
     """A session that is connected.
 
     Raises:
-      TransportError: nobody listens until the deadline.
+      TransportError: there is no response until the deadline.
       CongraspError: who listens does not take our certificate, or has one that is not for listening to this run.
     """
     while True:

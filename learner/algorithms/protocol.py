@@ -24,7 +24,7 @@ class Policy(NamedTuple):
     params: Params
     """Actor and critic (`common.policy.network`)."""
     observation: Statistics
-    """Of observations (D,), on the host; acting normalises by them."""
+    """Of observations (D,), on the host; inference normalises by them."""
     value: Statistics
     """Of returns (), on the host."""
 

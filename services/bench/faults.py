@@ -52,12 +52,12 @@ class Result(NamedTuple):
         return first == self.second[:4] == (0, 0, 0, 0)
 
 
-def bench_faults(actors: int, tries: int, kinds: Sequence[str], seed: int = 0) -> bool:
+def bench_faults(actors: int, repeats: int, kinds: Sequence[str], seed: int = 0) -> bool:
     """Prints what every kind of fault cost.
 
     Args:
       actors: actor processes.
-      tries: faults of each kind.
+      repeats: faults of each kind.
       kinds: of `FAULTS`; all of them if none is named.
       seed: of the moments, and of the bits that are flipped.
 
@@ -76,18 +76,18 @@ def bench_faults(actors: int, tries: int, kinds: Sequence[str], seed: int = 0) -
             if disk is None:
                 console.print(f"{kind}: left out, for file systems cannot be mounted here.")
                 continue
-            results.append(_measure(kind, RunUnderTest(disk / "run", actors, _OPTIONS), tries, random.Random(seed)))
+            results.append(_measure(kind, RunUnderTest(disk / "run", actors, _OPTIONS), repeats, random.Random(seed)))
         last = results[-1]
         console.print(f"{kind}: {'nothing lost' if last.fine else last.report.faults[:5]}; {_rest(last)}")
     console.print(_table(results, actors))
     return all(result.fine for result in results)
 
 
-def _measure(kind: str, run: RunUnderTest, tries: int, rng: random.Random) -> Result:
+def _measure(kind: str, run: RunUnderTest, repeats: int, rng: random.Random) -> Result:
     """Faults of one kind in one run, and the verdict on it."""
     seconds: list[float] = []
     try:
-        for number in range(tries):
+        for number in range(repeats):
             if number % _RESTARTS == 0 and run.alive:
                 run.stop()
             if not run.alive:
@@ -213,7 +213,7 @@ def _rest(result: Result) -> str:
 
 def _table(results: Sequence[Result], actors: int) -> Table:
     """A row for each kind: both verdicts where they differ."""
-    columns = ("tries", "accepted", "survived", *KINDS, "damaged on disk", "median, s", "longest, s")
+    columns = ("repeats", "accepted", "survived", *KINDS, "damaged on disk", "median, s", "longest, s")
     table = Table("fault", title=f"{actors} actors")
     for column in columns:
         table.add_column(column, justify="right")

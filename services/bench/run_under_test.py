@@ -46,9 +46,16 @@ class RunUnderTest:
 
     def start(self) -> None:
         """Begins the run, or resumes it, and waits until its learner has taken rollouts from all actors."""
-        command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(self.run_dir), "--boards"]
+        command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(self.run_dir)]
         begun = (self.run_dir / "config.json").exists()
-        command += ["--actors", str(self.count), "--evaluation", "0", *(["--resume"] if begun else [])]
+        command += [
+            "--metric-writers",
+            "--actors",
+            str(self.count),
+            "--evaluation",
+            "0",
+            *(["--resume"] if begun else []),
+        ]
         command += [] if begun else [*_SMALL, *self._options]
         self.process = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         endpoint = until(lambda: self._argument("learner", "--listen"))

@@ -33,6 +33,10 @@ def actor(
       audit: Journal of every rollout and the learner's answer to it, for 'congrasp audit'; nothing is written without.
       watch: How it is watched.
       certs: Folder of an actor's certificate (congrasp certs), whose number its name on the wire begins with.
+
+    Examples:
+      congrasp actor --connect tcp/127.0.0.1:7447 --run human
+      congrasp actor --connect tls/10.0.0.5:7447 --run human --certs actor.1
     """
     from actors.process import run_actor
     from common.journal import Journal

@@ -15,6 +15,10 @@ def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tupl
     Args:
       run_dir: Directory of the run.
       journals: Journals of actors on other machines (`congrasp actor --audit FILE`).
+
+    Examples:
+      congrasp audit runs/mine
+      congrasp audit runs/mine --journals actor.1 actor.2
     """
     from rich.console import Console
     from rich.table import Table

@@ -15,6 +15,10 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
       threads: Threads of the native engine; 0 takes all cores.
       repeats: Measurements of each, alternating; medians and their ratio are printed, and the ratio of the best.
       engines: Engines to measure; those that the machine is made for if none is named.
+
+    Examples:
+      congrasp bench physics
+      congrasp bench physics --engines native warp --environments 1024
     """
     from common.parallel import cores
     from services.bench import physics as bench
@@ -38,6 +42,10 @@ def pieces(
       counts: Most pieces of an object; rates are compared with the first.
       vertices: Most vertices of a piece.
       repeats: Measurements of each; medians are printed.
+
+    Examples:
+      congrasp bench pieces --objects my-objects
+      congrasp bench pieces --objects my-objects --counts 8 32 --vertices 32
     """
     from services.assets.objects.named import objects_of
     from services.bench.pieces import bench_pieces
@@ -55,6 +63,10 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
       repeat: Queries in all.
       concurrency: Clients at the same time.
       states: States in one query, up to 64; each gets an answer.
+
+    Examples:
+      congrasp bench query
+      congrasp bench query --repeat 5000 --concurrency 4
     """
     from services.bench.query import bench_query
 
@@ -62,20 +74,24 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
     return 0
 
 
-def shutdown(tries: int = 100, within: float = 45.0, seed: int = 0) -> int:
+def shutdown(repeats: int = 100, within: float = 45.0, seed: int = 0) -> int:
     """Whether a run with a learner and two actors ends within 5 s of a signal, and leaves no process behind.
 
     Starts one again and again, and sends SIGINT and SIGTERM in turn at random times, also while it starts. The exit
     code is 1 if any took longer or left something.
 
     Args:
-      tries: How often.
+      repeats: How often.
       within: Seconds in which the times lie; after some 30 it trains.
       seed: Seed of the times.
+
+    Examples:
+      congrasp bench shutdown
+      congrasp bench shutdown --repeats 10
     """
     from services.bench.shutdown import bench_shutdown
 
-    return 0 if bench_shutdown(tries, within, seed) else 1
+    return 0 if bench_shutdown(repeats, within, seed) else 1
 
 
 def security(repeats: int = 5, seconds: float = 5.0, turns: int = 3, attacks: tuple[str, ...] = ()) -> int:
@@ -91,6 +107,10 @@ def security(repeats: int = 5, seconds: float = 5.0, turns: int = 3, attacks: tu
       turns: Measurements beside each attack, alternating; medians are printed.
       attacks: On a policy server: unread, silent, huge. On a learner: greedy, greedy-3, silent-learner, slow, slow-3.
         All of them if none is named.
+
+    Examples:
+      congrasp bench security
+      congrasp bench security --seconds 2 --repeats 3
     """
     from services.bench.attacks import bench_attacks
     from services.bench.security import bench_security
@@ -111,6 +131,10 @@ def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: 
       repeats: Measurements of each kind of ingest, alternating; medians are printed.
       actors: Actor processes that wait for weights.
       versions: Publications of weights, four a second.
+
+    Examples:
+      congrasp bench transport
+      congrasp bench transport --senders 4
     """
     from services.bench.transport import bench_transport
 
@@ -126,6 +150,10 @@ def staleness(lag: int = 4, seeds: int = 5, updates: int = 40, worlds: int = 32)
       seeds: Trainings of each kind.
       updates: Updates of each training.
       worlds: Episodes in one update.
+
+    Examples:
+      congrasp bench staleness
+      congrasp bench staleness --lag 8 --seeds 3
     """
     from services.bench.staleness import bench_staleness
 
@@ -133,7 +161,7 @@ def staleness(lag: int = 4, seeds: int = 5, updates: int = 40, worlds: int = 32)
     return 0
 
 
-def faults(actors: int = 2, tries: int = 20, kinds: tuple[str, ...] = (), seed: int = 0) -> int:
+def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed: int = 0) -> int:
     """What kills, stops, freezes, full disks and damaged files cost a real run of what it had acknowledged: nothing.
 
     Every kind of fault has a run of its own, whose journals are read twice, by code that has nothing in common. The
@@ -141,15 +169,19 @@ def faults(actors: int = 2, tries: int = 20, kinds: tuple[str, ...] = (), seed: 
 
     Args:
       actors: Actor processes.
-      tries: Faults of each kind.
+      repeats: Faults of each kind.
       kinds: Kinds of faults: sigterm, ctrl-c, kill-learner, kill-actor, kill-all, freeze-learner, freeze-actor,
         full-disk (which needs the right to mount), damage-checkpoint, damage-accepted (rollouts), damage-journal,
         damage-policy. All of them if none is named.
       seed: Seed of the moments, and of the bits that are flipped.
+
+    Examples:
+      congrasp bench faults
+      congrasp bench faults --repeats 5
     """
     from services.bench.faults import bench_faults
 
-    return 0 if bench_faults(actors, tries, kinds, seed) else 1
+    return 0 if bench_faults(actors, repeats, kinds, seed) else 1
 
 
 def recovery(actors: int = 3, repeats: int = 3) -> int:
@@ -158,6 +190,10 @@ def recovery(actors: int = 3, repeats: int = 3) -> int:
     Args:
       actors: Actor processes.
       repeats: How often each is killed.
+
+    Examples:
+      congrasp bench recovery
+      congrasp bench recovery --actors 4
     """
     from services.bench.recovery import bench_recovery
 
@@ -172,6 +208,10 @@ def recording(actors: int = 2, seconds: float = 20.0, turns: int = 3) -> int:
       actors: Actor processes.
       seconds: Length of a turn.
       turns: Turns of each kind.
+
+    Examples:
+      congrasp bench recording
+      congrasp bench recording --actors 1 --turns 5
     """
     from services.bench.recording import bench_recording
 
@@ -203,6 +243,10 @@ def scaling(
       actors: Actor processes of each rank; by default none on GPUs, where one lives inside each rank, otherwise one.
       deadline: Seconds that one number of ranks may take in all.
       out: File for the results as JSON.
+
+    Examples:
+      congrasp bench scaling --ranks 1 2 4 8
+      congrasp bench scaling --preset quickstart --physics native --seconds 30
     """
     import dataclasses
 
@@ -233,6 +277,10 @@ def startup(
       objects: Objects in the pool; 0: those of the preset.
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
       deadline: Seconds that one start may take.
+
+    Examples:
+      congrasp bench startup
+      congrasp bench startup --preset human --environments 1024
     """
     import dataclasses
 
@@ -256,6 +304,10 @@ def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int 
       environments: Episodes that run side by side.
       threads: Threads of the native engine; 0 takes all cores.
       repeats: Measurements of each, alternating; medians and their ratio are printed.
+
+    Examples:
+      congrasp bench measures
+      congrasp bench measures --environments 256
     """
     from common.parallel import cores
     from services.bench.measures import bench_measures

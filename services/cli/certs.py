@@ -25,6 +25,10 @@ def init(
       run: Name of the run that they are for.
       host: Names and addresses of this machine, under which others will connect to its learner or policy server.
       force: Replace an authority that is there; certificates that it issued are useless then.
+
+    Examples:
+      congrasp certs init certs --run human --host 10.0.0.5
+      congrasp certs init certs --force
     """
     from common.transport.security import LISTENERS, ROLES
     from services.ops.certificates import create_authority, issue
@@ -58,6 +62,10 @@ def issue(
       host: Names and addresses under which others will connect to it (learner and server).
       days: Days until it expires.
       force: Replace the certificate of this number; the old one works until it expires, too.
+
+    Examples:
+      congrasp certs issue certs --role actor
+      congrasp certs issue certs --role client --host 10.0.0.6
     """
     from common.transport.security import CERTIFICATE_FILE
     from services.ops.certificates import issue, read
@@ -78,6 +86,10 @@ def revoke(folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, r
       role: The certificate's role.
       number: The certificate's number.
       run: Name of the run that it was for; by default the one that the authority was made for.
+
+    Examples:
+      congrasp certs revoke certs --role actor --number 1
+      congrasp certs revoke certs --role client --number 2 --run human
     """
     from services.ops.certificates import revoke
 
@@ -90,6 +102,10 @@ def show(folder: Folder = pathlib.Path("certs")) -> int:
 
     Args:
       folder: Folder of an authority or of one certificate.
+
+    Examples:
+      congrasp certs show
+      congrasp certs show certs
     """
     from rich.console import Console
     from rich.table import Table

@@ -35,11 +35,9 @@ def generate(
 ) -> int:
     """Make the constraint sets of objects and write one file each, which says what its arrays mean.
 
-    For the whole surface and for the graspable region O+: 256 headings by the paper's rules, 20 reference poses, and
+    For the whole surface and for the graspable region: 256 headings by the paper's rules, 20 reference poses, and
     wrist trajectories that end at them, from 15 to 25 cm away, replayed through the wrist's controller. 80 % of them
     are for training, and the others are held out.
-
-    Examples: congrasp constraints generate mug:7 box:0; congrasp constraints generate my-objects --references policy
 
     Args:
       objects: Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7.
@@ -53,6 +51,10 @@ def generate(
       folder: Folder of objects.
       out: Folder for the files.
       seed: Seed of the constraints.
+
+    Examples:
+      congrasp constraints generate mug:7 box:0
+      congrasp constraints generate my-objects --references policy
     """
     from common.config import TaskConfig
     from common.hands import get_hand
@@ -122,8 +124,6 @@ def import_captures(
     trajectory to it of 15 waypoints, and, where the object's parts are labelled, which of them may be touched. Only
     right hands are used. Objects are made of the data set's meshes.
 
-    Examples: congrasp constraints import grab GRAB/; congrasp constraints import myohand data/ --meshes object_sim/
-
     Args:
       format: Whose files these are.
       path: The data set's folder, or one of its files.
@@ -132,13 +132,17 @@ def import_captures(
       hand: Hand of the sets. Human finger angles fit no other hand: it follows the captured wrist by its own grasp
         axes, with the captured headings and affordance, and closes its fingers around the object at the end.
       headings: sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps.
-      affordance: What O+ is: parts that fingers touch; whatever they touch; or everything. auto: parts where they are
-        labelled.
+      affordance: Graspable are parts that fingers touch; whatever they touch; or everything. auto: parts where they
+        are labelled.
       beyond: Radians by which a captured joint may exceed the human hand's limits; it is then moved to the limit. For
         another hand it does not count.
       out: Folder for the sets, and for import.json, which holds the outcome of each sequence.
       objects: Folder for the objects.
       seed: Of sampled headings and of the split into training and held-out.
+
+    Examples:
+      congrasp constraints import grab GRAB/
+      congrasp constraints import myohand data/ --meshes object_sim/
     """
     import importlib
 
@@ -240,6 +244,10 @@ def show(
       png: Picture to write: headings, affordance, trajectories and reference poses.
       rest: Resting pose of the picture, from 1; 0 takes the one that leaves room for most poses.
       seed: Draws which constraints the picture shows.
+
+    Examples:
+      congrasp constraints show sets/mug_7.constraints.safetensors
+      congrasp constraints show sets/mug_7.constraints.safetensors --png mug.png --rest 2
     """
     from common.task.constraint_sets import load
     from services.cli.console import show_facts

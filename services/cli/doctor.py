@@ -18,6 +18,10 @@ def doctor(
       run: Name of the learner's run.
       folder: Where runs are to be written.
       certs: Folder of certificates (congrasp certs) to look at, and to connect with as an observer.
+
+    Examples:
+      congrasp doctor
+      congrasp doctor --connect tcp/10.0.0.5:7447 --run human
     """
     from services.ops.doctor import examine
 

@@ -10,6 +10,7 @@ import tyro
 
 from actors.physics import PhysicsName
 from common.config import Split
+from common.engines import engine_title
 from common.errors import CongraspError
 
 if TYPE_CHECKING:
@@ -74,6 +75,10 @@ def evaluate(
       by: object: also print the rates of each object; --json always has them.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.
+
+    Examples:
+      congrasp evaluate --table single composed --episodes 200
+      congrasp evaluate --policy runs/mine/policy.safetensors --json evaluation.json
     """
     from actors.physics import resolve_physics
     from services.assets.objects.named import objects_of
@@ -103,7 +108,12 @@ def evaluate(
         for one, tables in lineup.entrants:
             own = dataclasses.replace(setup, keep=pools and pools / f"{one.hand}-{one.method}")
             results.append(evaluate_tables(one.policy, tables, own, track, keep=pictures is not None))
-    _show(results, lineup, f"{_who(lineup)}, on {_source(lineup, objects)}, {engine}, friction {friction:g}", by)
+    _show(
+        results,
+        lineup,
+        f"{_who(lineup)}, on {_source(lineup, objects)}, {engine_title(engine)}, friction {friction:g}",
+        by,
+    )
     if json and pools:
         about = _about(lineup, objects, constraints, split) | settings
         write_json([row for found in results for row in found.rows], json, about)

@@ -1,4 +1,4 @@
-"""`congrasp export`: policies and motions for other programs, each file checked as it is written."""
+"""Policies and motions for other programs, each file checked as it is written."""
 
 import pathlib
 from typing import Annotated, Literal
@@ -13,26 +13,32 @@ def policy(
     hand: str = "human",
     to: Literal["onnx", "stablehlo"] = "onnx",
     out: pathlib.Path | None = None,
+    force: bool = False,
 ) -> int:
     """Write a policy as ONNX or StableHLO, and print by how much it differs from the original on random inputs.
 
     Normalisation is inside; the file also holds the hand, the meaning and order of every input and output, and the
     hand's MuJoCo model. docs/exports.md says how to use it; examples/onnx_grasp.py does.
 
-    Examples: congrasp export policy; congrasp export policy --hand allegro --to stablehlo
-
     Args:
       policy: The policy file (.safetensors); the pretrained one otherwise.
       hand: Whose pretrained policy.
       to: The format.
       out: The file to write; policy.onnx or policy.stablehlo.zip otherwise.
+      force: Replace a file that is there.
+
+    Examples:
+      congrasp export policy
+      congrasp export policy --hand allegro --to stablehlo
     """
+    from common.files import check_free
     from common.policy.bundle import load
     from common.policy.pretrained import policy_file
     from services.export.policy import SUFFIXES, TOLERANCE, export_policy
 
     source = policy_file(policy, hand)
     path = out or pathlib.Path(f"policy{SUFFIXES[to]}")
+    check_free(path, force=force)
     difference = export_policy(load(source), to, path)
     print(f"{path}: largest absolute difference to the Flax policy {difference:.1e} (at most {TOLERANCE:g})")
     return 0
@@ -45,6 +51,7 @@ def motion(
     index: int = -1,
     success: bool = False,
     camera: bool = False,
+    force: bool = False,
 ) -> int:
     """Write a grasp motion for another program, read the file back, and print its largest error in millimetres.
 
@@ -52,40 +59,53 @@ def motion(
     trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for each motion. docs/exports.md says what
     is in each.
 
-    Examples: congrasp export motion grasps/mug/grasp.npz; congrasp export motion runs/mine --success --to ros2
-
     Args:
       paths: Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot takes several.
       to: The format.
-      out: The file or folder to write; the first motion's name in the working directory otherwise.
+      out: The file or folder to write; by default one named after the object, such as mug.glb, in the working
+        directory.
       index: Which of the recorded episodes, from 0; -1 is the last.
       success: Count only episodes that succeeded.
       camera: Also film the motions; lerobot alone has videos.
+      force: Replace a file that is there; a folder never is.
+
+    Examples:
+      congrasp export motion grasps/mug/grasp.npz --to glb
+      congrasp export motion runs/mine --success --to ros2 --out bag
     """
     from services.export.frames import TOLERANCE_MM
-    from services.export.motion_formats import FORMATS, export_motions, pick_motion
+    from services.export.motion_formats import default_name, export_motions, pick_motion
 
     if not paths:
         raise CongraspError("No motion was named.", "Name a .npz of 'congrasp grasp', a recording or a run's folder.")
-    target = out or pathlib.Path(f"{paths[0].stem}{FORMATS[to] or f'-{to}'}")
     motions = [pick_motion(path, index, success=success) for path in paths]
-    error = export_motions(motions, to, target, camera=camera)
+    target = out or default_name(motions[0], to)
+    error = export_motions(motions, to, target, camera=camera, force=force)
     frames = sum(len(motion.time) for motion in motions)
     print(f"{target}: {frames} frames, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
     return 0
 
 
 def layout(
-    path: Annotated[pathlib.Path, tyro.conf.Positional], out: pathlib.Path = pathlib.Path("congrasp-layout.json")
+    path: Annotated[pathlib.Path, tyro.conf.Positional],
+    out: pathlib.Path = pathlib.Path("congrasp-layout.json"),
+    force: bool = False,
 ) -> int:
     """Write a layout for Foxglove: the actors' episodes in 3-D, learning curves, rewards, contacts and events.
 
     Args:
       path: The run's folder, or one MCAP file, that the layout is to fit.
       out: The file to write; in Foxglove: Layout, Import from file.
+      force: Replace a file that is there.
+
+    Examples:
+      congrasp export layout runs/mine
+      congrasp export layout recordings/learner.mcap --out layout.json
     """
+    from common.files import check_free
     from services.export.layout import export_layout
 
+    check_free(out, force=force)
     panels = export_layout(path, out)
     print(f"{out}: {panels} panels")
     return 0

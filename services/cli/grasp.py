@@ -36,25 +36,24 @@ Constraints: Any = dataclasses.make_dataclass(
 def grasp(
     objects: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
     out: pathlib.Path = pathlib.Path("grasps"),
-    constraints: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = Constraints(),  # noqa: B008
+    constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = Constraints(),  # noqa: B008
     video: bool = False,
     pictures: bool = True,
     policy: pathlib.Path | None = None,
     hand: str = "human",
-    tries: int = 16,
+    attempts: int = 16,
     seed: int = 0,
     approach: float = 0.0,
     lift: float = 0.0,
     rest: str = "",
     folder: str = "objects",
     again: bool = False,
-    options: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
+    mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
 ) -> int:
     """Make grasp motions for objects of your own.
 
     Every object gets a folder in --out: grasp.npz (arrays that say what they mean), grasp.mcap (Foxglove, Rerun),
     grasp.png, portrait.png, object.png (before and after its import, beside a hand at true scale) and result.json.
-    Examples: congrasp grasp mug.obj --approach 1 --lift 0.15 --video; congrasp grasp mug:7 --rest upright
 
     Several attempts are simulated at once, and the best is kept: first one that holds the object for two seconds
     without the table, then small errors, a quiet object and gentle forces. Interrupted runs resume where they stopped.
@@ -63,19 +62,23 @@ def grasp(
       objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, FAMILY:SEED of the generator (mug:7), or
         names in --folder.
       out: Folder for the results.
-      constraints: What the grasp must keep to.
+      constraint: What the grasp must keep to.
       video: Also write grasp.mp4, at half speed, with the constraints drawn.
       pictures: Write pictures.
       policy: A policy file; by default the one that comes with the package.
       hand: Hand whose pretrained policy is taken.
-      tries: Attempts that are simulated side by side.
+      attempts: How many are simulated side by side.
       seed: Draws what is attempted.
       approach: Seconds in which the hand first comes from beside the table; longer where an arm needs it (1 m/s).
       lift: Metres by which the hand then lifts the object, which stands on the table until then; 0 removes the table.
       rest: How the object lies on the table: upright, or a number from 1 on (congrasp objects rests shows them).
       folder: Folder of objects, whose names can stand for files.
       again: Also redo finished objects.
-      options: How meshes become objects.
+      mesh: How meshes become objects.
+
+    Examples:
+      congrasp grasp examples/mug.obj --video
+      congrasp grasp mug:7 --rest upright --approach 1 --lift 0.15
     """
     from common.policy import bundle as bundles
     from common.policy.pretrained import policy_file
@@ -85,16 +88,16 @@ def grasp(
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
-    at_least(1, tries=tries)
+    at_least(1, attempts=attempts)
     at_most(10.0, "seconds", approach=approach)
     at_most(0.5, "metres", lift=lift)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
     file = policy_file(policy, hand)
     found, results = find_objects(objects, folder)
-    identity = (bundles.content_hash(file.read_bytes()), tries, seed, approach, lift)
-    settings = Settings(out, options, dataclasses.asdict(constraints), identity, video, pictures, again, rest)
-    grasper = Grasper(bundles.load(file), attempts=tries, approach=approach, lift=lift, seed=seed)
+    identity = (bundles.content_hash(file.read_bytes()), attempts, seed, approach, lift)
+    settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, video, pictures, again, rest)
+    grasper = Grasper(bundles.load(file), attempts=attempts, approach=approach, lift=lift, seed=seed)
 
     for result in results:
         _show(result)

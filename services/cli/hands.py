@@ -1,4 +1,4 @@
-"""`congrasp hands`: the hands there are, pictures of them, and hands of one's own."""
+"""The hands there are, pictures of them, and hands of one's own."""
 
 import pathlib
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +12,11 @@ if TYPE_CHECKING:
 
 
 def list_hands() -> int:
-    """List the hands: those of the package and your own, with joints, masses and whether a policy comes with them."""
+    """List the hands: those of the package and your own, with joints, masses and whether a policy comes with them.
+
+    Examples:
+      congrasp hands list
+    """
 
     from common.errors import CongraspError
     from common.hands import HANDS, get_hand, hands_folder, own_hands
@@ -51,6 +55,10 @@ def sheet(
     Args:
       hands: Names of hands, or hand files.
       out: The PNG file to write; with several hands, one beside another.
+
+    Examples:
+      congrasp hands sheet human
+      congrasp hands sheet allegro sharpa --out robot-hands.png
     """
     from common.hands import get_hand, own_hands
     from services.assets.hands.visual import load_meshes, skin_of_meshes
@@ -81,8 +89,6 @@ def import_hand(
     the hand is kept beside it. Look at the picture, and correct the file where the proposal is wrong: poses,
     fingertips, gains, couplings and capsules are all in it.
 
-    Examples: congrasp hands import hand.urdf; congrasp hands import hand.xml --name mine --palm palm_link
-
     Args:
       file: The hand's URDF (.urdf) or MJCF (.xml), a right or left hand of hinges.
       name: Its name; that of the file by default.
@@ -92,6 +98,10 @@ def import_hand(
       object_scale: Factor on the objects that it learns to grasp; by default from its opening, 1 for a human hand's.
       out: The file to write; by default NAME.json in the folder of your own hands ('congrasp hands list' names it).
       png: The picture; by default beside the file.
+
+    Examples:
+      congrasp hands import hand.urdf
+      congrasp hands import hand.xml --name mine --palm palm_link
     """
     from common.errors import CongraspError
     from common.hands import SUFFIX
@@ -148,6 +158,10 @@ def check(
       hand: A hand, by its name or its file.
       png: The picture; by default NAME-check.png.
       json: Also write the lines to this file.
+
+    Examples:
+      congrasp hands check allegro
+      congrasp hands check my_hand --png check.png --json check.json
     """
     from common.hands import get_hand
     from common.parallel import cores
@@ -188,8 +202,6 @@ def train(
     policy as --hand NAME. Without a GPU the training is short and of an easier task. It stops where the self-check
     fails. The same command goes on where it was stopped.
 
-    Examples: congrasp hands train my_hand.urdf; congrasp hands train my_hand --training="--updates 900"
-
     Args:
       hand: The hand's URDF (.urdf) or MJCF (.xml), which is imported unless a hand of its name is among your own
         already; or a hand's name or file.
@@ -204,6 +216,10 @@ def train(
       pool: Objects of the report; 0 takes 64, without a GPU 12.
       training: Further options of 'congrasp train', as one text.
       patience: Minutes after which the training is ended, to be resumed by the next 'congrasp hands train'.
+
+    Examples:
+      congrasp hands train my_hand.urdf
+      congrasp hands train my_hand --training="--updates 900"
     """
     import shlex
 
@@ -234,7 +250,7 @@ def train(
         patience=60.0 * patience,
     )
     train_hand(request, lambda text: print(text, flush=True))
-    print(f"Try: congrasp grasp mug.obj --hand {reference}")
+    print(f"Try: congrasp grasp examples/mug.obj --hand {reference}")
     return 0
 
 

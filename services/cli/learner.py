@@ -1,5 +1,6 @@
 """`congrasp learner`: the learner alone."""
 
+import contextlib
 import pathlib
 import threading
 from collections.abc import Sequence
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from common.config import MetricWriter, RunConfig, run_config_from_json, to_json
-from common.transport.ports import LEARNER_URL, rank_url
+from common.transport.ports import LEARNER_URL, rank_url, reachable_url
 from services.cli.train import defaults as defaults
 from services.cli.watch import Watch, Watched
 from services.train.presets import with_hand
@@ -33,7 +34,7 @@ def learner(
     ranks: int = 1,
     coordinator: str = "127.0.0.1:7440",
     inside: bool = False,
-    boards: tuple[MetricWriter, ...] = ("tensorboard",),
+    metric_writers: tuple[MetricWriter, ...] = ("tensorboard",),
     watch: Watched = Watch(),  # noqa: B008
 ) -> int:
     """The learner alone; actors on this machine or on others connect to it with `congrasp actor --connect`.
@@ -50,9 +51,9 @@ def learner(
       certs: Folder of a learner's certificate (congrasp certs): mutual TLS, and each role may do only what is its own.
       insecure: Listen beyond loopback without certificates.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
-      resume: Go on with the run in --run-dir, from its newest intact checkpoint; a run that has not come to one
+      resume: Resume the run in --run-dir from its newest intact checkpoint; a run that has not come to one
         begins anew.
-      or_resume: Begin the run, or go on with it if --run-dir holds one: for supervisors that give the same command
+      or_resume: Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command
         every time.
       rank: Number of this process among several that train together; each needs a GPU of its own
         (CUDA_VISIBLE_DEVICES).
@@ -60,15 +61,19 @@ def learner(
         --run-dir of rank 0; rank r listens 4 r ports above --listen.
       coordinator: Where the ranks find rank 0: its host and a port, which and the next of which must be free there.
       inside: An actor lives in this process, too, so that its rollouts never leave the device.
-      boards: Where the learner's metrics are written, too: tensorboard (files in the run's folder), wandb-offline
-        (files there, for `wandb sync`), wandb (needs an account); with no name none.
+      metric_writers: Where the learner's metrics are written, too: tensorboard (files in the run's folder),
+        wandb-offline (files there, for `wandb sync`), wandb (needs an account); with no name none.
       watch: How it is watched.
+
+    Examples:
+      congrasp learner --preset human --run-dir runs/human --listen tls/0.0.0.0:7447 --certs certs
+      congrasp learner --run-dir runs/human --resume
     """
     from common.errors import CongraspError
     from common.policy import bundle as bundles
     from common.transport import urls
     from learner.ranks import Ranks, end_process
-    from learner.run_directory import CONFIG_FILE, continue_run, create_run
+    from learner.run_directory import CONFIG_FILE, continue_run, create_run, listening
     from services.ops.shutdown import on_signal
 
     resume = resume or (or_resume and (run_dir / CONFIG_FILE).exists())
@@ -91,7 +96,18 @@ def learner(
                 create_run(run_dir, config, None if initial is None else bundles.load(initial))
             joined = Ranks.join(rank, ranks, coordinator)
             config = run_config_from_json(joined.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
-            _learn(run_dir, config, transport, stop, joined, resume=resume, inside=inside, writers=boards, watch=watch)
+            with listening(run_dir, reachable_url(url)) if rank == 0 else contextlib.nullcontext():
+                _learn(
+                    run_dir,
+                    config,
+                    transport,
+                    stop,
+                    joined,
+                    resume=resume,
+                    inside=inside,
+                    writers=metric_writers,
+                    watch=watch,
+                )
             return stop.exit_code
     except CongraspError as error:
         if ranks > 1:

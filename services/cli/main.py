@@ -3,7 +3,6 @@
 import contextlib
 import difflib
 import errno
-import functools
 import importlib
 import inspect
 import io
@@ -69,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         code = run(arguments)
     except CongraspError as error:
-        code = _complain(str(error), error.exit_code, debug)
+        code = _fail(str(error), error.exit_code, debug)
     except BrokenPipeError:
         if _last_words(sys.stdout, "\n"):  # it is another pipe that broke
             raise
@@ -78,15 +77,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if error.errno not in _FULL:
             raise
         where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
-        code = _complain(f"{where}: {error.strerror}. Free space and start again.", USAGE_ERROR, debug)
+        code = _fail(f"{where}: {error.strerror}. Free space and start again.", USAGE_ERROR, debug)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("common", "actors", "learner", "services"):
             raise
         package = (error.name or "").partition(".")[0]
         extra = EXTRAS.get(package, "train")
-        code = _complain(
-            f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug
-        )
+        code = _fail(f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug)
     _last_words(sys.stdout)
     if code in SIGNALLED:  # no time for what an interpreter does at its end
         os._exit(code)
@@ -121,28 +118,12 @@ def run(arguments: list[str]) -> int:
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
     """The command's module as a function from its arguments to the call that they ask for."""
     module = importlib.import_module(f"services.cli.{name}")
-    import tyro
+    from services.cli import parser
 
     prog = f"congrasp {name}"
     if hasattr(module, "COMMANDS"):
-        description = inspect.getdoc(module)
-        commands = {key: _deferred(command) for key, command in module.COMMANDS.items()}
-        return lambda rest: tyro.extras.subcommand_cli_from_dict(
-            commands, prog=prog, description=description, args=rest
-        )
-    defaults: Callable[[list[str]], dict[str, Any]] = getattr(module, "defaults", lambda rest: {})
-    return lambda rest: tyro.cli(functools.partial(_deferred(module.COMMAND), **defaults(rest)), prog=prog, args=rest)
-
-
-def _deferred(command: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
-    """The command with its arguments bound, to be called once they are known to be right."""
-
-    @functools.wraps(command)
-    def bind(*args: Any, **options: Any) -> Callable[[], Any]:
-        return functools.partial(command, *args, **options)
-
-    bind.__annotations__ = {**command.__annotations__, "return": Any}
-    return bind
+        return parser.of_group(module.COMMANDS, prog, inspect.getdoc(module))
+    return parser.of_command(module.COMMAND, prog, getattr(module, "defaults", lambda rest: {}))
 
 
 def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: list[str]) -> Callable[[], Any]:
@@ -157,7 +138,8 @@ def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: li
         inside = [line.strip("│ ") for line in said.getvalue().splitlines() if line.startswith("│")]
         rules = [i for i, line in enumerate(inside) if line.startswith("─")] or [len(inside)]
         rest = inside[rules[0] :]
-        similar = [line.split()[0] for line in rest if line.startswith("--")] if "Perhaps you meant:" in rest else []
+        options = [line.split()[0].rstrip(",") for line in rest if line.startswith("--")]
+        similar = options if "Perhaps you meant:" in rest else []
         hint = f"Perhaps you meant {' or '.join(similar)}. " if similar else ""
         what = " ".join(inside[: rules[0]]).rstrip(".")
         raise CongraspError(f"{what}.", f"{hint}See 'congrasp {name} --help'.") from None
@@ -172,7 +154,7 @@ def usage() -> str:
         "Dexterous grasping under constraints: distributed training and a live policy.\n\n"
         f"{rows}\n\n"
         "Options of every command: --help, and --debug for the trace of an error.\n"
-        "First steps: 'congrasp grasp mug.obj' for a mesh of yours, 'congrasp view', 'congrasp train'.\n"
+        "First steps: 'congrasp grasp examples/mug.obj', or a mesh of yours, 'congrasp view', 'congrasp train'.\n"
     )
 
 
@@ -185,7 +167,7 @@ def _prepare_environment() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
-def _complain(text: str, code: int, debug: bool) -> int:
+def _fail(text: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
     if log_error(text):

@@ -18,13 +18,15 @@ _COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "yell
 def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tuple[str, ...] = ()) -> int:
     """Make procedural objects and store them in a folder.
 
-    Examples: congrasp objects generate --count 100; congrasp objects generate --families mug knife --out tools
-
     Args:
       out: Folder for the objects.
       count: Number of objects.
       seed: Seed of the first; the others follow. Training never uses seeds from one million upward.
       families: Families, in turn, or groups of them: basic (if none is named), household, all.
+
+    Examples:
+      congrasp objects generate --count 100
+      congrasp objects generate --families mug knife --out tools
     """
     from common.objects import procedural
     from common.objects.store import Catalogue
@@ -45,19 +47,21 @@ def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tup
 def import_meshes(
     paths: Annotated[tuple[str, ...], tyro.conf.Positional],
     out: str = "objects",
-    options: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(),  # noqa: B008
+    mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(),  # noqa: B008
 ) -> int:
     """Make objects of meshes: decompose them, weigh them, find their resting poses, and store them in a folder.
 
     A path is a mesh file (STL, OBJ, PLY, GLB), a folder with `graspable.*` and `non_graspable.*`, a folder with convex
     pieces `contact*` beside `<name>.*` and `<name>_<part>.*`, or a folder of such files and folders.
 
-    Examples: congrasp objects import mug.obj; congrasp objects import scans/ --unit mm --density 300 --out my-objects
-
     Args:
       paths: Mesh files and folders.
       out: Folder for the objects.
-      options: How meshes become objects.
+      mesh: How meshes become objects.
+
+    Examples:
+      congrasp objects import examples/mug.obj
+      congrasp objects import scans/ --unit mm --density 300 --out my-objects
     """
     from common.objects.store import Catalogue
     from services.assets.objects.meshes import import_sources
@@ -76,7 +80,7 @@ def import_meshes(
     catalogue = Catalogue(out)
     with bars() as progress:
         task = progress.add_task("Importing", total=len(sources))
-        for _, obj in import_sources(sources, options):
+        for _, obj in import_sources(sources, mesh):
             if isinstance(obj, CongraspError):
                 report_error(obj)
                 failures += 1
@@ -96,12 +100,14 @@ def list_objects(
 ) -> int:
     """List the objects of a folder, or the families of the generator.
 
-    Examples: congrasp objects list my-objects --png my-objects.png
-
     Args:
       folder: Folder of objects.
       families: List the generator's families instead.
       png: Picture to write: every object, its graspable region green and its avoid region red.
+
+    Examples:
+      congrasp objects list my-objects --png my-objects.png
+      congrasp objects list --families
     """
     from common.objects.procedural import FAMILIES
     from common.objects.store import Catalogue
@@ -138,12 +144,14 @@ def list_objects(
 def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", png: pathlib.Path | None = None) -> int:
     """Print the facts of an object, and draw it.
 
-    Examples: congrasp objects show mug:7 --png mug.png; congrasp objects show mug_7 --folder my-objects
-
     Args:
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
       folder: Folder of objects.
       png: Picture to write: labelled surface, convex pieces, headings on the table.
+
+    Examples:
+      congrasp objects show mug:7 --png mug.png
+      congrasp objects show mug_7 --folder my-objects
     """
     import numpy as np
 
@@ -192,12 +200,14 @@ def rests(
 ) -> int:
     """List an object's resting poses, the likeliest first, and draw them: what `congrasp grasp --rest` takes.
 
-    Examples: congrasp objects rests mug:7 --png rests.png; congrasp objects rests mug.obj
-
     Args:
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
       folder: Folder of objects.
       png: Picture to write: a thumbnail of each.
+
+    Examples:
+      congrasp objects rests mug:7 --png rests.png
+      congrasp objects rests examples/mug.obj
     """
     import numpy as np
 
@@ -246,24 +256,25 @@ def set_affordance(
     name: str = "",
     folder: str = "objects",
 ) -> int:
-    """Divide an object's surface anew into the graspable region (O+) and the avoid region (O-).
+    """Divide an object's surface anew into graspable region and avoid region.
 
-    O+ is what lies on the mesh of a part, what is painted in a colour, or what lies beyond a plane. It must have a
-    tenth of the surface at least. Sets of constraints and evaluation then keep to it.
-
-    Examples: congrasp objects affordance mug_7 --part-mesh handle.ply;
-    congrasp objects affordance mug_7 --half-space 0 0 1 0.02 --name upper-mug
+    Graspable is what lies on the mesh of a part, what is painted in a colour, or what lies beyond a plane. It must have
+    a tenth of the surface at least. Sets of constraints and evaluation then keep to it.
 
     Args:
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
       part_mesh: A mesh of the graspable part, in the frame and unit of the object's own file.
       painted: A PLY file of the object with coloured vertices, in the same frame and unit.
       colour: Of the graspable region in the painted file: red, green, blue, yellow, or #rrggbb.
-      half_space: Three numbers of a direction and one in metres: O+ is what lies farther than that along the direction.
-        In the object's frame, whose origin is its centre of mass.
+      half_space: Three numbers of a direction and one in metres: graspable is what lies farther than that along the
+        direction. In the object's frame, whose origin is its centre of mass.
       invert: What was found is the avoid region, and the rest may be grasped.
       name: Name of the new object; the old one otherwise, which it then replaces.
       folder: Folder of objects, to which the new one goes.
+
+    Examples:
+      congrasp objects affordance examples/mug.obj --part-mesh examples/mug-handle.obj
+      congrasp objects affordance mug_7 --half-space 0 0 1 0.02 --name upper-mug
     """
     from common.objects.store import Catalogue
     from services.assets.objects import affordance

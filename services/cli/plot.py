@@ -7,26 +7,36 @@ import tyro
 
 
 def plot(
-    path: Annotated[pathlib.Path, tyro.conf.Positional],
+    paths: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
     out: pathlib.Path | None = None,
     formats: tuple[Literal["png", "pdf"], ...] = ("png", "pdf"),
 ) -> int:
     """Draw a run's learning curves, reward terms and other metrics, or an evaluation's table, rates and errors.
 
-    Examples: congrasp plot runs/mine; congrasp plot evaluation.json --formats pdf
-
     Args:
-      path: A run's folder, or one MCAP file; a run that is not over is drawn up to its last half second. Or the JSON
-        file of 'congrasp evaluate --json'.
-      out: Folder for the figures; 'plots' beside the recordings or the JSON file otherwise.
+      paths: Runs' folders, or MCAP files, which are drawn over one another; a run that is not over is drawn up to its
+        last half second. Or the JSON file of one 'congrasp evaluate --json'.
+      out: Folder for the figures; 'plots' beside the recordings or the JSON file otherwise. Of several runs it must
+        be named.
       formats: Of the files.
-    """
-    from services.evaluate.plots import plot_evaluation
-    from services.viz.plots import plot_run
 
-    folder = out or (path if path.is_dir() else path.parent) / "plots"
-    draw = plot_evaluation if path.suffix == ".json" else plot_run
-    for file in draw(path, folder, formats):
+    Examples:
+      congrasp plot runs/mine
+      congrasp plot runs/mine runs/other --out plots --formats png
+    """
+    from common.errors import CongraspError
+    from services.evaluate.plots import plot_evaluation
+    from services.viz.plots import plot_runs
+
+    evaluations = [path for path in paths if path.suffix == ".json"]
+    if not paths:
+        raise CongraspError("No run was named.", "Name the folders of runs: congrasp plot runs/mine")
+    if len(paths) > 1 and evaluations:
+        raise CongraspError(f"{evaluations[0]} can only be drawn alone.", "Runs are drawn over one another.")
+    if len(paths) > 1 and out is None:
+        raise CongraspError("The figures of several runs belong to none of them.", "Name a folder with --out.")
+    folder = out or (paths[0] if paths[0].is_dir() else paths[0].parent) / "plots"
+    for file in plot_evaluation(paths[0], folder, formats) if evaluations else plot_runs(paths, folder, formats):
         print(file)
     return 0
 

@@ -33,6 +33,10 @@ def query(
       certs: Folder of a client's certificate (congrasp certs).
       health: Ask only whether the server is ready; the exit code is 0 if it is, and 4 if it is not.
       json: Print JSON: p50_ms, p99_ms, answers_per_s, failed, overloaded.
+
+    Examples:
+      congrasp query --connect tcp/127.0.0.1:7457
+      congrasp query --repeat 1000 --concurrency 4 --json
     """
     import json as json_module
 

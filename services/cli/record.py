@@ -28,6 +28,10 @@ def record(
       duration: Seconds after which to stop; without it until Ctrl-C.
       log_format: Text, or one JSON object a line: time, level, role, id, run, text, fields.
       certs: Folder of an observer's certificate (congrasp certs).
+
+    Examples:
+      congrasp record --connect tcp/127.0.0.1:7447 --run human
+      congrasp record --run human --out recordings --live 8765
     """
     from common.transport.keys import process_name
     from services.ops.logs import logging_as

@@ -1,4 +1,4 @@
-"""`congrasp render`: pictures of a hand or of a recorded episode, without OpenGL."""
+"""Pictures of a hand or of a recorded episode, without OpenGL."""
 
 import pathlib
 from typing import Annotated
@@ -12,6 +12,10 @@ def hand(hand: str = "human", out: pathlib.Path = pathlib.Path("hand.png")) -> i
     Args:
       hand: Name of the hand.
       out: The PNG file to write.
+
+    Examples:
+      congrasp render hand --hand allegro
+      congrasp render hand --hand my_hand --out my-hand.png
     """
     from common.hands import get_hand
     from services.viz.hand_sheets import hand_sheet
@@ -32,8 +36,6 @@ def episode(
 ) -> int:
     """Draw frames of a recorded episode with its constraints: approach arrow, avoid region in red, waypoints, pose.
 
-    Examples: congrasp render episode runs/mine --success; congrasp render episode runs/mine --index 0 --video grasp.mp4
-
     Args:
       path: A run's folder, or one MCAP file.
       out: The PNG file to write.
@@ -41,6 +43,10 @@ def episode(
       success: Count only episodes that succeeded.
       frames: Pictures on the sheet.
       video: Also write the whole episode as an MP4, the grasp itself at half its speed.
+
+    Examples:
+      congrasp render episode runs/mine --success
+      congrasp render episode runs/mine --index 0 --video grasp.mp4
     """
     from services.record.reader import pick_episode
     from services.viz.render import episode_sheet, save_episode_video

@@ -31,8 +31,6 @@ def report(
     It evaluates the policy by the paper's protocol first, and draws some of those very episodes. With 200 episodes a
     row that takes some minutes on a CPU; a first look: --episodes 16.
 
-    Examples: congrasp report runs/mine; congrasp report --hand allegro --objects my-objects --out allegro.html
-
     Args:
       source: A run's folder or a policy file; by default a pretrained policy.
       out: The file to write.
@@ -44,6 +42,10 @@ def report(
       hand: Whose pretrained policy.
       json: Also write the rows to this file.
       check: A file of 'congrasp hands check --json', with the picture beside it, to be part of the report.
+
+    Examples:
+      congrasp report runs/mine --episodes 16
+      congrasp report --hand allegro --objects my-objects --out allegro.html
     """
     from common.policy.bundle import content_hash
     from common.policy.pretrained import policy_file

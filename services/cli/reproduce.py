@@ -41,8 +41,6 @@ def reproduce(
     is listed with the reason. The same command goes on where it was stopped: trainings from their last checkpoint,
     tables that are done are not made again unless policy or numbers changed.
 
-    Examples: congrasp reproduce --quick; congrasp reproduce --captured grab oakink dexycb
-
     Args:
       out: Folder for reproduction.html, reproduction.json and tables.tex, and for runs, rows and pictures.
       quick: Take the pretrained policies, train nothing, and evaluate 48 episodes a row: minutes on two CPU cores.
@@ -59,6 +57,10 @@ def reproduce(
       seed: Seed of constraints and episodes.
       training: Further options of every 'congrasp train', as one text.
       patience: Minutes after which a training is ended, to be resumed by the next 'congrasp reproduce'.
+
+    Examples:
+      congrasp reproduce --quick
+      congrasp reproduce --captured grab oakink dexycb
     """
     from common.policy.pretrained import pretrained_hands
     from services.cli.console import at_least, tracked

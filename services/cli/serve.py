@@ -29,6 +29,10 @@ def serve(
       watch: How it is watched.
       certs: Folder of a server's certificate (congrasp certs), for its clients and for the learner.
       insecure: Listen beyond loopback without certificates.
+
+    Examples:
+      congrasp serve --policy runs/mine/policy.safetensors
+      congrasp serve --connect tcp/127.0.0.1:7447 --run human
     """
     import contextlib
     import os

@@ -9,6 +9,7 @@ from common.transport.ports import LEARNER_URL
 
 
 def status(
+    run_dir: Annotated[pathlib.Path | None, tyro.conf.Positional] = None,
     connect: str = LEARNER_URL,
     run: str = "quickstart",
     watch: bool = False,
@@ -21,21 +22,32 @@ def status(
     The exit code is 1 where the counters do not add up.
 
     Args:
+      run_dir: Folder of a run whose learner runs on this machine, in place of --connect and --run.
       connect: The learner's endpoint.
       run: Name of the run.
       watch: Go on until Ctrl-C, also while the learner is disconnected.
       every: Seconds between two looks with --watch.
       certs: Folder of an observer's certificate (congrasp certs).
       json: Print JSON instead of tables; with --watch one object a line, and null while the learner is disconnected.
+
+    Examples:
+      congrasp status runs/mine --watch
+      congrasp status --connect tcp/10.0.0.5:7447 --run human --json
     """
     import json as json_module
 
     from rich.console import Console
     from rich.live import Live
 
+    from common.errors import CongraspError
     from common.transport import urls
+    from learner.run_directory import learner_url, open_run
     from services.ops.status import ask, follow, tables
 
+    if run_dir is not None:
+        connect, run = learner_url(run_dir), open_run(run_dir).name
+        if not connect:
+            raise CongraspError(f"No learner is running in {run_dir}.", f"What it recorded: congrasp plot {run_dir}")
     with urls.connect(connect, "observer", certs=certs, run=run) as transport:
         found = ask(transport, run)
         if not watch:

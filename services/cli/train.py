@@ -31,7 +31,7 @@ def train(
     certs: pathlib.Path | None = None,
     insecure: bool = False,
     evaluation: int | None = None,
-    boards: tuple[MetricWriter, ...] = ("tensorboard",),
+    metric_writers: tuple[MetricWriter, ...] = ("tensorboard",),
     metrics_port: int = 0,
 ) -> int:
     """Trains a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
@@ -55,7 +55,7 @@ def train(
       constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp constraints import'); their
         objects are those of --objects.folder, and --objects.procedural puts others beside them.
       split: Of these sets the part for training (the default), what is held out, or all.
-      resume: Go on from the newest intact checkpoint in --run-dir, with the run's own configuration; what the learner
+      resume: Resume from the newest intact checkpoint in --run-dir, with the run's own configuration; what the learner
         alone uses, such as --updates and --ppo.…, may be changed.
       listen: Endpoint where actors of other machines may join, such as tls/0.0.0.0:7447; on this machine alone by
         default.
@@ -63,9 +63,13 @@ def train(
       insecure: Listen beyond loopback without certificates.
       evaluation: Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out. By
         default 64, and before training for the quickstart preset alone.
-      boards: Where the learner's metrics are written, too: tensorboard (files in the run's folder), wandb-offline
-        (files there, for `wandb sync`), wandb (needs an account); with no name none.
+      metric_writers: Where the learner's metrics are written, too: tensorboard (files in the run's folder),
+        wandb-offline (files there, for `wandb sync`), wandb (needs an account); with no name none.
       metrics_port: Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none.
+
+    Examples:
+      congrasp train --preset quickstart --run-dir runs/mine
+      congrasp train --preset human --run-dir runs/human --seed 5
     """
     from services.train.command import run_training
 
@@ -84,7 +88,7 @@ def train(
         evaluation=64 if evaluation is None else evaluation,
         compared=evaluation is not None or preset == "quickstart",
         ranks=ranks,
-        writers=boards,
+        writers=metric_writers,
         metrics_port=metrics_port,
         listen=listen,
         certs=certs,

@@ -1,9 +1,15 @@
 """`congrasp view`: the constraint studio, and the window on a training, in a browser."""
 
 import pathlib
+from typing import Annotated
+
+import tyro
+
+_WAIT = 3.0  # seconds for a learner of this machine
 
 
 def view(
+    run_dir: Annotated[pathlib.Path | None, tyro.conf.Positional] = None,
     objects: pathlib.Path | None = None,
     policy: pathlib.Path | None = None,
     connect: str = "",
@@ -16,12 +22,12 @@ def view(
 ) -> int:
     """Ask for a grasp in the browser and see it: set the heading, paint the avoid region, draw the wrist's path.
 
-    With --connect it takes the newest weights of a run that is being trained and shows the run: its curves, its actors
-    and their episodes. With --recordings a click on a curve finds the episodes of that time.
-
-    Examples: congrasp view --objects my-objects; congrasp view --connect tcp/10.0.0.5:7447 --run mine
+    With a run's folder, or with --connect, it takes the newest weights of a run that is being trained and shows the
+    run: its curves, its actors and their episodes. With --recordings a click on a curve finds the episodes of that
+    time; a folder brings those, too.
 
     Args:
+      run_dir: Folder of a run of this machine, live or over, in place of --connect, --run, --recordings and --policy.
       objects: Your own objects: a mesh, a folder of meshes, or what 'congrasp objects import' made.
       policy: A policy file, read again when it changes; by default the pretrained ones.
       connect: A learner's endpoint, such as tcp/10.0.0.5:7447, to attach to.
@@ -31,10 +37,16 @@ def view(
       port: Port of the page; 0 takes a free one.
       insecure: Offer the page beyond loopback.
       certs: Folder of an observer's certificate (congrasp certs), for --connect.
+
+    Examples:
+      congrasp view runs/mine
+      congrasp view --objects my-objects --port 8080
     """
     from services.ops.shutdown import on_signal
     from services.viz.studio.app import open_view
 
+    if run_dir is not None:
+        connect, run, policy, recordings = _of_folder(run_dir, certs)
     with (
         on_signal() as stop,
         open_view(
@@ -52,6 +64,23 @@ def view(
         print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
         stop.wait()
         return stop.exit_code
+
+
+def _of_folder(run_dir: pathlib.Path, certs: pathlib.Path | None) -> tuple[str, str, pathlib.Path | None, pathlib.Path]:
+    """--connect, --run, --policy and --recordings of a run: its learner if that responds, else its newest policy."""
+    from common.errors import TransportError
+    from common.transport import urls
+    from learner.run_directory import POLICY_FILE, learner_url, open_run
+
+    run, connect = open_run(run_dir).name, learner_url(run_dir)
+    try:
+        if connect:
+            urls.connect(connect, "observer", certs=certs, wait=_WAIT).close()
+            return connect, run, None, run_dir
+    except TransportError:
+        print(f"No response from the learner of {run_dir}: what it left is shown.")
+    policy = run_dir / POLICY_FILE
+    return "", run, policy if policy.is_file() else None, run_dir
 
 
 COMMAND = view

@@ -28,6 +28,10 @@ def warmup(
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
       environments: Environments of an actor; 0: those of the preset.
       rollout_steps: Control steps of a rollout; 0: those of the preset.
+
+    Examples:
+      congrasp warmup --preset human
+      congrasp warmup --preset full --hand my_hand --environments 4096
     """
     from rich.console import Console
 

@@ -8,23 +8,18 @@ import pathlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from common.config import TaskConfig
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.policy.bundle import PolicyBundle, content_hash
-from common.task.constraints import optional
 from common.wire.codec import encode
-from services.evaluate.scores import FORCES, Row, force_cells, paper_cells, rate_cells
+from services.evaluate.model_card import model_card
+from services.evaluate.scores import ERRORS, FORCES, Row, error_title, force_cells, paper_cells, rate_cells, scaled
 from services.record.reader import read_metrics
 from services.viz.plots import draw, encoded, figures
 
 _REPORT = pathlib.Path(__file__).with_suffix(".html")
-_LIMITS = (
-    "What it is for: grasps in simulation, of rigid objects that fit the hand, under its constraints in any "
-    "combination. It observes exact poses and contacts.",
-    "What it is not: it was never run on a physical hand, it does not see soft or jointed objects, and success in "
-    "simulation says nothing about the safety of a robot.",
-)
+_FEW = 100
+"""Episodes of a row below which its figures are a first look."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +60,7 @@ def write_report(
     curves: Sequence[Picture],
     commands: Commands,
     check: HandCheck | None = None,
+    motion: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes the report, whole or not at all.
 
@@ -78,15 +74,19 @@ def write_report(
       curves: of the training, where it was recorded.
       commands: that make its parts again.
       check: the self-check of the hand, where it was made.
+      motion: a grasp to turn around (`services.evaluate.turntable`).
 
     Raises:
       CongraspError: jinja2 is absent, or the file cannot be written.
     """
+    errors = [name for names in ERRORS.values() for name in names.values() if _measured(name, rows)]
     text = template().render(
         title=f"Grasping policy of the {policy.spec.hand} hand, version {policy.version}",
         summary=_summary(rows),
         conditions=conditions,
-        rates=[{"cells": _compared(row), "verdict": _verdict(row)} for row in rows],
+        warning=_warning(rows),
+        errors=[error_title(name) for name in errors],
+        rates=[_compared(row, errors) for row in rows],
         forces={"columns": FORCES, "rows": [force_cells(row) for row in rows]},
         command=commands.table,
         sheets=[embedded(sheet) for sheet in sheets],
@@ -95,7 +95,8 @@ def write_report(
         curves_command=commands.curves,
         check=check and {**vars(check), "sheet": embedded(Picture("self-check", check.sheet))},
         facts=_facts(policy, name),
-        limits=_LIMITS,
+        motion=motion,
+        card=model_card(policy, rows),
     )
     write_atomically(out, text.encode())
 
@@ -115,14 +116,31 @@ def template(path: pathlib.Path = _REPORT) -> Any:
 def curves_of(run_dir: pathlib.Path) -> Iterator[Picture]:
     """Figures of a run's recordings, if it has any."""
     if any(run_dir.rglob("*.mcap")):
-        series = read_metrics(run_dir)
-        for title, panels in figures(series).values():
-            yield Picture(title, encoded(draw(title, panels, series)))
+        runs = {run_dir.name: read_metrics(run_dir)}
+        for title, panels in figures(runs).values():
+            yield Picture(title, encoded(draw(title, panels, runs)))
 
 
 def count_causes(causes: Sequence[str]) -> str:
     """Such as "2 held, 1 slipped 0.82 s after the table was removed"."""
     return ", ".join(f"{count} {cause}" for cause, count in collections.Counter(causes).items())
+
+
+def _measured(error: str, rows: Sequence[Row]) -> bool:
+    """Whether one of the rows has this error."""
+    return any(row.errors.get(error) is not None for row in rows)
+
+
+def _warning(rows: Sequence[Row]) -> str:
+    """That rows have too few episodes to be quoted; empty where they have enough."""
+    fewest = min((row.episodes for row in rows), default=_FEW)
+    if fewest >= _FEW:
+        return ""
+    width = max(row.success_high - row.success_low for row in rows)
+    return (
+        f"First look: rows of {fewest} episodes, fewer than {_FEW}, with intervals of {100 * width:.0f} points. "
+        "Do not quote these figures or compare policies by them; --episodes 200 makes better ones."
+    )
 
 
 def _summary(rows: Sequence[Row]) -> str:
@@ -137,11 +155,13 @@ def _summary(rows: Sequence[Row]) -> str:
     )
 
 
-def _compared(row: Row) -> tuple[str, ...]:
-    """A row's cells: rates, then errors, each followed by the paper's."""
-    name, episodes, objects, success, held, errors, _ = rate_cells(row)
-    rate, paper_errors = paper_cells(row)
-    return name, episodes, objects, success, rate, held, errors, paper_errors
+def _compared(row: Row, errors: Sequence[str]) -> Mapping[str, Any]:
+    """A row for the template: its rates, the paper's success, and pairs of errors, its own and the paper's."""
+    name, episodes, objects, success, held, _, _ = rate_cells(row)
+    paper = row.paper.errors if row.paper else {}
+    pairs = [(scaled(error, row.errors.get(error)), scaled(error, paper.get(error))) for error in errors]
+    cells = {"name": name, "episodes": episodes, "objects": objects, "success": success, "held": held}
+    return {**cells, "paper": paper_cells(row)[0], "errors": pairs, "verdict": _verdict(row)}
 
 
 def _verdict(row: Row) -> str:
@@ -156,12 +176,6 @@ def embedded(picture: Picture) -> Mapping[str, Any]:
     return {"title": picture.title, "caption": picture.caption, "image": base64.b64encode(picture.png).decode()}
 
 
-def _trained(task: TaskConfig) -> str:
-    """Probabilities of the constraints in training."""
-    parts = [f"{part.title} in {100 * getattr(task, f'p_{part.name}'):.0f} %" for part in optional(task)]
-    return f"headings: {task.headings}; of the episodes {', '.join(parts)}"
-
-
 def _facts(policy: PolicyBundle, name: str) -> list[tuple[str, str]]:
     """Names and values of the last table."""
     task, network = policy.task, policy.spec.network
@@ -170,7 +184,6 @@ def _facts(policy: PolicyBundle, name: str) -> list[tuple[str, str]]:
         ("content", content_hash(encode(policy.to_message()))),
         ("hand", policy.spec.hand),
         ("trained on", f"{policy.transitions:,} environment steps, version {policy.version}"),
-        ("constraints in training", _trained(task)),
         ("observation", f"{sum(size for _, size in policy.spec.layout)} numbers"),
         ("action", f"{policy.spec.action_size} numbers, {1 / task.control_dt:g} times a second"),
         ("network", f"{' - '.join(map(str, network.hidden))}, encoders of {network.encoder}"),

@@ -1,11 +1,12 @@
 """Evaluates a policy and writes its report: what `congrasp report` and `congrasp hands train` end with."""
 
 import pathlib
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from actors.physics import PhysicsName, resolve_physics
 from common.config import ObjectsConfig
+from common.engines import engine_title
 from common.errors import CongraspError
 from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.parallel import cores
@@ -16,6 +17,7 @@ from services.evaluate.failures import failure_sheets
 from services.evaluate.protocol import objects_label, two_seconds
 from services.evaluate.report import Commands, HandCheck, Picture, count_causes, curves_of, template, write_report
 from services.evaluate.scores import TABLES, Row, known_rows
+from services.evaluate.turntable import turntable
 from services.viz.sheets import png_of
 
 _PICTURED = 4
@@ -82,6 +84,15 @@ def report_on(
     )
     commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
     which = f"{len(given)} objects ({objects_label(policy, objects)})"
-    how = f"{episodes} episodes a row on {which}, engine {engine}, seed {seed}"
-    write_report(out, policy, file.name, rows, how, sheets, curves, commands, check)
+    how = f"{episodes} episodes a row on {which}, {engine_title(engine)}, seed {seed}"
+    write_report(out, policy, file.name, rows, how, sheets, curves, commands, check, _motion(evaluator, names))
     return Reported(rows, left_out)
+
+
+def _motion(evaluator: Evaluator, names: Sequence[str]) -> Mapping[str, Any] | None:
+    """A success of the first row that has one, to turn around; a failure if none has."""
+    for successes, failures in ((1, 0), (0, 1)):
+        for name in names:
+            for episode in evaluator.examples(name, successes, failures):
+                return {**turntable(episode), "constraint": name}
+    return None

@@ -396,6 +396,21 @@ def object_table(rows: Sequence[Row]) -> Any:
     return table
 
 
+_FOR_PEOPLE = {"rad": ("°", 180 / np.pi), "m": ("mm", 1000.0), "": ("%", 100.0)}
+"""Unit and factor in which errors are shown, by the unit in which they are kept."""
+
+
+def error_title(name: str) -> str:
+    """Heading of an error's column, such as "heading, mm"."""
+    constraint = next(constraint for constraint, names in ERRORS.items() if name in names.values())
+    return f"{constraint}, {_FOR_PEOPLE[_UNITS[name]][0]}"
+
+
+def scaled(name: str, error: float | None) -> str:
+    """An error under `error_title`; empty where there is none."""
+    return "" if error is None else f"{_FOR_PEOPLE[_UNITS[name]][1] * error:.1f}"
+
+
 def _name(row: Row) -> str:
     """Constraint and group."""
     return f"{row.constraint}, {row.group}" if row.group else row.constraint

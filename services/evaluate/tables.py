@@ -57,7 +57,7 @@ class Setup:
     folder: pathlib.Path | None = None
     """Objects of the table `objects`; procedural ones if there is none."""
     keep: pathlib.Path | None = None
-    """Where results of its pools are kept, to go on from."""
+    """Where results of its pools are kept, to resume from."""
 
 
 class Found(NamedTuple):

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.errors import CongraspError
+from common.files import check_free
 from services.export.frames import TOLERANCE_MM, error_mm
 from services.export.motion_file import GraspMotion, load_motion, motion_of_episode
 from services.record.reader import pick_episode
@@ -49,20 +50,24 @@ def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -
     return motion_of_episode(pick_episode(path, index, success=success))
 
 
-def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path, *, camera: bool = False) -> float:
+def export_motions(
+    motions: Sequence[GraspMotion], kind: str, path: pathlib.Path, *, camera: bool = False, force: bool = False
+) -> float:
     """Writes motions in a format, reads the file back and compares.
 
     Args:
       motions: one, or several where the format takes them.
       kind: one of `FORMATS`.
-      path: the file or folder to write; a file that is there is replaced, a folder is not.
+      path: the file or folder to write.
       camera: also film them, where the format has videos.
+      force: replace a file that is there; a folder is never replaced.
 
     Returns:
       The largest error in mm (see `services.export.frames.error_mm`).
 
     Raises:
-      CongraspError: the error is above `TOLERANCE_MM`, and nothing was written; or `path` cannot be written.
+      CongraspError: the error is above `TOLERANCE_MM`, and nothing was written; or `path` is there already, or
+        cannot be written.
     """
     if len(motions) > 1 and kind not in SEVERAL:
         raise CongraspError(f"A {kind} file holds one motion, and {len(motions)} were named.", "Name one at a time.")
@@ -73,6 +78,7 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
         raise CongraspError(f"The name of a {kind} file ends in {suffix}, and {path} does not.", f"Use --out {name}")
     if path.is_dir():
         raise CongraspError(f"The folder {path} is there already.", "Remove it or name another with --out.")
+    check_free(path, force=force)
     for motion in motions:
         _check(motion)
     module = importlib.import_module(f"services.export.{kind}")
@@ -93,11 +99,19 @@ def export_motions(motions: Sequence[GraspMotion], kind: str, path: pathlib.Path
                 f"The {kind} file is off by {worst:.3g} mm; {TOLERANCE_MM} mm is let through.",
                 "Nothing was written. Is the motion's file intact?",
             )
-        for made in workplace.iterdir():
-            made.replace(path.with_name(made.name))
+        made = sorted(workplace.iterdir())
+        for file in made:
+            check_free(path.with_name(file.name), force=force)
+        for file in made:
+            file.replace(path.with_name(file.name))
     finally:
         shutil.rmtree(workplace, ignore_errors=True)
     return worst
+
+
+def default_name(motion: GraspMotion, kind: str) -> pathlib.Path:
+    """Where a motion goes unless told otherwise: the object's name in the working directory."""
+    return pathlib.Path(f"{motion.object}{FORMATS[kind] or f'-{kind}'}")
 
 
 def _check(motion: GraspMotion) -> None:

@@ -225,9 +225,9 @@ def _run_onnx(encoded: bytes, observations: np.ndarray) -> np.ndarray:
 
 def _stablehlo(bundle: PolicyBundle) -> bytes:
     """A ZIP with `policy.jax` (for `jax.export.deserialize`), `policy.mlirbc` (portable StableHLO) and `meta.json`."""
-    layout, acting = bundle.spec.layout, jax.device_get(bundle.inference_parameters)
+    layout, parameters = bundle.spec.layout, jax.device_get(bundle.inference_parameters)
     size = sum(width for _, width in layout)
-    function = jax.jit(lambda observation: mean_action(layout, acting, observation))
+    function = jax.jit(lambda observation: mean_action(layout, parameters, observation))
     batch = jax.export.symbolic_shape("batch")[0]
     argument = jax.ShapeDtypeStruct((batch, size), jnp.float32)
     exported = jax.export.export(function, platforms=_PLATFORMS)(argument)

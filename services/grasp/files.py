@@ -29,6 +29,7 @@ from services.viz.sheets import save_png
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
 PORTRAIT = "portrait.png"
 """Its last frame, 1280 x 720, with a view from the thumb's side."""
+_FORMAT = 2  # of result.json: what was written with another is done anew
 THUMBNAIL = "thumbnail.png"
 """A picture of its last frame."""
 OBJECT = "object.png"
@@ -100,4 +101,4 @@ def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
 
 def key_of(*parts: Any) -> str:
     """Sixteen hex digits that change when anything that makes a grasp does."""
-    return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps((_FORMAT, *parts), default=str).encode()).hexdigest()[:16]

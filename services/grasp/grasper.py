@@ -43,7 +43,7 @@ HOLD_SECONDS = 2.0
 """How long the object should be held without the table."""
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
 _SCALES |= {"moved_at_removal": 0.03, "force_link_max": 10.0, "slip": 0.02}
-"""What weighs as much as one another, among grasps that hold: errors, the object's way before the table goes (m), the
+"""What weighs as much as one another, among grasps that hold: errors, the object's way before table removal (m), the
 strongest link's force (N), and the object's way after it went (m)."""
 _UNLIKELY = 0.5
 """What each likelier resting pose weighs against a grasp, likewise."""
@@ -84,8 +84,8 @@ class Grasp:
             "hand": self.motion.hand,
             "success": self.success,
             "held_quarter_second": self.motion.success,
-            "tries": self.attempts,
-            "tries_held": self.held,
+            "attempts": self.attempts,
+            "attempts_held": self.held,
             "rest": self.rest + 1,
             "phases": self.motion.about.get("phases", {}),
             "constraints": list(self.motion.constraints),
@@ -220,8 +220,8 @@ class Grasper:
         labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
         about = {
             "actor": "grasp",
-            "tries": attempts,
-            "tries_held": held,
+            "attempts": attempts,
+            "attempts_held": held,
             "object_file_scale": obj.file_scale,
             "object_file_origin": [-x for x in obj.origin],
         }

@@ -65,7 +65,7 @@ class Result(NamedTuple):
             return self.error
         facts = self.facts
         outcome = "held" if facts["success"] else "not held"
-        best = f"best of {facts['tries']} attempts, {facts['tries_held']} of which hold it"
+        best = f"best of {facts['attempts']} attempts, {facts['attempts_held']} of which hold it"
         errors = [f"{what} {_shown(facts, stem)}" for stem, what in _ERRORS.items() if f"{stem}_m" in facts]
         if "affordance_ratio" in facts:
             errors.append(f"{100 * facts['affordance_ratio']:.0f} % of the touches where there should be none")
@@ -210,8 +210,8 @@ def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> Non
     if drawn:
         images = [np.asarray(Image.open(out / result.name / THUMBNAIL).convert("RGB")) for result in drawn]
         labels = [
-            f"{r.name}: {'held' if r.facts['success'] else 'NOT HELD'}, {r.facts['tries_held']} of {r.facts['tries']}"
-            for r in drawn
+            f"{name}: {'held' if facts['success'] else 'NOT HELD'}, {facts['attempts_held']} of {facts['attempts']}"
+            for name, facts, *_ in drawn
         ]
         title = f"{hand} hand: {held} of {len(rows)} objects held for two seconds without the table"
         save_png(out / SHEET, contact_sheet(images, labels, columns=min(_COLUMNS, len(drawn)), title=title))

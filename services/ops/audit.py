@@ -124,7 +124,7 @@ class _Session:
     """What a session of a learner began with, and what it noted of rollouts that it did not use."""
 
     life: str
-    epoch: str
+    run_id: str
     version: int
     max_staleness: int
     kept: bool
@@ -266,7 +266,7 @@ def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
 
 def _without_trace(identity: Identity, version: int, last: _Session, after: _Session, *, undone: bool) -> str:
     """Why the session after the last that had a rollout did not take it up; it is lost if there is no reason."""
-    if abs(version - after.version) > after.max_staleness or after.epoch != last.epoch:
+    if abs(version - after.version) > after.max_staleness or after.run_id != last.run_id:
         return "undone" if undone else "too old after a restart"
     if not last.kept or identity in last.unwritten or after.falls_back:
         return "undone" if undone else "not kept on disk"

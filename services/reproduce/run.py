@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 
 from actors.physics import resolve_physics
+from common.engines import engine_title
 from common.errors import CongraspError
 from common.policy.pretrained import pretrained_file
 from common.task.methods import get_method
@@ -186,7 +187,7 @@ def _account(
     ]
     conditions = (
         f"{numbers.episodes} episodes a row on {numbers.pool} held-out procedural objects, {numbers.many} on many "
-        f"objects, engine {numbers.physics}, friction {numbers.friction:g}, seed {numbers.seed}."
+        f"objects, {engine_title(numbers.physics)}, friction {numbers.friction:g}, seed {numbers.seed}."
     )
     cells = compare(results, found.absent, request.hands)
     return Account(list(results), cells, where, list(failures), conditions, request.command, curves, seconds)

@@ -33,7 +33,7 @@ class PolicyClient(EpisodePolicy):
           certs: folder of a client's certificate, for a server that asks for one.
 
         Raises:
-          TransportError: nobody is there.
+          TransportError: there is no response.
         """
         super().__init__()
         self._transport = urls.connect(connect, "client", certs=certs, wait=wait)

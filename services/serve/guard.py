@@ -39,7 +39,7 @@ class Counters:
     """Steps in which no answer came, neither of this one's state nor of an earlier one's."""
     stale: int = 0
     """Answers that were thrown away because their state was too old."""
-    bad: int = 0
+    invalid: int = 0
     """Answers that were thrown away because they were not finite or misshapen."""
     lost: int = 0
     """Queries without an answer."""
@@ -205,7 +205,7 @@ class Guard:
             return
         wanted = np.append(as_numbers(answer.q_target, self._fingers), as_numbers(answer.u_target, 6))
         if not np.isfinite(wanted).all():
-            self.counters.bad += 1
+            self.counters.invalid += 1
         elif not 0.0 <= self._clock() - asked <= self._stale:
             self.counters.stale += 1
         else:

@@ -63,7 +63,7 @@ class Policy(Protocol):
         Raises:
           RefusedError: the request or the state is bad. Its subclasses in `common.errors` tell what a program can act
             on: an unknown constraint, a contradiction, an overloaded server, a deadline that passed there.
-          TransportError: the server is away.
+          TransportError: there is no response from the server.
         """
         ...
 

@@ -206,7 +206,7 @@ class PolicyServer:
                 if newer is not None:
                     self._swap(newer)
             except TransportError:
-                continue  # the learner is away; it may come back
+                continue  # the learner is disconnected; it may come back
             except CongraspError as error:
                 if str(error) != self._trouble:
                     log("warning", str(error))

@@ -40,7 +40,7 @@ from services.train.processes import engine_of, leave_gpus_to, train
 from services.viz.render import episode_sheet
 from services.viz.sheets import save_png
 
-EPISODE, SHIPPED = "episode.png", "shipped.png"
+EPISODE, PRETRAINED = "episode.png", "pretrained.png"
 _EVALUATION_OBJECTS = 12
 _SEEDS = 3
 _LINE_SECONDS = 10.0
@@ -132,7 +132,7 @@ def run_training(
                         notify=lambda text: console.print(f"  [yellow]{text}[/]", soft_wrap=True),
                     )
         if stop.is_set():
-            console.print(f"Stopped. Go on with: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
+            console.print(f"Stopped. Resume with: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
             return stop.exit_code
         console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
         if evaluation:
@@ -376,7 +376,7 @@ def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> 
 def _pretrained_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
     """What the same kind of policy does after training on the full task."""
     with console.status("The policy that comes with congrasp …") as status:
-        grasps = showcase(bundles.load(policy), run_dir / SHIPPED, lambda text: status.update(f"{text} …"))
+        grasps = showcase(bundles.load(policy), run_dir / PRETRAINED, lambda text: status.update(f"{text} …"))
     console.print(
         f"The policy that comes with congrasp, trained on the full task: {sum(grasps.values())} of {len(grasps)} "
         f"grasps, one under each constraint ({', '.join(grasps)}).",
@@ -389,7 +389,7 @@ def _next_steps(run_dir: pathlib.Path) -> None:
     congrasp = _command()
     pictures = (
         (EPISODE, "an episode of the trained policy"),
-        (SHIPPED, "a grasp under each of the four constraints, by the policy that comes with congrasp"),
+        (PRETRAINED, "a grasp under each of the four constraints, by the policy that comes with congrasp"),
     )
     rows = [(str(run_dir / name), why) for name, why in pictures if (run_dir / name).exists()]
     rows += [

@@ -116,15 +116,14 @@ def train(
     logs = run_dir / "logs"
     logs.mkdir(exist_ok=True)
     learners = _learners(run_dir, listen, connect[0], ranks=ranks, inside=not actors, gpus=gpus)
-    learners[0].arguments += ["--metrics-port", str(metrics_port), "--boards", *writers]
+    learners[0].arguments += ["--metrics-port", str(metrics_port), "--metric-writers", *writers]
     children = _actors(run_dir, config.name, connect, ranks=ranks, actors=actors, physics=physics)
     try:
         for child in (*learners, *children):
             child.start()
         transport = _connect(connect[0], learners[0], stop, certs)
         if transport is not None:
-            watch = f"congrasp view --connect {connect[0]} --run {config.name} --recordings {run_dir}"
-            notify(" ".join([f"Watch it in the browser with: {watch}", *certificates]))
+            notify(" ".join([f"Watch it in the browser with: congrasp view {run_dir}", *certificates]))
             with transport:
                 _supervise(learners, children, transport, config.name, stop, report, notify)
     finally:

@@ -1,4 +1,4 @@
-"""Commands in processes of their own, which nobody watches; a training goes on from its last checkpoint."""
+"""Commands in processes of their own, which nobody watches; a training resumes from its last checkpoint."""
 
 import json
 import pathlib

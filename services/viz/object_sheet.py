@@ -77,7 +77,7 @@ def rests_sheet(obj: GraspObject) -> np.ndarray:
 
 
 def overview(objects: Sequence[GraspObject]) -> np.ndarray:
-    """(H, W, 3) uint8: each object as it lies most often, its graspable region green and its avoid region red."""
+    """(H, W, 3) uint8: each object at rest as most likely, its graspable region green and its avoid region red."""
     images, titles = [], []
     for obj in objects:
         shape = _painted(obj)

@@ -12,25 +12,18 @@ from common.errors import CongraspError
 from common.files import write_atomically
 from services.record.palette import INK
 from services.record.reader import read_metrics
+from services.viz.titles import titled
 
 Series = Mapping[str, tuple[np.ndarray, np.ndarray]]
+"""Steps and values of each metric of a run, by `<role>/<name>/<metric>`."""
+Runs = Mapping[str, Series]
+"""Runs by their names for a legend."""
 _COLUMNS = 4
 QUIET, _GRID = "#6b7280", "#e3e6ea"
 COLOURS = ("#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a", "#c2478f", "#6b7280")
+_MEANINGLESS = {"episode/object_index"}
 _LEGEND = 8
 """Lines of one panel that a legend still names."""
-_UNITS = {
-    "_per_second": "1/s",
-    "_seconds": "s",
-    "_rad": "rad",
-    "_m": "m",
-    "_bytes": "bytes",
-    "_ratio": "share",
-    "kl": "nats",
-    "entropy": "nats",
-    "fraction": "share",
-    "episode/length": "control steps",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,28 +35,27 @@ class Panel:
     metrics: tuple[str, ...]
 
 
+def _panel(metric: str) -> Panel:
+    """A panel of one metric."""
+    return Panel(*titled(metric), (metric,))
+
+
 LEARNING = (
-    Panel("Return of an episode", "reward", ("episode/return",)),
-    Panel("Success", "share of episodes", ("episode/success",)),
-    Panel("Links in contact at the table's removal", "links", ("episode/links_at_removal",)),
-    Panel("Throughput", "control steps/s", ("steps_per_second",)),
+    *map(_panel, ("episode/return", "episode/success", "episode/links_at_removal", "steps_per_second")),
     Panel("Policy lag", "versions", ("staleness_mean", "staleness_max")),
-    Panel("KL of an update", "nats", ("kl",)),
-    Panel("Policy loss", "", ("policy_loss",)),
-    Panel("Value loss", "", ("value_loss",)),
-    Panel("Explained variance of the critic", "share", ("explained_variance",)),
-    Panel("Standard deviation of actions", "action units", ("action_std",)),
-    Panel("Learning rate", "", ("learning_rate",)),
-    Panel("Clipped samples", "share", ("clip_fraction",)),
+    *map(_panel, ("kl", "policy_loss", "value_loss", "explained_variance")),
+    *map(_panel, ("action_std", "learning_rate", "clip_fraction")),
 )
 """Panels of the first figure; those without data are left out."""
 
 
-def plot_run(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str] = ("png", "pdf")) -> list[pathlib.Path]:
-    """Draws a run.
+def plot_runs(
+    paths: Sequence[pathlib.Path], out: pathlib.Path, formats: Sequence[str] = ("png", "pdf")
+) -> list[pathlib.Path]:
+    """Draws runs, several over one another.
 
     Args:
-      path: a run's folder, or one MCAP file.
+      paths: runs' folders, or MCAP files.
       out: folder for the figures.
       formats: of the files: png, pdf.
 
@@ -73,13 +65,21 @@ def plot_run(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str] = ("p
     Raises:
       CongraspError: there are no metrics, or a file cannot be written.
     """
-    series = read_metrics(path)
-    if not series:
-        raise CongraspError(f"The recordings in {path} hold no metrics.", "Was the learner recorded?")
+    runs = {}
+    for path, label in zip(paths, _labels(paths), strict=True):
+        runs[label] = read_metrics(path)
+        if not runs[label]:
+            raise CongraspError(f"The recordings in {path} hold no metrics.", "Was the learner recorded?")
     written = []
-    for name, (title, panels) in figures(series).items():
-        written += save(draw(title, panels, series), out / name, formats)
+    for name, (title, panels) in figures(runs).items():
+        written += save(draw(title, panels, runs), out / name, formats)
     return written
+
+
+def _labels(paths: Sequence[pathlib.Path]) -> list[str]:
+    """Names of runs for a legend: their folders', or the whole paths where two have the same."""
+    names = [path.resolve().name for path in paths]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 
 def save(figure: Any, stem: pathlib.Path, formats: Sequence[str]) -> list[pathlib.Path]:
@@ -120,26 +120,46 @@ def style(axes: Any, title: str, x: str, y: str) -> None:
         side.set_visible(False)
 
 
-def figures(series: Series) -> dict[str, tuple[str, list[Panel]]]:
-    """Title and panels of each figure by file name; every metric of `series` is in exactly one of them."""
-    present = {_metric(name) for name in series}
+def figures(runs: Runs) -> dict[str, tuple[str, list[Panel]]]:
+    """Title and panels of each figure by file name.
+
+    Every metric of the runs is in exactly one panel, but for those that mean nothing as a mean, and those outside of
+    the learning curves that have one value throughout.
+    """
+    names = {_metric(name) for series in runs.values() for name in series} - _MEANINGLESS
     learning = [
         dataclasses.replace(panel, metrics=shown)
         for panel in LEARNING
-        if (shown := tuple(metric for metric in panel.metrics if metric in present))
+        if (shown := tuple(metric for metric in panel.metrics if metric in names))
     ]
-    rest = sorted(present - {metric for panel in learning for metric in panel.metrics})
+    rest = sorted(names - {metric for panel in learning for metric in panel.metrics} - _constants(runs))
     groups = {
         "learning": ("Learning", learning),
-        "reward_terms": ("Reward terms, sum over an episode", _panels(rest, "term/", "reward")),
-        "episodes": ("Episodes", _panels(rest, "episode/", "")),
+        "reward_terms": ("Reward terms, sum over an episode", _panels(rest, "term/")),
+        "episodes": ("Episodes", _panels(rest, "episode/")),
         "details": ("Details", [_panel(m) for m in rest if not m.startswith(("term/", "episode/"))]),
     }
     return {name: group for name, group in groups.items() if group[1]}
 
 
-def draw(title: str, panels: Sequence[Panel], series: Series) -> Any:
-    """One figure of small multiples; a line is named after its process, and its metric where there are two."""
+def _constants(runs: Runs) -> set[str]:
+    """Metrics of which every curve, of several points, has one and the same value."""
+    values: dict[str, list[np.ndarray]] = {}
+    for series in runs.values():
+        for name, (_, found) in series.items():
+            values.setdefault(_metric(name), []).append(found[np.isfinite(found)])
+    return {
+        metric
+        for metric, found in values.items()
+        if all(len(curve) > 1 for curve in found) and len(np.unique(np.concatenate(found))) == 1
+    }
+
+
+def draw(title: str, panels: Sequence[Panel], runs: Runs) -> Any:
+    """One figure of small multiples.
+
+    A line is named after its process, or its run where there are several, and its metric where the panel has two.
+    """
     columns = min(_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     figure = new_figure(3.6 * columns, 0.6 + 2.5 * rows, title)
@@ -147,9 +167,14 @@ def draw(title: str, panels: Sequence[Panel], series: Series) -> Any:
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     for axes, panel in zip(grid.flat, panels, strict=False):
-        lines = [name for name in series if _metric(name) in panel.metrics]
-        for i, name in enumerate(lines):
-            _curve(axes, *series[name], COLOURS[i % len(COLOURS)], _label(name, panel))
+        lines = [
+            (_label(run, name, panel, runs), *curve)
+            for run, series in runs.items()
+            for name, curve in series.items()
+            if _metric(name) in panel.metrics
+        ]
+        for i, (label, steps, values) in enumerate(lines):
+            _curve(axes, steps, values, COLOURS[i % len(COLOURS)], label)
         style(axes, panel.title, "update", panel.unit)
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4), useOffset=False)
         axes.yaxis.get_offset_text().set(fontsize=7, color=QUIET)
@@ -186,19 +211,16 @@ def _metric(name: str) -> str:
     return name.split("/", 2)[2]
 
 
-def _label(name: str, panel: Panel) -> str:
+def _label(run: str, name: str, panel: Panel, runs: Runs) -> str:
     """The line's name in a legend."""
     role, process, metric = name.split("/", 2)
-    return f"{role} {process}" if len(panel.metrics) == 1 else metric.replace("_", " ")
+    processes = {found.rpartition(f"/{metric}")[0] for found in runs[run] if _metric(found) == metric}
+    who = process if process.startswith(role) else f"{role} {process}"
+    several = who if len(processes) > 1 or len(runs) == 1 else ""
+    words = [run if len(runs) > 1 else "", several if len(panel.metrics) == 1 or len(runs) > 1 else ""]
+    return ", ".join(word for word in (*words, titled(metric)[0] if len(panel.metrics) > 1 else "") if word)
 
 
-def _panels(metrics: Sequence[str], prefix: str, unit: str) -> list[Panel]:
+def _panels(metrics: Sequence[str], prefix: str) -> list[Panel]:
     """A panel for each metric with a prefix."""
-    return [_panel(metric, prefix, unit) for metric in metrics if metric.startswith(prefix)]
-
-
-def _panel(metric: str, prefix: str = "", unit: str = "") -> Panel:
-    """A panel of one metric, with the unit that its name implies."""
-    words = metric.removeprefix(prefix)
-    found = next((unit for end, unit in _UNITS.items() if metric.endswith(end)), unit)
-    return Panel(words.replace("/", ": ").replace("_", " ").capitalize(), found, (metric,))
+    return [_panel(metric) for metric in metrics if metric.startswith(prefix)]

@@ -35,7 +35,7 @@ def bundle() -> PolicyBundle:
         observation=Statistics(np.float64(2**40 + 1), rng.normal(size=17), rng.random(17) * 2**40),
         value=Statistics(np.float64(7), np.float64(-3.0), np.float64(28.0)),
         version=12,
-        epoch="ab12",
+        run_id="ab12",
         transitions=3_000_000_000,
     )
 
@@ -45,7 +45,7 @@ def test_file_keeps_everything_exactly(bundle, tmp_path):
     bundles.save(bundle, path)
     loaded = bundles.load(path)
     assert (loaded.spec, loaded.task) == (bundle.spec, bundle.task)
-    assert (loaded.version, loaded.epoch, loaded.transitions) == (12, "ab12", 3_000_000_000)
+    assert (loaded.version, loaded.run_id, loaded.transitions) == (12, "ab12", 3_000_000_000)
     for name in ("params", "observation", "value"):
         jax.tree.map(np.testing.assert_array_equal, getattr(loaded, name), jax.device_get(getattr(bundle, name)))
     assert loaded.observation.count == 2**40 + 1

@@ -71,7 +71,7 @@ def test_a_run_from_beginning_to_end(tmp_path, hub):
 
     assert (last.version, last.transitions) == (3, 3 * 2 * 8)
     shipped = bundles.load(tmp_path / "policy.safetensors")
-    assert (shipped.version, shipped.epoch) == (3, last.epoch)
+    assert (shipped.version, shipped.run_id) == (3, last.run_id)
     jax.tree.map(np.testing.assert_array_equal, shipped.params, jax.device_get(last.params))
     assert open_run(tmp_path) == CONFIG
     assert (tmp_path / "checkpoints" / "latest").resolve().name == "checkpoint_000000003.safetensors"
@@ -101,7 +101,7 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
     assert ppo._optimise._cache_size() == compiled
     actor.join(10.0)
     assert actor.ended == "The run is finished."
-    assert (last.version, last.transitions, last.epoch) == (6, 6 * 2 * 8, first.epoch)
+    assert (last.version, last.transitions, last.run_id) == (6, 6 * 2 * 8, first.run_id)
     assert open_run(tmp_path).updates == 6
     assert actor.versions == sorted(actor.versions)
 
@@ -190,7 +190,7 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     (kept / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
     (tmp_path / "version").write_bytes(bytes(21))
     policy = (tmp_path / "policy.safetensors").read_bytes()
-    with pytest.raises(CongraspError, match=r"holds checkpoints of a run\. Go on with --resume"):
+    with pytest.raises(CongraspError, match=r"holds checkpoints of a run\. Continue with --resume"):
         learn(tmp_path, hub)
     seen, said = [], []
     learn(
@@ -290,7 +290,7 @@ def test_training_goes_on_from_a_given_policy(tmp_path, hub):
     given = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
     create_run(tmp_path / "two", CONFIG, given)
     begun = learn(tmp_path / "two", hub, CONFIG, stopped)
-    assert begun.version == 0 and begun.epoch != given.epoch
+    assert begun.version == 0 and begun.run_id != given.run_id
     jax.tree.map(np.testing.assert_array_equal, begun.params, given.params)
     other = dataclasses.replace(given, spec=dataclasses.replace(given.spec, hand="claw"))
     with pytest.raises(CongraspError, match=r"'claw'.*'human'"):

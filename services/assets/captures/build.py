@@ -34,7 +34,7 @@ Affordance = Literal["auto", "parts", "contacts", "none"]
 _TOUCHED = 0.03
 """Metres around touched points that count as touched."""
 _VERTICES = 3
-"""Contact points that make a part of an object one of O+ (paper)."""
+"""Contact points that make a part of an object graspable (O+ in the paper)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Options:
     headings: Literal["sampled", "demonstrated"] = "sampled"
     """sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps."""
     affordance: Affordance = "auto"
-    """parts: O+ are the labelled parts that fingers touch; contacts: what fingers touch; auto: parts if labelled."""
+    """parts: graspable are labelled parts that fingers touch; contacts: what they touch; auto: parts if labelled."""
     beyond: float = BEYOND
     """Radians by which a captured joint may exceed its limits; it is then moved to the limit. For `human` alone."""
     waypoints: int = 15
@@ -162,7 +162,7 @@ def _shape(
 def _labelled(
     sequence: Sequence, obj: GraspObject, demonstration: Demonstration, affordance: Affordance
 ) -> GraspObject:
-    """The object with the partition into O+ and O- that the grasp shows, under a name of its own."""
+    """The object with the partition into graspable and avoid region that the grasp shows, under a name of its own."""
     names, clouds = _parts(sequence, obj)
     if affordance == "none" or (affordance == "auto" and not names):
         return obj
@@ -196,7 +196,7 @@ def _with_region(sequence: Sequence, make: Callable[[], GraspObject]) -> GraspOb
     try:
         return make()
     except CongraspError as error:
-        raise Dropped(sequence.name, "O+ too small", str(error).split(". ")[0]) from None
+        raise Dropped(sequence.name, "graspable region too small", str(error).split(". ")[0]) from None
 
 
 def _nearest(clouds: list[np.ndarray], points: np.ndarray) -> np.ndarray:

@@ -291,7 +291,7 @@ def _labels(
     points: np.ndarray,
     face: np.ndarray,
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Names of the parts, which of them form O+, and the part (N,) of each surface point."""
+    """Names of the parts, which of them form the graspable region, and the part (N,) of each surface point."""
     if source.parts_are_pieces:
         ends = np.cumsum([len(mesh.faces) for mesh in meshes])
         labels = np.searchsorted(ends, face, side="right")

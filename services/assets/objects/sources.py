@@ -28,7 +28,7 @@ class MeshFile:
     part: str = ""
     """Name of the part that it shows."""
     graspable: bool = True
-    """Whether that part belongs to O+."""
+    """Whether that part may be grasped."""
 
 
 @dataclasses.dataclass(frozen=True)

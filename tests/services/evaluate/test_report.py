@@ -9,19 +9,25 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from common.config import NetworkConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
+from common.hands import known_hand
 from common.policy import bundle as bundles
 from services.assets.hands.check import Finding, write_findings
 from services.cli import main
+from services.evaluate.model_card import limits
 from services.evaluate.report import Commands, Picture, count_causes, curves_of, write_report
 from services.evaluate.reporting import Reported
+from services.evaluate.turntable import turntable
 from services.record.channels import JsonChannels
 from services.record.writer import LogWriter
 from services.train.command import untrained
 from services.train.presets import get_preset
+from services.viz.shapes import hand_shape
 from services.viz.sheets import save_png
+from tests.episodes import episode
 from tests.pages import Reader
 from tests.rows import row as made_row
 
@@ -52,7 +58,11 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
     # The paper has 96.9, 96.4 and 95.5 %: above it, below it, and within the interval.
     assert cells["99.0 % (97.5-99.5)"] == "better" and cells["90.0 % (85.0-95.0)"] == "worse"
     assert cells["96.0 % (93.0-98.0)"] == ""
-    assert cells["96.9 %"] == "paper" and "0.137 rad 0.020 m" in cells and "p & q.safetensors" in cells
+    assert cells["96.9 %"] == "paper" and "p & q.safetensors" in cells
+    # Ours and the paper's 0.137 rad and 0.020 m, in a column each.
+    for ours, paper in (("4.0", "7.8"), ("13.0", "20.0")):
+        assert f'<td class="number">{ours} <span class="paper">{paper}</span></td>' in text
+    assert "<th>heading, °</th><th>heading, mm</th>" in text
     assert "300 episodes in simulation. Success is at or above the paper's in 2 of the 3 rows" in html.unescape(text)
     assert "slipped &lt;b&gt;" in text and "--policy &lt;mine&gt;" in text
     assert len(found.sources) == 2 and not found.links
@@ -112,3 +122,61 @@ def test_a_runs_curves_are_pictures(tmp_path):
 
 def test_causes_are_counted():
     assert count_causes(["held", "slipped", "held"]) == "2 held, 1 slipped"
+
+
+def test_limits_name_what_is_bad_by_the_figures():
+    good = row("heading", 0.99, 0.975, 0.995)
+    assert limits([good]) == ["No row is below the paper's success, or below 80 %."]
+    worst = [{"name": "can", "episodes": 10, "success": 0.5}, {"name": "box", "episodes": 10, "success": 0.9}]
+    bad = dataclasses.replace(
+        row("pose", 0.75, 0.7, 0.8),
+        held_2s=0.6,
+        objects=worst,
+        plausibility={"hand_hand_mm": 11.0, "hand_table_mm": 1.0, "wrist_speed": 2.5},
+    )
+    assert limits([good, bad]) == [
+        "Pose: 75.0 % success, 60.0 % held for 2 s, success 21.4 points below the paper's 96.4 %.",
+        "Objects that it loses most: can (50 % of 10).",
+        "Its fingers pass through one another: 11.0 mm at the deepest, in the mean of the worst row.",
+        "Its wrist peaks at 2.5 m/s, in the mean of the fastest row.",
+    ]
+
+
+def test_few_episodes_are_a_warning(tmp_path, policy):
+    few = dataclasses.replace(row("heading", 0.9, 0.6, 0.98), episodes=16)
+    for rows, warned in (([few], True), ([row("heading", 0.99, 0.975, 0.995)], False)):
+        write_report(tmp_path / "r.html", policy, "p", rows, "", [], [], Commands("c", ""))
+        text = (tmp_path / "r.html").read_text()
+        assert ('class="warning"' in text) == warned and ("rows of 16 episodes" in text) == warned
+        for section in ("Use", "Limits", "Data", "Licence", "Citation"):
+            assert f"<h3>{section}</h3>" in text
+        assert "@article{congraspxl" in text
+
+
+def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
+    """What the page's script computes, bones times weights, is the skin, the object and the table of the episode."""
+    recorded = episode(9)
+    made = turntable(recorded)
+    data = json.loads(made["data"])
+
+    def array(name, kind, *shape):
+        return np.frombuffer(base64.b64decode(data[name]), kind).reshape(-1, *shape)
+
+    frames = array("frames", "<f4", data["count"], 3, 4)
+    assert len(frames) == len(range(0, len(recorded.arrays["table"]), round(data["seconds"] / 0.01)))
+    step, which = round(data["seconds"] / 0.01), 1
+    bones, weights = array("bones", "u1", 4), array("weights", "u1", 4) / 255
+    points = np.column_stack([array("position", "<f4", 3), np.ones(len(bones))])
+    moved = np.einsum("vk,vkij,vj->vi", weights, frames[which][bones], points)
+    arrays, hand = recorded.arrays, known_hand(recorded.meta["hand"])
+    skin = hand_shape(hand, arrays["link_position"][step], arrays["link_quaternion"][step])
+    np.testing.assert_allclose(moved[: len(skin.vertices)], skin.vertices, atol=2e-3)
+    solid = moved[bones[:, 0] == data["count"] - 2]
+    turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
+    corners = turn.apply(arrays["visual_vertices"]) + arrays["object_position"][step]
+    np.testing.assert_allclose([solid.min(0), solid.max(0)], [corners.min(0), corners.max(0)], atol=1e-5)
+    assert array("faces", "<u4", 3).max() < len(points) and data["table"][1] == array("faces", "<u4").size
+    write_report(
+        tmp_path / "r.html", policy, "p", [], "", [], [], Commands("c", ""), motion={**made, "constraint": "x"}
+    )
+    assert "A grasp to turn around" in (tmp_path / "r.html").read_text()

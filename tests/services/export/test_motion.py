@@ -428,9 +428,18 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     save_motion(tmp_path / "mug.npz", motion_of_episode(episode(T)))
     assert run("logs", "--to", "bvh") == 0
     assert run("mug.npz") == 0
-    assert "mug.glb: 7 frames, largest error" in capsys.readouterr().out
+    assert "cylinder-0.glb: 7 frames, largest error" in capsys.readouterr().out
+    changed = tmp_path / "cylinder-0.glb"
+    changed.write_bytes(b"mine")
+    assert run("mug.npz") == 2
+    assert changed.read_bytes() == b"mine" and "cylinder-0.glb is there already" in capsys.readouterr().err
+    assert run("mug.npz", "--force") == 0 and changed.read_bytes().startswith(b"glTF")
+    (tmp_path / "cylinder-0.bvh").rename(tmp_path / "taken.bvh")
+    assert run("mug.npz", "--to", "bvh") == 2  # what goes beside the file is there already, too
+    assert not (tmp_path / "cylinder-0.bvh").exists()
+    (tmp_path / "taken.bvh").rename(tmp_path / "cylinder-0.bvh")
     assert run("mug.npz", "logs", "--to", "lerobot") == 0
-    made = {"logs.bvh", "logs.bvh.json", "mug-lerobot", "mug.glb"}
+    made = {"cylinder-0.bvh", "cylinder-0.bvh.json", "cylinder-0-lerobot", "cylinder-0.glb"}
     assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *made}
     capsys.readouterr()
     for arguments, words in (

@@ -50,7 +50,7 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     assert reports[0][0].startswith("Compiling") and reports[1] == ("Attempting", 1, 75) and reports[-1][1:] == (75, 75)
     assert 1 <= found.held <= found.attempts <= 12 and found.success
     motion = found.motion
-    assert motion.constraints == ("heading", "affordance") and motion.about["tries"] == found.attempts
+    assert motion.constraints == ("heading", "affordance") and motion.about["attempts"] == found.attempts
     assert len(motion.time) == 75 and motion.table.sum() == 49  # the table goes with the fiftieth step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     np.testing.assert_array_equal(motion.surface_minus, minus[:256])
@@ -190,8 +190,8 @@ def test_nothing_to_grasp(tmp_path):
     for option, value in (("--approach", "-1"), ("--approach", "11"), ("--lift", "0.6"), ("--lift", "nan")):
         with pytest.raises(CongraspError, match=f"{option} is .* It is from 0 to"):
             command(tmp_path, option, value)
-    with pytest.raises(CongraspError, match="--tries is 0"):
-        command(tmp_path, "--tries", "0")
+    with pytest.raises(CongraspError, match="--attempts is 0"):
+        command(tmp_path, "--attempts", "0")
 
 
 def test_files_of_a_grasp_are_constraints_of_the_next(tmp_path, block, grasper, monkeypatch, made_up):

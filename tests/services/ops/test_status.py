@@ -1,6 +1,7 @@
 """`congrasp status` against a live learner's end."""
 
 import copy
+import dataclasses
 import io
 import json
 import signal
@@ -12,14 +13,17 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from common.errors import TransportError
+from common.config import RunConfig
+from common.errors import CongraspError, TransportError
 from common.transport.keys import Keys
 from common.transport.ports import free_port
 from common.transport.zenoh_transport import ZenohTransport
 from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
+from learner.run_directory import POLICY_FILE, create_run, listening
 from learner.staleness import StalenessManager
 from services.cli.status import status
+from services.cli.view import _of_folder
 from services.ops.status import ask, tables, warnings
 from tests.rollouts import ACTION, OBSERVATION, SCHEMA, bundle, rollout
 
@@ -51,16 +55,30 @@ def endpoint():
 
 @pytest.mark.timeout(30)
 def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
-    assert status(endpoint, "r", json=True) == 0
+    assert status(connect=endpoint, run="r", json=True) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["run"], found["version"], found["ledger"]["accepted"]) == ("r", 0, 1)
     assert [(role["role"], role["id"]) for role in found["roles"]] == [("actor", "worker-7"), ("learner", "0")]
     actor = found["roles"][0]
     assert (actor["rollouts"], actor["version"], actor["lag"]) == (1, 0, 0)
     assert 0 < actor["steps_per_second"] == found["rates"]["steps_per_second"] <= 8
-    assert status(endpoint, "r") == 0
+    assert status(connect=endpoint, run="r") == 0
     text = capsys.readouterr().out
     assert "worker-7" in text and "accepted" in text and "1 rollout(s) of at most 64 waiting" in text
+
+
+@pytest.mark.timeout(30)
+def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
+    create_run(tmp_path / "run", dataclasses.replace(RunConfig(), name="r"))
+    with pytest.raises(CongraspError, match=r"No learner is running in .*congrasp plot"):
+        status(tmp_path / "run")
+    with listening(tmp_path / "run", endpoint):
+        assert status(tmp_path / "run", json=True) == 0
+        assert json.loads(capsys.readouterr().out)["roles"][0]["id"] == "worker-7"
+        connect, run, policy, recordings = _of_folder(tmp_path / "run", None)
+        assert (connect, run, policy, recordings) == (endpoint, "r", None, tmp_path / "run")
+    (tmp_path / "run" / POLICY_FILE).touch()
+    assert _of_folder(tmp_path / "run", None) == ("", "r", tmp_path / "run" / POLICY_FILE, tmp_path / "run")
 
 
 @pytest.mark.timeout(30)
@@ -92,7 +110,7 @@ def test_watching_goes_on_until_it_is_interrupted(endpoint):
 @pytest.mark.timeout(30)
 def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
     with pytest.raises(TransportError, match="other"):
-        status(endpoint, "other")
+        status(connect=endpoint, run="other")
 
 
 def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_markup(endpoint):

@@ -195,9 +195,9 @@ def test_the_policy_is_told_what_is_not_measured():
 @pytest.mark.parametrize(
     ("outcome", "counter"),
     [
-        (answer(np.array([np.nan, 0.0])), "bad"),
-        (answer(np.zeros(3)), "bad"),
-        (answer(np.zeros(2), np.full(6, np.inf)), "bad"),
+        (answer(np.array([np.nan, 0.0])), "invalid"),
+        (answer(np.zeros(3)), "invalid"),
+        (answer(np.zeros(2), np.full(6, np.inf)), "invalid"),
         (RefusedError("No."), "refused"),
         (TransportError("Away."), "lost"),
         (ValueError("a fault"), "lost"),

@@ -53,7 +53,7 @@ def policies(tmp_path_factory) -> tuple[Policy, Policy]:
 
 
 def goals(request: GraspRequest) -> dict[str, dict[str, np.ndarray]]:
-    """Goal arrays of every constraint around the heading of a request; the trajectory ends where O+ is."""
+    """Goal arrays of every constraint around the heading of a request; the trajectory ends at the graspable region."""
     heading = request.constraints["heading"]
     graspable = request.surface[request.surface[:, 2].argmin()]
     path = graspable + np.linspace(0.2, 0.0, TASK.trajectory_points)[:, None] * np.array([0.0, 0.0, 1.0])

@@ -11,7 +11,7 @@ from common.config import NetworkConfig, ObjectsConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
 from services.ops.certificates import create_authority, issue
 from services.train import command
-from services.train.command import EPISODE, SHIPPED, _check_connections, _compare, _minutes, _next_steps, _Progress
+from services.train.command import EPISODE, PRETRAINED, _check_connections, _compare, _minutes, _next_steps, _Progress
 from services.train.presets import get_preset
 
 CONFIG = RunConfig(updates=10, environments=4, rollout_steps=5)  # 40 steps an update
@@ -107,12 +107,12 @@ def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, t
     (tmp_path / EPISODE).touch()
     _next_steps(tmp_path)
     assert any(line.strip() == str(tmp_path / EPISODE) for line in said())
-    assert not any(SHIPPED in line for line in said())
+    assert not any(PRETRAINED in line for line in said())
     commands = [line.split("congrasp ", 1)[1].split()[0] for line in said() if "congrasp " in line]
     assert commands and set(commands) <= set(COMMANDS)
-    (tmp_path / SHIPPED).touch()
+    (tmp_path / PRETRAINED).touch()
     _next_steps(tmp_path)
-    assert any(line.strip() == str(tmp_path / SHIPPED) for line in said())
+    assert any(line.strip() == str(tmp_path / PRETRAINED) for line in said())
 
 
 @pytest.mark.parametrize(("free", "words"), [(1000, "disk of .* is full.*--resume"), (10**9, "its log is empty")])

@@ -62,7 +62,7 @@ def test_rows_of_several_policies_are_told_apart(tmp_path: pathlib.Path) -> None
 
 def test_an_evaluation_becomes_png_and_pdf(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     evaluation(tmp_path / "e.json")
-    assert plot(tmp_path / "e.json") == 0
+    assert plot((tmp_path / "e.json",)) == 0
     files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
     assert [f.name for f in files] == [f"{n}.{k}" for n in ("table", "success", "errors") for k in ("png", "pdf")]
     starts = {".png": b"\x89PNG", ".pdf": b"%PDF-"}

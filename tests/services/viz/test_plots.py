@@ -8,11 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from common.config import TaskConfig
 from common.errors import CongraspError
+from common.task.constraints import CONSTRAINTS
+from common.task.metrics import episode_fields
 from services.cli.plot import plot
 from services.record.channels import JsonChannels, nest
 from services.record.writer import LogWriter
-from services.viz.plots import LEARNING, Panel, draw, figures, plot_run, smooth
+from services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth
+from services.viz.titles import titled
 
 METRICS = {
     "episode/return": 3.0,
@@ -39,11 +43,11 @@ def record(directory: pathlib.Path, updates: int = 30) -> None:
 
 def test_every_metric_is_in_exactly_one_panel() -> None:
     series = {f"learner/0/{name}": (np.arange(3), np.arange(3.0)) for name in METRICS}
-    groups = figures(series)
+    groups = figures({"run": series})
     shown = [metric for _, panels in groups.values() for panel in panels for metric in panel.metrics]
     assert sorted(shown) == sorted(METRICS)
     assert [panel.metrics for panel in groups["reward_terms"][1]] == [("term/contact",), ("term/force_excess",)]
-    assert groups["episodes"][1] == [Panel("Heading rad", "rad", ("episode/heading_rad",))]
+    assert groups["episodes"][1] == [Panel("Heading error: angle", "rad", ("episode/heading_rad",))]
     assert groups["details"][1] == [Panel("Queue length", "", ("queue_length",))]
     assert {panel.title for panel in groups["learning"][1]} == {
         panel.title for panel in LEARNING if set(panel.metrics) & set(METRICS)
@@ -52,7 +56,7 @@ def test_every_metric_is_in_exactly_one_panel() -> None:
 
 def test_a_run_becomes_png_files(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     record(tmp_path / "run" / "logs")
-    assert plot(tmp_path / "run") == 0
+    assert plot((tmp_path / "run",)) == 0
     files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
     figures = ("learning", "reward_terms", "episodes", "details")
     assert [file.name for file in files] == [f"{name}.{kind}" for name in figures for kind in ("png", "pdf")]
@@ -65,9 +69,38 @@ def test_a_run_becomes_png_files(tmp_path: pathlib.Path, capsys: pytest.CaptureF
         assert (np.abs(learning - colour).sum(-1) < 10).sum() > 200
 
 
+def test_runs_are_drawn_over_one_another_and_what_never_changes_is_left_out(tmp_path: pathlib.Path) -> None:
+    rising, flat = np.arange(4.0), np.full(4, 2.0)
+    one = {"learner/0/kl": rising, "learner/0/term/drop": flat, "learner/0/term/contact": flat, "actor/a/queue": rising}
+    two = {"learner/0/kl": 2 * rising, "learner/0/term/drop": flat, "learner/0/term/contact": 3 * flat}
+    runs = {
+        name: {metric: (np.arange(4), values) for metric, values in run.items()}
+        for name, run in (("a", one), ("b", two))
+    }
+    groups = figures(runs)
+    assert [panel.metrics for panel in groups["reward_terms"][1]] == [("term/contact",)]
+    figure = draw("Learning", groups["learning"][1], runs)
+    (axes,) = [axes for axes in figure.axes if axes.get_lines()]
+    assert [(line.get_label(), line.get_ydata()[-1]) for line in axes.get_lines()] == [("a", 3.0), ("b", 6.0)]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["a", "b"]
+    with pytest.raises(CongraspError, match="--out"):
+        plot((tmp_path / "a", tmp_path / "b"))
+
+
+def test_every_metric_of_an_episode_has_a_title_of_its_own() -> None:
+    task = TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))
+    titles = {name: titled(name)[0] for name in episode_fields(task)}
+    assert len(set(titles.values())) == len(titles)
+    assert not [name for name, title in titles.items() if "_" in title or "/" in title or not title[0].isupper()]
+    assert titled("episode/heading_m") == ("Heading error: distance", "m")
+    assert titled("term/force_excess") == ("Force excess", "reward")
+    assert titled("failure/bowl") == ("Lost objects: bowl", "share of episodes")
+    assert titled("fetch_seconds") == ("Fetch", "s")
+
+
 def test_the_curve_is_the_metric() -> None:
     steps, values = np.arange(10) * 3, np.arange(10.0) ** 2
-    figure = draw("Title", [Panel("Kl", "nats", ("kl",))], {"learner/0/kl": (steps, values)})
+    figure = draw("Title", [Panel("Kl", "nats", ("kl",))], {"run": {"learner/0/kl": (steps, values)}})
     (line,) = [line for axes in figure.axes for line in axes.get_lines()]
     np.testing.assert_array_equal(line.get_xydata(), np.stack([steps, values], -1))
 
@@ -85,10 +118,10 @@ def test_smoothing_skips_what_is_absent_and_keeps_constants() -> None:
 
 def test_nothing_to_draw_is_said_in_words(tmp_path: pathlib.Path) -> None:
     with pytest.raises(CongraspError, match="no recording"):
-        plot_run(tmp_path, tmp_path)
+        plot_runs([tmp_path], tmp_path)
     LogWriter(tmp_path / "logs", "log").close()
     writer = LogWriter(tmp_path / "logs", "log")
     writer.write(JsonChannels().entry("/version/learner/0", 0, {"version": 1}))
     writer.close()
     with pytest.raises(CongraspError, match="no metrics"):
-        plot_run(tmp_path, tmp_path)
+        plot_runs([tmp_path], tmp_path)

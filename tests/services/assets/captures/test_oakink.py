@@ -138,7 +138,9 @@ def test_an_affordance_of_less_than_a_tenth_is_dropped(run_import, tmp_path):
     write(case, tmp_path)
     write_parts(case, tmp_path, case.size[2] / 2 - 0.045)
     _, report = run_import("oakink", tmp_path, code=2)
-    assert report.dropped[0]["rule"] == "O+ too small" and "% of its surface" in report.dropped[0]["reason"]
+    assert (
+        report.dropped[0]["rule"] == "graspable region too small" and "% of its surface" in report.dropped[0]["reason"]
+    )
     _, report = run_import("oakink", tmp_path, "--affordance", "none")
     assert [row["object"] for row in report.kept] == ["A01001"]
 

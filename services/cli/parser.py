@@ -1,0 +1,147 @@
+"""Command functions as parsers: their signatures become options, their docstrings help that people read."""
+
+import contextlib
+import dataclasses
+import functools
+import inspect
+import re
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, Any
+
+import docstring_parser
+import tyro
+
+Command = Callable[..., Any]
+Parser = Callable[[list[str]], Callable[[], Any]]
+"""From the arguments to the call that they ask for."""
+_QUIET = ("", "None", "False")
+"""Defaults that say nothing: the help text has what happens without the option."""
+_CONTINUED = re.compile(r"\s*\n\s*")
+
+
+def of_command(
+    command: Command, prog: str, defaults: Callable[[list[str]], Mapping[str, Any]] = lambda rest: {}
+) -> Parser:
+    """The parser of a command; `defaults` finds values of its parameters that depend on the arguments."""
+
+    def parse(rest: list[str]) -> Callable[[], Any]:
+        bound = functools.partial(_deferred(command), **defaults(rest))
+        with _epilog(examples(command)):
+            return tyro.cli(
+                bound,
+                prog=prog,
+                args=rest,
+                config=(tyro.conf.DisallowNone,),
+                registry=_REGISTRY,
+            )
+
+    return parse
+
+
+def of_group(commands: Mapping[str, Command], prog: str, description: str | None) -> Parser:
+    """The parser of a group of commands by name."""
+
+    def parse(rest: list[str]) -> Callable[[], Any]:
+        if rest and rest[0] in commands:
+            return of_command(commands[rest[0]], f"{prog} {rest[0]}")(rest[1:])
+        deferred = {name: _deferred(command) for name, command in commands.items()}
+        with _epilog([examples(command)[0] for command in commands.values()]):
+            return tyro.extras.subcommand_cli_from_dict(deferred, prog=prog, description=description, args=rest)
+
+    return parse
+
+
+def examples(command: Command) -> list[str]:
+    """The command lines in the section `Examples` of a command's docstring."""
+    found = docstring_parser.parse(inspect.getdoc(command) or "").examples
+    return [line.strip() for example in found for line in (example.description or "").splitlines() if line.strip()]
+
+
+@contextlib.contextmanager
+def _epilog(lines: Sequence[str]) -> Iterator[None]:
+    """Prints examples behind the help, which is what a parser that ends the process without an error has printed."""
+    try:
+        yield
+    except SystemExit as end:
+        if not end.code:
+            print("\n".join(("Examples:", *(f"  {line}" for line in lines))))
+        raise
+
+
+def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
+    """The command with its arguments bound, to be called once they are known to be right."""
+
+    def bind(*args: Any, **options: Any) -> Callable[[], Any]:
+        return functools.partial(command, *args, **options)
+
+    hints = {name: _described(hint) for name, hint in typing.get_type_hints(command, include_extras=True).items()}
+    signature = inspect.signature(command)
+    taken = [value.replace(annotation=hints[name]) for name, value in signature.parameters.items()]
+    vars(bind)["__signature__"] = signature.replace(parameters=taken)
+    bind.__name__, bind.__annotations__ = command.__name__, {**hints, "return": Any}
+    bind.__doc__ = re.sub(r"\n    (?=\S)", " ", inspect.getdoc(command) or "")  # a parameter's text on one line
+    return bind
+
+
+def _described(hint: Any) -> Any:
+    """A parameter's type, with how its values and its default are shown."""
+    kind = typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
+    metavar = None
+    if typing.get_origin(kind) is tuple and typing.get_args(kind)[-1] is Ellipsis:
+        metavar = f"{_value(typing.get_args(kind)[0])} ..."
+    return Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint)]
+
+
+def _value(kind: Any) -> str:
+    """How one value of a tuple is shown."""
+    if typing.get_origin(kind) is typing.Literal:
+        return "{" + ",".join(map(str, typing.get_args(kind))) + "}"
+    return "PATH" if kind.__name__ == "Path" else kind.__name__.upper()
+
+
+def _hint(default: str) -> str:
+    """What stands behind an option's help."""
+    shown = default.strip("[']")  # a choice is shown as a list
+    return "" if shown in _QUIET else f"(default: {shown})"
+
+
+_REGISTRY = tyro.constructors.ConstructorRegistry()
+
+
+@_REGISTRY.struct_rule
+def _dataclass(info: tyro.constructors.StructTypeInfo) -> tyro.constructors.StructConstructorSpec | None:
+    """Options of a dataclass: tyro's own rule, with each field's text on one line and described as parameters are."""
+    if not dataclasses.is_dataclass(info.type) or not dataclasses.is_dataclass(info.default):
+        return None
+    hints = typing.get_type_hints(info.type, include_extras=True)
+    return tyro.constructors.StructConstructorSpec(
+        instantiate=info.type,
+        fields=tuple(
+            tyro.constructors.StructFieldSpec(
+                field.name,
+                _described(hints[field.name]),
+                getattr(info.default, field.name),
+                functools.partial(_meaning, info.type, field.name),
+            )
+            for field in dataclasses.fields(info.type)
+        ),
+    )
+
+
+def _meaning(kind: type, field: str) -> str | None:
+    """What a field means, on one line: the string under it."""
+    for base in kind.__mro__:
+        if found := _meanings(base).get(field):
+            return found
+    return None
+
+
+@functools.cache
+def _meanings(kind: type) -> Mapping[str, str]:
+    """What the fields of one class mean."""
+    if kind is object:
+        return types.MappingProxyType({})
+    params = docstring_parser.parse_from_object(kind).params
+    return {param.arg_name: _CONTINUED.sub(" ", param.description) for param in params if param.description}

@@ -1,0 +1,113 @@
+"""What a policy is for, what it learnt from, where it is bad, and how it may be used and cited."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from common.config import TaskConfig
+from common.policy.bundle import PolicyBundle
+from common.task.constraints import optional
+from common.task.plausibility import CLEAN_MM
+from services.evaluate.scores import Row
+
+_LEAST = 0.8
+"""Rates below this are named as limits."""
+_WORST = 6
+"""Objects that are named at most."""
+_OVERLAPS = {
+    "hand_hand_mm": "Its fingers pass through one another",
+    "hand_table_mm": "It passes through the table",
+    "hand_object_mm": "It passes through the object",
+}
+_FAST = 1.0  # m/s of a wrist, above which an arm hardly follows
+_ALWAYS = (
+    "It was made and measured in simulation, never on a physical hand: success here says nothing about the safety of a "
+    "robot.",
+    "It observes exact poses, velocities and contact forces of a rigid object that fits the hand. Soft or jointed "
+    "objects, clutter and obstacles are nothing that it ever met.",
+)
+_CITATION = """@article{congraspxl,
+  title  = {ConGraspXL: Controllable Constraint-Conditioned Dexterous Grasping Motion Synthesis},
+  author = {Zhang, Hui and Meboldt, Mirko and Song, Jie}
+}"""
+
+
+def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
+    """The sections of a policy's model card.
+
+    Args:
+      policy: what it is about.
+      rows: its evaluation.
+
+    Returns:
+      `uses`: sentences; `commands`: that use it; `data`: sentences; `limits`: sentences, what the rows show first;
+      `licence`; `citation`: BibTeX of the method.
+    """
+    hand = policy.spec.hand_name
+    return {
+        "uses": (
+            f"Grasps of rigid objects with the {hand} hand in simulation, under any combination of its constraints: "
+            f"{', '.join(policy.task.constraints)}. Motions for animation, demonstrations and references for learning, "
+            "comparison with other methods.",
+        ),
+        "commands": (
+            "congrasp grasp examples/mug.obj --video --policy FILE",
+            "congrasp serve --policy FILE",
+            "congrasp export policy --policy FILE --to onnx",
+        ),
+        "data": (
+            "It learnt by reinforcement in simulation. Objects are procedural, or those of the run's own folder; "
+            "constraints are sampled, or those of the run's constraint sets.",
+            _trained(policy.task),
+        ),
+        "limits": (*limits(rows), *_ALWAYS),
+        "licence": "The software and the policies that come with it: Apache-2.0. A policy of your own is yours, within "
+        "the licences of the meshes, hands and captured grasps that it learnt from.",
+        "citation": _CITATION,
+    }
+
+
+def limits(rows: Sequence[Row]) -> list[str]:
+    """What is bad by the figures: rows below the paper's or below 80 %, lost objects, implausible motions."""
+    found = []
+    for row in rows:
+        name = f"{row.constraint} ({row.group})" if row.group else row.constraint
+        rates = [("success", row.success), ("held for 2 s", row.held_2s)]
+        low = [f"{100 * rate:.1f} % {what}" for what, rate in rates if rate is not None and rate < _LEAST]
+        if row.paper and row.success < row.paper.success:
+            below = 100 * (row.paper.success - row.success)
+            low.append(f"success {below:.1f} points below the paper's {100 * row.paper.success:.1f} %")
+        if low:
+            found.append(f"{name.capitalize()}: {', '.join(low)}.")
+    if not found:
+        found.append("No row is below the paper's success, or below 80 %.")
+    if worst := _worst(rows):
+        found.append(f"Objects that it loses most: {', '.join(worst)}.")
+    for measure, words in _OVERLAPS.items():
+        deepest = max((row.plausibility.get(measure) or 0.0 for row in rows), default=0.0)
+        if deepest > CLEAN_MM[measure]:
+            found.append(f"{words}: {deepest:.1f} mm at the deepest, in the mean of the worst row.")
+    fastest = max((row.plausibility.get("wrist_speed") or 0.0 for row in rows), default=0.0)
+    if fastest > _FAST:
+        found.append(f"Its wrist peaks at {fastest:.1f} m/s, in the mean of the fastest row.")
+    return found
+
+
+def _worst(rows: Sequence[Row]) -> list[str]:
+    """Objects with a success below 80 % over all rows, the worst first, with their rates."""
+    episodes: dict[str, int] = {}
+    held: dict[str, float] = {}
+    for row in rows:
+        for of in row.objects:
+            episodes[of["name"]] = episodes.get(of["name"], 0) + of["episodes"]
+            held[of["name"]] = held.get(of["name"], 0.0) + of["episodes"] * of["success"]
+    rates = sorted((held[name] / count, name) for name, count in episodes.items())
+    return [f"{name} ({100 * rate:.0f} % of {episodes[name]})" for rate, name in rates if rate < _LEAST][:_WORST]
+
+
+def _trained(task: TaskConfig) -> str:
+    """The distribution of the episodes in training."""
+    parts = [f"{part.title} in {100 * getattr(task, f'p_{part.name}'):.0f} %" for part in optional(task)]
+    drawn = (("mass", task.mass_range), ("friction", task.friction_range))
+    ranges = [f"{name} x {low:g} to {high:g}" for name, (low, high) in drawn]
+    headings = "all headings" if task.headings == "all" else "headings within 30° of straight down"
+    return f"In training: {headings}; {', '.join(parts) or 'no other constraint'}; {', '.join(ranges)}."
