@@ -9,6 +9,7 @@ from common.objects.shapes import matrix
 from common.objects.spec import GraspObject
 from common.task.sampling.headings import INWARD
 
+_ROUND = 1e-6  # rad
 _LOWEST = 0.012  # m above the table of a target from above
 
 
@@ -30,7 +31,8 @@ class Arrow(NamedTuple):
         """
         level = _level(self.direction, up)
         other = np.cross(self.direction, level)
-        return float(np.arctan2(self.cross @ other, self.cross @ level))
+        angle = float(np.arctan2(self.cross @ other, self.cross @ level))
+        return angle if angle > _ROUND - np.pi else np.pi  # as much, without a sign that rounding decides on
 
     def with_roll(self, angle: float, up: np.ndarray) -> "Arrow":
         """The arrow with a roll of `angle` rad; see `roll`."""

@@ -54,6 +54,7 @@ export class Renderer {
     this.canvas = canvas;
     this.software = drawnInSoftware();
     this.coarse = 1; // share of the pixels, along each side, while something moves
+    this.shadows = true; // while something moves
     this.mean = 0; // ms of a frame
     const gl = canvas.getContext("webgl2", { antialias: !this.software, alpha: false, stencil: true });
     if (!gl) throw new Error("This browser offers no WebGL 2. Use a newer one, or allow hardware acceleration.");
@@ -112,14 +113,15 @@ export class Renderer {
     for (const buffer of mesh.buffers) this.gl.deleteBuffer(buffer);
   }
 
-  // Told how long a frame took while something moves: without a graphics card fewer pixels are drawn until it is fast.
+  // Told how long a frame took while something moves: without a graphics card fewer pixels are drawn until it is fast,
+  // and if that is not enough no shadows.
   pace(milliseconds, slowest) {
     if (!this.software) return;
     this.mean += 0.2 * (milliseconds - this.mean);
-    if (this.mean > 0.85 * slowest && this.coarse > 0.45) {
-      this.coarse = Math.max(0.45, 0.8 * this.coarse);
-      this.mean = 0.7 * slowest;
-    }
+    if (this.mean <= 0.85 * slowest) return;
+    if (this.coarse > 0.45) this.coarse = Math.max(0.45, 0.8 * this.coarse);
+    else this.shadows = false;
+    this.mean = 0.7 * slowest;
   }
 
   // Fits the frame to the space that the page gives it.
@@ -141,10 +143,10 @@ export class Renderer {
     this.resize(moving);
     gl.clearColor(...background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
-    for (const view of views) this.#view(view);
+    for (const view of views) this.#view(view, this.shadows || !moving);
   }
 
-  #view({ matrix, things, left = 0, width = 1 }) {
+  #view({ matrix, things, left = 0, width = 1 }, shadows) {
     const gl = this.gl;
     gl.viewport(Math.round(left * this.canvas.width), 0, Math.round(width * this.canvas.width), this.canvas.height);
     gl.uniformMatrix4fv(this.places.view, false, matrix);
@@ -163,7 +165,7 @@ export class Renderer {
     gl.enable(gl.STENCIL_TEST);
     gl.stencilFunc(gl.EQUAL, GROUND, 255);
     gl.stencilOp(gl.KEEP, gl.KEEP, gl.INCR);
-    for (const thing of things) if (thing.casts) this.#draw({ mesh: thing.mesh, model: multiply(FLAT, thing.model ?? IDENTITY), tint: [0, 0, 0], alpha: SHADE, lit: 0 });
+    for (const thing of things) if (shadows && thing.casts) this.#draw({ mesh: thing.mesh, model: multiply(FLAT, thing.model ?? IDENTITY), tint: [0, 0, 0], alpha: SHADE, lit: 0 });
     gl.disable(gl.STENCIL_TEST);
     for (const thing of things) if (!thing.above && clear(thing)) this.#draw(thing);
     gl.disable(gl.DEPTH_TEST);

@@ -138,8 +138,10 @@ export class Player {
     $("now").hidden = false;
     $("scrub").max = Math.round(this.duration / this.step);
     $("layout").hidden = this.slots.length < 2;
-    $("result").textContent = `${motion.meta.object}: ${motion.meta.success ? "success" : "no success"}, policy version ${motion.meta.version}`;
-    $("result").className = motion.meta.success ? "good" : "warn";
+    const { success, metrics } = motion.meta;
+    const { outcome, held } = outcomeOf(success, metrics?.held === undefined ? success : metrics.held > 0);
+    $("result").textContent = `${motion.meta.object}: ${outcome}, policy version ${motion.meta.version}`;
+    $("result").className = held ? "good" : "warn";
     $("banner").hidden = !motion.meta.note;
     $("banner").textContent = motion.meta.note ?? "";
     this.#names();
@@ -155,7 +157,8 @@ export class Player {
   #names() {
     $("names").hidden = this.slots.length < 2;
     $("names").dataset.layout = $("layout").value;
-    $("names").replaceChildren(...this.slots.map(({ name }) => Object.assign(document.createElement("span"), { textContent: name })));
+    const texts = this.slots.map(({ name }, i) => (i && !this.beside ? `${name} (faint)` : name));
+    $("names").replaceChildren(...texts.map((textContent) => Object.assign(document.createElement("span"), { textContent })));
     this.app.redraw();
   }
 
@@ -199,6 +202,12 @@ export class Player {
       });
     });
   }
+}
+
+// How a motion ended. It succeeds by holding the object for the paper's quarter of a second, and holds it if it does to
+// its end.
+export function outcomeOf(success, held) {
+  return { outcome: held ? "held" : success ? "held briefly" : "not held", held };
 }
 
 // "wrist_velocity" as "Wrist velocity".

@@ -1,5 +1,6 @@
 // The studio's panel: the request, the resolved constraints, and the motions.
 
+import { outcomeOf } from "./player.js";
 import { ask, download, post, upload } from "./wire.js";
 
 const $ = (id) => document.getElementById(id);
@@ -247,7 +248,7 @@ export class StudioPanel {
   // "3. mug: held"
   #name(id) {
     const motion = this.state.motions.find((other) => other.id === id);
-    return motion ? `${motion.id}. ${motion.object}: ${motion.held ? "held" : motion.success ? "held briefly" : "not held"}` : "";
+    return motion ? `${motion.id}. ${motion.object}: ${outcomeOf(motion.success, motion.held).outcome}` : "";
   }
 
   #motions(motions) {

@@ -143,7 +143,7 @@ export class TrainingPanel {
   #actors(actors) {
     const wanted = $("filter").value.trim().toLowerCase();
     const shown = actors.filter((actor) => actor.id.toLowerCase().includes(wanted));
-    const head = row(["actor", "version", "lag (versions)", "rollouts", "steps/s", "episodes", "success", "object"], "th");
+    const head = row(["actor", "version", "lag", "rollouts", "steps/s", "episodes", "success", "object"], "th");
     $("actors").replaceChildren(head, ...shown.map((actor) => {
       const success = actor.success === undefined ? "" : `${Math.round(100 * actor.success)} %`;
       const line = row([actor.id, short(actor.version), short(actor.lag), short(actor.rollouts), short(actor.steps_per_second), String(actor.episodes), success, actor.object ?? ""]);
@@ -183,9 +183,8 @@ export class TrainingPanel {
   #figure(name) {
     const figure = document.createElement("figure");
     figure.dataset.curve = name;
-    figure.innerHTML = "<figcaption><span></span><span class='quiet'></span><button title='hide'>×</button></figcaption><canvas></canvas>";
-    const { title, unit } = this.view.names[name];
-    figure.querySelector("span").textContent = unit ? `${title}, ${unit}` : title;
+    figure.innerHTML = "<figcaption><span></span><button title='hide'>×</button></figcaption><span class='quiet'></span><canvas></canvas>";
+    figure.querySelector("span").textContent = this.view.names[name].title;
     figure.querySelector("span").title = name;
     figure.querySelector("button").addEventListener("click", () => {
       this.chosen = Object.keys(this.view.curves).filter((other) => other !== name);
@@ -252,7 +251,8 @@ export class TrainingPanel {
     g.stroke();
     const near = figure.near ?? null;
     const shown = near !== null && near < values.length ? near : values.length - 1;
-    figure.querySelector(".quiet").textContent = near === null ? short(values[shown]) : `update ${short(steps[shown])}: ${short(values[shown])}`;
+    const value = `${short(values[shown])} ${this.view.names[figure.dataset.curve].unit}`;
+    figure.querySelector(".quiet").textContent = near === null ? value : `update ${short(steps[shown])}: ${value}`;
     g.fillStyle = colour;
     g.beginPath();
     g.arc(x(shown), y(shown), 3, 0, 7);

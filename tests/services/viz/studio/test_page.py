@@ -364,7 +364,8 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     assert not opened.is_visible("#policy")  # the studio's policy may be older than the run's, which a tile shows
     assert opened.locator("tr[data-actor]").count() == 100
     assert opened.inner_text("[data-tile='largest lag'] b") == "2 versions"
-    assert "Throughput, control steps/s" in opened.inner_text("figure[data-curve=steps_per_second]")
+    assert "Throughput" in opened.inner_text("figure[data-curve=steps_per_second]")
+    assert "100,000 control steps/s" in opened.inner_text("figure[data-curve=steps_per_second]")
     assert "50.0 %" in opened.inner_text("[data-constraint=pose]")
     opened.fill("#filter", "a04")
     opened.wait_for_selector("tr[data-actor=a099]", state="detached")
