@@ -27,13 +27,13 @@ def why_nothing_held(
     """
     text = f"None of {attempts} attempts held. The one shown: {cause(episode, drop_height)}."
     found = {name: held(weaker, name) for name, weaker in _weaker(request)}
-    if not found:
-        return f"{text} Only the heading was asked for: try another arrow."
-    best = max(found, key=lambda name: found[name])
-    if found[best]:
+    best = max(found, key=lambda name: found[name], default="")
+    if best and found[best]:
         title = get_constraint(best).title
         return f"{text} The {title} decided: without it {found[best]} of {attempts} hold."
-    return f"{text} {explanation[0]} Without any one of the others none holds either: try another arrow."
+    guides = [name for name in request.constraints if "heading" in get_constraint(name).overrides]
+    advice = f"{explanation[0]} Try another {get_constraint(guides[-1] if guides else 'heading').title}."
+    return f"{text} None holds without any one of the constraints either. {advice}" if found else f"{text} {advice}"
 
 
 def _weaker(request: GraspRequest) -> Iterator[tuple[str, GraspRequest]]:

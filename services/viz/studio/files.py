@@ -78,8 +78,8 @@ def drawing(
         raise CongraspError(f"A motion cannot be drawn as '{str(kind)[:20]}'.", f"Choose from: {', '.join(DRAWN)}.")
     camera = _camera(view)
     if kind == "png":
-        if not 0 <= frame < len(episode.arrays["table"]):
-            raise CongraspError(f"The motion has no frame {frame}.")
+        if not isinstance(frame, int) or not 0 <= frame < len(episode.arrays["table"]):
+            raise CongraspError(f"The motion has no frame {ascii(frame)[:20]}.")
         (image,) = render_episode_frames(episode, [frame], _PICTURE, camera)
         return Download(_name(episode, key, f"-{frame}.png"), png_of(image))
     with tempfile.TemporaryDirectory(prefix="congrasp-video-") as folder:

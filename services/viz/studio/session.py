@@ -134,7 +134,7 @@ class Session:
         """The object in one of its resting poses, from 0."""
         with self._lock:
             obj = self._studio.obj
-        return self._thumbnails.picture(obj, int(index) if index.isdecimal() else -1)
+        return self._thumbnails.picture(obj, int(index) if index.isdecimal() and len(index) < 6 else -1)
 
     def motion(self, key: str) -> Message:
         """A motion: one of the studio, `actor:NAME` for an actor's newest episode, `record:ID` for a recorded one."""
@@ -285,7 +285,7 @@ class Session:
 
     def _draw_motion(self, id: str, kind: str, camera: Mapping[str, Any], frame: int = 0) -> None:
         """Begins to draw a motion as one of `DRAWN`; `drawn` then has it."""
-        episode = self.motion(id)
+        episode = self.motion(str(id))
 
         def work(progress: Progress) -> str:
             """Draws it."""

@@ -226,9 +226,9 @@ export class TrainingPanel {
     const { steps, values } = curve;
     if (!steps.length) return;
     const low = Math.min(...values, values[0] >= 0 ? 0 : Infinity);
-    const high = Math.max(...values, low + 1e-9);
+    const high = Math.max(...values);
     const x = (i) => (steps.length < 2 ? 0 : ((steps[i] - steps[0]) / (steps[steps.length - 1] - steps[0])) * width);
-    const y = (i) => height - 14 - ((values[i] - low) / (high - low)) * (height - 22);
+    const y = (i) => height - 14 - ((values[i] - low) / (high - low || 1)) * (height - 22);
     g.strokeStyle = styled("--line");
     g.beginPath();
     for (const part of [0, 0.5, 1]) {
@@ -238,7 +238,7 @@ export class TrainingPanel {
     g.stroke();
     g.fillStyle = styled("--quiet");
     g.font = "10px system-ui, sans-serif";
-    g.fillText(short(high), 2, 8 - 0 + 2);
+    if (high > low) g.fillText(short(high), 2, 10);
     g.fillText(short(low), 2, height - 16);
     g.fillText(`update ${short(steps[0])}`, 2, height - 2);
     g.textAlign = "right";

@@ -34,11 +34,6 @@ def test_a_picture_is_seen_from_where_the_page_looks() -> None:
     assert seen.shape == (720, 1280, 3) and abs(np.median(columns) - 640) < 40
     # From twice as far the object is half as large along each side.
     assert len(orange(image({**VIEW, "position": [1.0, -1.2, 0.74]}))[0]) == pytest.approx(len(rows) / 4, rel=0.25)
-    # A target 3 cm higher moves it down by what that is across the line of sight, at 0.85 m.
-    higher = orange(image({**VIEW, "target": [0.0, 0.0, 0.09]}))[0]
-    up = 0.03 * np.hypot(0.5, 0.6) / np.linalg.norm([0.5, 0.6, 0.34])
-    pixels = 360 / np.tan(np.radians(16)) * up / 0.85
-    assert np.median(higher) - np.median(rows) == pytest.approx(pixels, rel=0.25)
 
 
 def test_a_video_has_a_frame_for_every_40_ms_at_half_speed_before_the_table_is_removed() -> None:
@@ -55,6 +50,7 @@ def test_a_video_has_a_frame_for_every_40_ms_at_half_speed_before_the_table_is_r
     [
         ("gif", VIEW, 0, "Choose from: mp4, png"),
         ("png", VIEW, 6, "no frame 6"),
+        ("png", VIEW, 1.5, "no frame 1.5"),
         ("png", {**VIEW, "target": [0.0, 0.0]}, 0, "camera's target must be three numbers"),
         ("png", {**VIEW, "target": VIEW["position"]}, 0, "straight down"),
         ("png", {**VIEW, "field_of_view": 0.0}, 0, "field of view"),
@@ -72,14 +68,16 @@ FLAGS = np.ones(4, bool)
 @pytest.mark.parametrize(
     ("asked", "without", "says"),
     [
-        ((), {}, "Only the heading was asked for"),
+        ((), {}, "removed. It guides. Try another heading."),
         (
             ("affordance", "trajectory"),
             {"affordance": 0, "trajectory": 5},
             "The wrist trajectory decided: without it 5 of 8",
         ),
         (("affordance", "pose"), {"affordance": 2, "pose": 1}, "The affordance decided: without it 2 of 8"),
-        (("pose",), {"pose": 0}, "The pose rules. Without any one of the others none holds either"),
+        (("pose",), {"pose": 0}, "either. It guides. Try another reference pose."),
+        (("affordance", "trajectory"), {"affordance": 0, "trajectory": 0}, "It guides. Try another wrist trajectory."),
+        (("affordance",), {"affordance": 0}, "It guides. Try another heading."),
     ],
 )
 def test_where_nothing_held_the_constraint_whose_absence_helps_most_decided(asked, without, says) -> None:
@@ -93,7 +91,7 @@ def test_where_nothing_held_the_constraint_whose_absence_helps_most_decided(aske
         tried[name] = weaker
         return without[name]
 
-    note = why_nothing_held(failed, request, ["The pose rules."], held, attempts=8, drop_height=0.1)
+    note = why_nothing_held(failed, request, ["It guides."], held, attempts=8, drop_height=0.1)
     assert note.startswith("None of 8 attempts held. The one shown: pushed away before the table was removed.")
     assert says in note and tried.keys() == set(asked)
     for name, weaker in tried.items():
