@@ -138,6 +138,9 @@ def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
     difference = np.abs(small - wanted).max(-1)[12:-6]
     assert (difference > 40).mean() < 0.02, "the picture is another than tests/services/viz/studio/first_picture.png"
     assert orange(seen).mean() > 0.01
+    grey = np.ptp(seen, axis=-1) < 14
+    shadow = grey & (abs(seen.mean(-1) - 0.8 * 219) < 8)  # on the table, which is 219 bright
+    assert shadow[: len(seen) // 2].sum() < shadow[len(seen) // 2 :].sum() and shadow.mean() > 0.003
 
 
 def test_the_rules_act_and_are_explained_when_constraints_are_ticked(opened: Any, site: Site) -> None:
@@ -384,3 +387,11 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     opened.wait_for_selector("#result:has-text('thing-2')")
     opened.click("#show-studio")
     opened.wait_for_selector("#player", state="hidden")
+    # Once the run is over and its learner has gone, it is shown whole, and nothing is missed.
+    assert opened.locator("#curves figure").count() == 4
+    site.window.take_status(made_up.status(100) | {"finished": True}, time.time())
+    site.window.take_status(None, time.time())
+    opened.click("#show-training")
+    opened.wait_for_selector("[data-tile=state] b:has-text('finished')")
+    eventually(lambda: opened.locator("#curves figure").count() == len(site.window.view()["names"]) == 6)
+    assert opened.inner_text("#run-trouble") == "" and opened.inner_text("[data-tile=update] b") == "59"
