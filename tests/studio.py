@@ -17,8 +17,9 @@ from common.wire.codec import Message
 from services.record.channels import JsonChannels
 from services.record.scene import episode_entries
 from services.record.writer import LogWriter
+from services.viz.studio.catalogue import Catalogue
 from services.viz.studio.jobs import Progress
-from services.viz.studio.session import Catalogue, Session
+from services.viz.studio.session import Session
 from services.viz.studio.training import TrainingWindow
 from tests.episodes import episode
 
@@ -111,13 +112,19 @@ def record(folder: pathlib.Path, moments: list[tuple[float, int]]) -> None:
     writer.close()
 
 
-def take_mesh(path: pathlib.Path) -> tuple[GraspObject, list[str]]:
-    """Whatever the file holds, it is a bottle."""
-    if path.suffix != ".stl":
-        raise CongraspError(f"{path} is not an STL file.", "Convert it.")
-    return procedural.generate(5, "bottle"), ["It was a bit small"]
+class MadeUpImporter:
+    """Whatever the file holds, it is a bottle, 6 x 6 x 20 of the unit that its name ends with, or two of an unknown."""
+
+    def sides(self, path: pathlib.Path) -> tuple[float, float, float]:
+        if path.suffix != ".stl":
+            raise CongraspError(f"{path} is not an STL file.", "Convert it.")
+        return {"cm": (6.0, 6.0, 20.0), "unknown": (0.9, 0.9, 3.0)}.get(path.stem, (0.06, 0.06, 0.2))
+
+    def load(self, path: pathlib.Path, unit: str) -> tuple[GraspObject, list[str]]:
+        factor = max(self.sides(path)) * {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}[unit] / 0.2
+        return procedural.generate(5, "bottle").scaled(factor), ["It was a bit small"]
 
 
 def session(grasping: MadeUpGrasping | None = None, **more: Any) -> Session:
     made = grasping or MadeUpGrasping()
-    return Session({"of the run": lambda: made}, objects(), take_mesh, **more)
+    return Session({"of the run": lambda: made}, objects(), MadeUpImporter(), **more)

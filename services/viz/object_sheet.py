@@ -62,16 +62,23 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
     return contact_sheet(images, list(panels), columns=len(panels), title=title)
 
 
+def rest_picture(obj: GraspObject, rest: int, size: tuple[int, int] = _SMALL) -> np.ndarray:
+    """(height, width, 3) uint8: the object on the table in one of its resting poses; size (width, height), pixels."""
+    pose = np.asarray(obj.rest_poses[rest], float)
+    shape = dataclasses.replace(_painted(obj), position=pose[:3], quaternion=pose[3:])
+    shape = dataclasses.replace(shape, paint_points=None, paint_colours=None)
+    camera = fit(shape_points(shape), np.array(_VIEW), size[0] / size[1])
+    return render_scene([shape, table_shape(pose[:3])], camera, size)
+
+
 def rests_sheet(obj: GraspObject) -> np.ndarray:
     """(H, W, 3) uint8: the object in each of its resting poses, by the numbers that `congrasp grasp --rest` takes."""
-    images, labels = [], []
+    images = [rest_picture(obj, rest) for rest in range(len(obj.rest_poses))]
     tilts = np.degrees(rest_tilts(obj))
-    for number, (pose, tilt) in enumerate(zip(np.asarray(obj.rest_poses, float), tilts, strict=True), 1):
-        shape = dataclasses.replace(_painted(obj), position=pose[:3], quaternion=pose[3:])
-        shape = dataclasses.replace(shape, paint_points=None, paint_colours=None)
-        camera = fit(shape_points(shape), np.array(_VIEW), _SMALL[0] / _SMALL[1])
-        images.append(render_scene([shape, table_shape(pose[:3])], camera, _SMALL))
-        labels.append(f"{number}: {100 * pose[2]:.1f} cm high, z axis {tilt:.0f}° from up")
+    labels = [
+        f"{number}: {100 * height:.1f} cm high, z axis {tilt:.0f}° from up"
+        for number, (height, tilt) in enumerate(zip(obj.rest_poses[:, 2], tilts, strict=True), 1)
+    ]
     title = f"{obj.name}: resting poses, the likeliest first"
     return contact_sheet(images, labels, columns=min(_COLUMNS, len(images)), title=title)
 

@@ -1,7 +1,7 @@
 """Pictures and videos of recorded episodes."""
 
 import pathlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -287,11 +287,30 @@ def episode_title(episode: Message) -> str:
 
 
 def save_episode_video(
-    path: pathlib.Path, episode: Message, size: tuple[int, int] = (640, 480), camera: Camera | None = None
+    path: pathlib.Path,
+    episode: Message,
+    size: tuple[int, int] = (640, 480),
+    camera: Camera | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> None:
-    """An episode as MP4: in real time, the grasp itself (before the lift or the table's removal) at half its speed."""
+    """An episode as MP4: in real time, the grasp itself (before the lift or the table's removal) at half its speed.
+
+    Args:
+      path: the file.
+      episode: the episode.
+      size: width and height in pixels.
+      camera: see `render_episode_frames`.
+      progress: told which share of the frames is drawn.
+    """
     step = max(1, round(_FRAME_SECONDS / 2 / float(episode.meta["control_dt"])))
     first, end = grasp_steps(episode)
     last = len(episode.arrays["table"])
     steps = [*range(0, first, 2 * step), *range(first, end, step), *range(end, last, 2 * step)]
-    save_video(path, render_episode_frames(episode, steps, size, camera), size, 1 / _FRAME_SECONDS)
+
+    def frames() -> Iterator[np.ndarray]:
+        """The frames, one after another."""
+        for done, frame in enumerate(render_episode_frames(episode, steps, size, camera), 1):
+            yield frame
+            progress(done / len(steps))
+
+    save_video(path, frames(), size, 1 / _FRAME_SECONDS)

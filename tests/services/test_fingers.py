@@ -26,6 +26,7 @@ from services.serve.inference import Inference, PolicyFunction
 from services.serve.load import example_episode
 from services.serve.requests import Layout
 from services.train.command import untrained
+from services.viz.studio import description
 from services.viz.studio.grasping import PolicyGrasping
 from services.viz.studio.lanes import for_page, lanes
 from services.viz.studio.state import Studio
@@ -86,7 +87,11 @@ def test_the_studio_refuses_it_in_one_line() -> None:
         studio.ask("fingers", True)
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
         studio.choose("fingers", "allowed", PINCH.tolist())
-    assert studio.asked == set() and studio.view()["others"] == [] and "fingers" not in studio.view()["known"]
+    assert (
+        studio.asked == set()
+        and description.describe(studio)["others"] == []
+        and "fingers" not in description.describe(studio)["known"]
+    )
 
 
 def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
@@ -157,12 +162,14 @@ def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: di
 def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
     studio = Studio(HAND, TASK, MUG)
     flags = dict(zip(HAND.fingers, PINCH.tolist(), strict=True))
-    assert studio.view()["others"] == [{"name": "fingers", "title": "fingers", "flags": {"allowed": flags}}]
+    assert description.describe(studio)["others"] == [
+        {"name": "fingers", "title": "fingers", "flags": {"allowed": flags}}
+    ]
     studio.ask("fingers", True)
-    assert studio.view()["active"]["masks"]["fingers"] and studio.trouble == ""
+    assert description.describe(studio)["active"]["masks"]["fingers"] and studio.trouble == ""
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), PINCH)
     studio.choose("fingers", "allowed", [True, True, True, False, False])
-    assert json.loads(json.dumps(studio.view()))["others"][0]["flags"]["allowed"]["middle"]
+    assert json.loads(json.dumps(description.describe(studio)))["others"][0]["flags"]["allowed"]["middle"]
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), [1, 1, 1, 0, 0])
     studio.choose("fingers", "allowed", [True, False, False, False, False])
     assert studio.trouble == "The constraint 'fingers' allows fewer than two fingers. Allow two or more."
@@ -181,6 +188,9 @@ def test_the_studio_grasps_with_it(policy: PolicyBundle) -> None:
     episode = grasping.grasp(studio.labelled, studio.request, lambda text, share: None)
     assert episode.arrays["active/fingers"] and "fingers_ratio" in episode.meta["metrics"]
     np.testing.assert_array_equal(episode.arrays["goal/fingers_allowed"], PINCH)
+    # An untrained policy holds nothing, with the constraint or without it.
+    assert episode.meta["note"].startswith("None of 8 attempts held. The one shown: ")
+    assert episode.meta["note"].endswith("Only the named fingers may touch the object. Try another heading.")
 
 
 def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:

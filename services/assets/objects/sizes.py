@@ -9,11 +9,13 @@ from common.errors import CongraspError
 
 Unit = Literal["auto", "guess", "m", "cm", "mm", "in"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-_UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
+UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _PLAUSIBLE = (0.01, 0.6)  # m, longest side of what is taken as metres without asking
 _POSSIBLE = (0.005, 1.0)  # m, of what a unit that was named may lead to
 _LIKELY = (0.02, 0.4)  # m, of what makes a unit worth proposing
 _THINNEST = 2e-4  # m
+_SCALES = ((0.01, 1000.0, "mm"), (1.0, 100.0, "cm"), (1000.0, 1.0, "m"))
+"""Up to which length (m) which unit suits, and how many of it are a metre."""
 _COMMON = (
     (0.015, "a pea"),
     (0.03, "a grape"),
@@ -48,17 +50,17 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
         fitting = [other for other in others if _LIKELY[0] <= longest * METRES[other] <= _LIKELY[1]]
         size = length(longest * METRES[taken])
         if unit != "guess" or len(fitting) != 1:
-            options = [f"{_UNIT_NAMES[u]}, add '--unit {u}' ({length(longest * METRES[u])})" for u in fitting]
+            options = [f"{UNIT_NAMES[u]}, add '--unit {u}' ({length(longest * METRES[u])})" for u in fitting]
             remedy = f"Set '--scale {0.1 / (max(sides) * METRES[taken]):.3g}' for an object of 10 cm."
             if options:
                 remedy = f"If they are {'; if '.join(options)}; or set --scale."
             fault = "large" if longest * METRES[taken] > high else "small"
             raise CongraspError(
-                f"{path} is {size} long if its numbers are {_UNIT_NAMES[taken]}: too {fault} for a hand.", remedy
+                f"{path} is {size} long if its numbers are {UNIT_NAMES[taken]}: too {fault} for a hand.", remedy
             )
         taken = fitting[0]
         notes.append(
-            f"it would be {size} long in metres, so its numbers are taken as {_UNIT_NAMES[taken]}: "
+            f"it would be {size} long in metres, so its numbers are taken as {UNIT_NAMES[taken]}: "
             f"{length(longest * METRES[taken])} (if that is wrong, add --unit or --scale)"
         )
     factor = METRES[taken] * scale
@@ -70,12 +72,42 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
     return factor
 
 
+def guessed_unit(path: object, sides: tuple[float, float, float]) -> str:
+    """The unit that makes an object for a hand of a mesh with these sides; empty if several do.
+
+    Raises:
+      CongraspError: none does.
+    """
+    longest = max(sides)
+    if _PLAUSIBLE[0] <= longest <= _PLAUSIBLE[1]:
+        return "m"
+    fitting = [unit for unit, factor in METRES.items() if _LIKELY[0] <= longest * factor <= _LIKELY[1]]
+    if not fitting and not any(possible for _, possible in sizes_by_unit(sides).values()):
+        raise CongraspError(
+            f"{path} is {longest:.4g} units long: in none of {', '.join(METRES)} is that an object for a hand.",
+            "Scale it in a modelling program.",
+        )
+    return fitting[0] if len(fitting) == 1 else ""
+
+
+def sizes_by_unit(sides: tuple[float, float, float]) -> dict[str, tuple[str, bool]]:
+    """For each unit that a mesh of these sides may have: its size for people, and whether a hand could grasp that."""
+    return {
+        unit: (_size([side * factor for side in sides]), _POSSIBLE[0] <= max(sides) * factor <= _POSSIBLE[1])
+        for unit, factor in METRES.items()
+    }
+
+
+def _size(sides: Sequence[float]) -> str:
+    """Three sides in metres, all in the unit that suits the longest."""
+    longest = max(sides)
+    factor, unit = next(((f, u) for limit, f, u in _SCALES if longest < limit), (1e-3, "km"))
+    return f"{' x '.join(f'{side * factor:.3g}' for side in sides)} {unit}"
+
+
 def length(metres: float) -> str:
     """A length with a unit that suits it."""
-    for limit, unit, factor in ((0.01, "mm", 1000.0), (1.0, "cm", 100.0), (1000.0, "m", 1.0)):
-        if metres < limit:
-            return f"{metres * factor:.3g} {unit}"
-    return f"{metres / 1000:.3g} km"
+    return _size([metres])
 
 
 def size_in_words(sides: Sequence[float] | np.ndarray) -> str:

@@ -5,6 +5,7 @@ import functools
 import pathlib
 import threading
 from collections.abc import Callable, Iterator
+from typing import cast
 
 from common.errors import CongraspError
 from common.objects import procedural
@@ -14,14 +15,18 @@ from common.policy.pretrained import hands_with_policy, policy_file
 from common.transport import urls
 from common.transport.base import Transport
 from common.transport.security import check_exposure
+from learner.run_directory import LOGS
 from services.assets.objects.named import objects_at, one_object
 from services.assets.objects.options import ImportOptions
+from services.assets.objects.sizes import Unit
+from services.assets.objects.sources import read_mesh
 from services.ops.logs import log
 from services.serve.server import follow_file, follow_run
+from services.viz.studio.catalogue import Catalogue
 from services.viz.studio.grasping import PolicyGrasping
 from services.viz.studio.recordings import Recordings
 from services.viz.studio.server import PageServer
-from services.viz.studio.session import Catalogue, Session
+from services.viz.studio.session import Session
 from services.viz.studio.training import Follower, TrainingWindow
 
 _GUESS = ImportOptions(unit="guess")
@@ -53,7 +58,7 @@ def open_view(
         )
     check_exposure(f"tcp/{f'[{host}]' if ':' in host else host}:{port}", None, insecure=insecure)
     with contextlib.ExitStack() as stack:
-        window = TrainingWindow(run) if connect or recordings else None
+        window = TrainingWindow(run if connect else _run_of(recordings)) if connect or recordings else None
         if recordings is not None and window is not None:
             _read(window, recordings)
         if connect and window is not None:
@@ -64,7 +69,9 @@ def open_view(
             hands = {"of the policy": functools.partial(PolicyGrasping, follow_file(policy), policy.name)}
         else:
             hands = _pretrained()
-        session = Session(hands, catalogue(objects), take_mesh, window, Recordings(recordings) if recordings else None)
+        session = Session(
+            hands, catalogue(objects), MeshImporter(), window, Recordings(recordings) if recordings else None
+        )
         stack.callback(session.close)
         server = PageServer(session.gets, session.posts, host, port)
         stack.callback(server.close)
@@ -108,10 +115,24 @@ def catalogue(objects: pathlib.Path | None) -> Catalogue:
     return Catalogue(makers)
 
 
-def take_mesh(path: pathlib.Path) -> tuple[GraspObject, list[str]]:
-    """Imports one mesh; with notes for the user."""
-    obj = one_object(path, _GUESS)
-    return obj, list(obj.notes)
+class MeshImporter:
+    """Imports meshes as `congrasp objects import` does."""
+
+    def sides(self, path: pathlib.Path) -> tuple[float, float, float]:
+        """The sides of a mesh in its own unit."""
+        x, y, z = read_mesh(path).extents.tolist()
+        return x, y, z
+
+    def load(self, path: pathlib.Path, unit: str) -> tuple[GraspObject, list[str]]:
+        """The object of a mesh; with notes for the user."""
+        obj = one_object(path, ImportOptions(unit=cast(Unit, unit)))
+        return obj, list(obj.notes)
+
+
+def _run_of(recordings: pathlib.Path | None) -> str:
+    """The name of a run by the folder of its recordings."""
+    names = [part for part in recordings.resolve().parts if part != LOGS] if recordings else []
+    return names[-1] if names else ""
 
 
 def _read(window: TrainingWindow, recordings: pathlib.Path) -> None:

@@ -1,7 +1,7 @@
 """An object's surface as the studio paints it: the avoid region, and a mesh fine enough to show it."""
 
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,14 +13,23 @@ from common.objects.spec import GraspObject
 _versions = itertools.count(1)
 
 
+class Paint(NamedTuple):
+    """What is painted."""
+
+    avoid: np.ndarray
+    """(512,) bool, surface points of the painted avoid region."""
+    shown: np.ndarray
+    """(V,) bool, vertices that are painted."""
+    version: int
+    """Another for all other paint, on any canvas."""
+
+
 class Canvas:
     """The paint on one object, none at first.
 
     Attributes:
-      avoid: (512,) bool, surface points of the painted avoid region.
       vertices, faces: (V, 3), (E, 3) of the mesh that is painted on.
-      shown: (V,) bool, vertices that are painted.
-      version: changes with the paint, and is another for every canvas.
+      paint: what is painted.
     """
 
     def __init__(self, obj: GraspObject):
@@ -28,6 +37,11 @@ class Canvas:
         self._obj = obj
         self.vertices, self.faces = finer(obj.visual_vertices, obj.visual_faces)
         self._set(np.zeros(len(obj.points), bool), np.zeros(len(self.vertices), bool))
+
+    @property
+    def avoid(self) -> np.ndarray:
+        """(512,) bool, surface points of the painted avoid region."""
+        return self.paint.avoid
 
     def brush(self, points: Any, radius: float, avoid: bool) -> None:
         """Paints what is within `radius` (m) of points (N, 3), or takes the paint away."""
@@ -42,11 +56,11 @@ class Canvas:
             squared = ((places[:, None] - strokes[None]) ** 2).sum(-1).min(-1, initial=np.inf)
             return np.where(squared <= radius**2, avoid, before)
 
-        self._set(brushed(self._obj.points, self.avoid), brushed(self.vertices, self.shown))
+        self._set(brushed(self._obj.points, self.avoid), brushed(self.vertices, self.paint.shown))
 
     def fill(self, avoid: bool) -> None:
         """Paints everything in one colour."""
-        self._set(np.full_like(self.avoid, avoid), np.full_like(self.shown, avoid))
+        self._set(np.full_like(self.avoid, avoid), np.full_like(self.paint.shown, avoid))
 
     def take_parts(self) -> None:
         """The paint that an object came with: its non-graspable parts."""
@@ -55,4 +69,4 @@ class Canvas:
 
     def _set(self, avoid: np.ndarray, shown: np.ndarray) -> None:
         """Takes new paint."""
-        self.avoid, self.shown, self.version = avoid, shown, next(_versions)
+        self.paint = Paint(avoid, shown, next(_versions))

@@ -1,6 +1,7 @@
 """Grasps of a policy as the studio asks for them: exactly as drawn, and close to it where that fails."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,12 @@ from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.parallel import cores
 from common.request import GraspRequest
-from common.task.constraints import known, require_known
+from common.task.constraints import get_constraint, known, require_known
+from common.task.constraints.priority import explain
 from common.wire.codec import Message
 from services.grasp.grasper import costs, repeated, surface_of
 from services.serve.server import Source
+from services.viz.studio.diagnosis import why_nothing_held
 from services.viz.studio.jobs import Progress
 
 ATTEMPTS = 8
@@ -77,19 +80,44 @@ class PolicyGrasping:
     def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
         """The episode of the grasp that was drawn if it holds, else of the best of those near it.
 
-        Its meta `note` says which it is.
+        Its meta `note` says which it is; where none held, why.
         """
         first_time = not self._compiled
         progress("compiling: the first grasp takes some seconds more" if first_time else "newest weights", 0.02)
         self.refresh()
         require_known(request.constraints, self.task)
-        episodes, aside = _episodes(self.hand, self.task, obj, request)
-        steps = self._attempts.steps
-        outcome = self._attempts.run(obj, episodes, lambda step: progress("grasping", step / steps))
+        outcome, aside = self._attempt(obj, request, lambda share: progress("grasping", share))
         self._compiled = True
         index = _best(outcome, tuple(request.constraints), self.task.approach_steps - 1)
         about = {"actor": "studio", "note": _note(outcome, index, aside)}
-        return self._attempts.episode(outcome, index, surface_of(self.task, obj), obj, about)
+        episode = self._attempts.episode(outcome, index, surface_of(self.task, obj), obj, about)
+        if (outcome.metrics["held"] > 0).any():
+            return episode
+
+        def held(weaker: GraspRequest, without: str) -> int:
+            """How many attempts hold under a weaker request."""
+            text = f"nothing held; without the {get_constraint(without).title}"
+            found, _ = self._attempt(obj, weaker, lambda share: progress(text, share))
+            return int((found.metrics["held"] > 0).sum())
+
+        asked = tuple(name for name in request.constraints if get_constraint(name).optional)
+        note = why_nothing_held(
+            episode,
+            request,
+            explain(asked, bool(outcome.redirected[index])),
+            held,
+            attempts=ATTEMPTS,
+            drop_height=self.task.drop_height,
+        )
+        return Message(episode.arrays, {**episode.meta, "note": note})
+
+    def _attempt(
+        self, obj: GraspObject, request: GraspRequest, progress: Callable[[float], None]
+    ) -> tuple[Outcome, np.ndarray]:
+        """Outcome of a request and of others near it, and how far (B,) in m each is beside it."""
+        episodes, aside = _episodes(self.hand, self.task, obj, request)
+        steps = self._attempts.steps
+        return self._attempts.run(obj, episodes, lambda step: progress(step / steps)), aside
 
 
 def _episodes(
@@ -122,11 +150,9 @@ def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int) -> int:
 
 
 def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
-    """Why another grasp than the drawn one is shown, or that none held; empty otherwise."""
+    """Why another grasp than the drawn one is shown; empty if it is that one, or none held."""
     held = outcome.metrics["held"] > 0
-    if not held.any():
-        return f"Neither what was drawn nor {ATTEMPTS - 1} others near it held. Try another arrow."
-    if index:
+    if held.any() and index:
         why = "did better" if held[0] else "held, which what was drawn did not"
         return f"Of {ATTEMPTS - 1} others near what was drawn, this one {why}: {1000 * aside[index]:.0f} mm beside it."
     return ""

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from common.hands import known_hand
 from common.task.constraints import CONSTRAINTS
 from common.task.constraints.base import ErrorSpec
+from common.task.reward import GRASP
 from common.wire.codec import Message
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.goals import active_blocks, active_constraints
@@ -16,6 +17,10 @@ from services.record.goals import active_blocks, active_constraints
 TOUCH = 0.05
 """Newtons from which a link counts as touching."""
 _UNITS = {"rad": (180 / np.pi, "°"), "m": (100.0, " cm"), "": (100.0, " %")}
+MEANINGS = {term.name: term.meaning for term in GRASP} | {
+    weight.name: weight.meaning for constraint in CONSTRAINTS for weight in constraint.weights
+}
+"""What each term of the reward is, by its name."""
 
 
 class Lane(NamedTuple):
@@ -85,4 +90,8 @@ def for_page(episode: Message) -> Message:
         position, quaternion = mujoco_link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
         arrays["ghost_position"] = (turn.apply(position) + episode.arrays["goal/pose_position"]).astype(np.float32)
         arrays["ghost_quaternion"] = (turn * _turn(quaternion)).as_quat(scalar_first=True).astype(np.float32)
-    return Message(arrays, {**episode.meta, "lanes": {name: lane.legend for name, lane in found.items()}})
+    terms = {name.removeprefix("reward/") for name in arrays if name.startswith("reward/")}
+    legends = {name: lane.legend for name, lane in found.items()}
+    return Message(
+        arrays, {**episode.meta, "lanes": legends, "terms": {name: MEANINGS.get(name, "") for name in terms}}
+    )

@@ -33,7 +33,13 @@ class Download(NamedTuple):
     data: bytes
 
 
-Answer = dict[str, Any] | list[Any] | Message | Download
+class Picture(NamedTuple):
+    """A PNG file's content, which a browser shows."""
+
+    png: bytes
+
+
+Answer = dict[str, Any] | list[Any] | Message | Download | Picture
 Get = Callable[[Mapping[str, str]], Answer]
 """Query parameters to answer."""
 Post = Callable[[Mapping[str, str], bytes], Answer]
@@ -192,6 +198,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             name = urllib.parse.quote(found.name)
             more = {"Content-Disposition": f"attachment; filename*=UTF-8''{name}"}
             self._send(200, "application/octet-stream", found.data, more)
+        elif isinstance(found, Picture):
+            self._send(200, "image/png", found.png)
         else:
             self._send(200, "application/json", json.dumps(found, allow_nan=False).encode())
 

@@ -1,11 +1,11 @@
 """One user's studio with its policy, objects and motions, beside the window on a training: what the page talks to."""
 
+import functools
 import json
 import pathlib
-import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,23 +18,23 @@ from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.wire.codec import Message
-from services.export.motion_file import motion_of_episode, save_motion
-from services.export.motion_formats import FORMATS, export_motions
-from services.record.channels import JsonChannels
-from services.record.scene import episode_entries
-from services.record.writer import LogWriter
+from services.assets.objects.sizes import METRES
 from services.viz.shapes import skin_colours
+from services.viz.studio.catalogue import Catalogue, Importer, Uploads
+from services.viz.studio.description import describe
+from services.viz.studio.files import DATA, DRAWN, data_file, drawing
+from services.viz.studio.history import ACTIONS, History
 from services.viz.studio.jobs import Jobs, Progress
 from services.viz.studio.lanes import for_page
+from services.viz.studio.motions import Motions
 from services.viz.studio.recordings import Recordings
-from services.viz.studio.server import Download, Get, Post
+from services.viz.studio.server import Download, Get, Picture, Post
 from services.viz.studio.state import Studio
+from services.viz.studio.thumbnails import Thumbnails
 from services.viz.studio.training import TrainingWindow
 
-EXPORTS = ("npz", "mcap", *FORMATS)
-"""What a motion can be saved as."""
-MOTIONS = 30
-"""Motions that stay to be played and exported."""
+_DRAWING = "drawing"
+"""What a job says it made when that is a picture or a video, and no motion."""
 
 
 class Grasping(Protocol):
@@ -50,38 +50,6 @@ class Grasping(Protocol):
         """The episode of a grasp."""
 
 
-class Catalogue:
-    """Objects to choose from, by name; they are made or imported when they are chosen."""
-
-    def __init__(self, makers: Mapping[str, Callable[[], GraspObject]]):
-        """The first is what a studio begins with."""
-        self._makers = dict(makers)
-        self._made: dict[str, GraspObject] = {}
-
-    @property
-    def names(self) -> list[str]:
-        """What there is."""
-        return list(self._makers)
-
-    def add(self, name: str, maker: Callable[[], GraspObject]) -> str:
-        """One more; returns the name that it got."""
-        free = next(n for n in (name, *(f"{name} ({i})" for i in range(2, 10_000))) if n not in self._makers)
-        self._makers[free] = maker
-        return free
-
-    def drop(self, name: str) -> None:
-        """One less."""
-        self._makers.pop(name, None)
-
-    def get(self, name: str) -> GraspObject:
-        """The object; a CongraspError if there is none or it cannot be imported."""
-        if name not in self._makers:
-            raise CongraspError(f"There is no object '{name[:60]}'.", "Choose one of the list.")
-        if name not in self._made:
-            self._made[name] = self._makers[name]()
-        return self._made[name]
-
-
 class Session:
     """Everything behind the page; its routes are `gets` and `posts`."""
 
@@ -89,7 +57,7 @@ class Session:
         self,
         hands: Mapping[str, Callable[[], Grasping]],
         objects: Catalogue,
-        take_mesh: Callable[[pathlib.Path], tuple[GraspObject, list[str]]],
+        importer: Importer,
         window: TrainingWindow | None = None,
         recordings: Recordings | None = None,
     ):
@@ -98,31 +66,31 @@ class Session:
         Args:
           hands: by name, what loads a policy.
           objects: what can be chosen.
-          take_mesh: imports an uploaded mesh, with notes for the user.
+          importer: makes objects of uploaded meshes.
           window: what is known of a run, or None.
           recordings: its episodes on disk, or None.
         """
-        self._hands, self._objects, self._take_mesh = hands, objects, take_mesh
+        self._hands, self._objects = hands, objects
         self._window, self._recordings = window, recordings
         self._folder = tempfile.TemporaryDirectory(prefix="congrasp-view-")
+        self._uploads = Uploads(pathlib.Path(self._folder.name), objects, importer)
         self._lock = threading.RLock()
-        self._jobs = Jobs()
-        self._motions: dict[str, Message] = {}
-        self._number = 0
+        self._jobs, self._motions, self._thumbnails = Jobs(), Motions(), Thumbnails()
+        self._drawn: Download | None = None
         self._hand = next(iter(hands))
-        self._object = objects.names[0]
-        self._notes: list[str] = []
-        self._grasping = hands[self._hand]()
-        self._studio = Studio(self._grasping.hand, self._grasping.task, objects.get(self._object))
-        self._studio.view()  # compiles the rules
+        self._object, self._shown = objects.names[0], 0
+        self._take_hand(hands[self._hand](), objects.get(self._object))
+        describe(self._studio)  # compiles the rules
         self.gets: dict[str, Get] = {
             "/api/state": lambda query: self.state(),
             "/api/job": lambda query: self._jobs.state(),
             "/api/hand": lambda query: hand_message(query.get("name", self._hand)),
             "/api/object": lambda query: self.mesh(),
-            "/api/paint": lambda query: Message({"avoid": self._studio.canvas.shown}, {}),
+            "/api/rest": lambda query: self.rest_picture(query.get("index", "")),
+            "/api/paint": lambda query: Message({"avoid": self._studio.canvas.paint.shown}, {}),
             "/api/motion": lambda query: for_page(self.motion(query.get("id", ""))),
             "/api/export": lambda query: self.export(query.get("id", ""), query.get("kind", "")),
+            "/api/drawn": lambda query: self.drawn(),
             "/api/training": lambda query: self.training(query.get("names", "")),
             "/api/episodes": lambda query: self.episodes_around(query.get("time", ""), query.get("seconds", "")),
         }
@@ -136,18 +104,23 @@ class Session:
     def state(self) -> dict[str, Any]:
         """What the page shows of studio, policy, objects, motions and job."""
         with self._lock:
+            upload = self._uploads.of(self._object)
             return {
-                "studio": self._studio.view(),
+                "studio": describe(self._studio),
+                "history": self._history.view(),
                 "hands": list(self._hands),
                 "hand": self._hand,
                 "objects": self._objects.names,
                 "chosen": self._object,
-                "notes": self._notes,
+                "shown": self._shown,
+                "upload": None if upload is None else upload.view(),
+                "notes": [] if upload is None else upload.notes,
                 "policy": self._grasping.newest(),
-                "motions": [self._described(key) for key in self._motions][::-1],
+                "motions": self._motions.view(),
                 "training": self._window is not None,
                 "recordings": self._recordings is not None,
-                "exports": EXPORTS,
+                "saves": [*DRAWN, *DATA],
+                "drawn": DRAWN,
                 "job": self._jobs.state(),
             }
 
@@ -157,6 +130,12 @@ class Session:
             vertices, faces = self._studio.canvas.vertices, self._studio.canvas.faces
             return Message({"vertices": vertices, "faces": faces}, {"name": self._studio.obj.name})
 
+    def rest_picture(self, index: str) -> Picture:
+        """The object in one of its resting poses, from 0."""
+        with self._lock:
+            obj = self._studio.obj
+        return self._thumbnails.picture(obj, int(index) if index.isdecimal() and len(index) < 6 else -1)
+
     def motion(self, key: str) -> Message:
         """A motion: one of the studio, `actor:NAME` for an actor's newest episode, `record:ID` for a recorded one."""
         kind, _, name = key.partition(":")
@@ -165,36 +144,17 @@ class Session:
         if kind == "record" and self._recordings is not None:
             return self._recordings.episode(name)
         with self._lock:
-            if key not in self._motions:
-                raise CongraspError(f"There is no motion '{key[:60]}'.", "Press Grasp, or choose one of the list.")
-            return self._motions[key]
+            return self._motions.get(key)
 
     def export(self, key: str, kind: str) -> Download:
-        """A motion as a file of one of `EXPORTS`; what is a folder comes as a zip archive."""
-        if kind not in EXPORTS:
-            raise CongraspError(f"A motion cannot be exported as '{kind[:20]}'.", f"Choose from: {', '.join(EXPORTS)}.")
-        episode = self.motion(key)
-        with tempfile.TemporaryDirectory(prefix="congrasp-export-") as folder:
-            path = pathlib.Path(folder) / f"motion{FORMATS.get(kind, f'.{kind}')}"
-            try:
-                if kind == "npz":
-                    save_motion(path, motion_of_episode(episode))
-                elif kind == "mcap":
-                    writer = LogWriter(pathlib.Path(folder), "motion", run="studio")
-                    writer.write(*episode_entries("studio", episode, 0, 0, JsonChannels()))
-                    writer.close()
-                    path = writer.files[0]
-                else:
-                    export_motions([motion_of_episode(episode)], kind, path)
-            except ModuleNotFoundError as error:
-                raise CongraspError(
-                    f"This needs the package '{error.name}'.", "Run: pip install 'congrasp[export]'"
-                ) from None
-            if path.is_dir():
-                path = pathlib.Path(shutil.make_archive(str(path), "zip", path))
-            number = "".join(c if c.isalnum() else "-" for c in key)[-40:]
-            suffix = f".{kind}" if kind in ("npz", "mcap") else FORMATS[kind] or f"-{kind}.zip"
-            return Download(f"{episode.meta['object']}-{number}{suffix}", path.read_bytes())
+        """A motion as a file of one of `DATA`."""
+        return data_file(self.motion(key), key, kind)
+
+    def drawn(self) -> Download:
+        """The picture or video that was drawn last; a CongraspError if there is none."""
+        if self._drawn is None:
+            raise CongraspError("Nothing has been drawn yet.", "Save a motion as mp4 or png.")
+        return self._drawn
 
     def training(self, names: str) -> dict[str, Any]:
         """What the window shows; `names`: curves, separated by commas."""
@@ -220,16 +180,20 @@ class Session:
             action = request.pop("action")
         except (ValueError, KeyError):
             raise CongraspError("The request is not a JSON object with an 'action'.") from None
-        actions: dict[str, Callable[..., Any]] = {
-            "hand": self._choose_hand,
-            "object": self._choose_object,
-            "grasp": self._grasp,
-            "forget": self._forget,
-            **{name: getattr(self._studio, name) for name in _ACTIONS},
-        }
-        if action not in actions:
-            raise CongraspError(f"The studio cannot do '{str(action)[:40]}'.", f"It can: {', '.join(actions)}.")
         with self._lock:
+            actions: dict[str, Callable[..., Any]] = {
+                "hand": self._choose_hand,
+                "object": self._choose_object,
+                "unit": self._choose_unit,
+                "grasp": self._grasp,
+                "draw_motion": self._draw_motion,
+                "delete": lambda id: self._motions.delete(id),
+                "undo": self._history.undo,
+                "redo": self._history.redo,
+                **{name: functools.partial(self._history.do, name) for name in ACTIONS},
+            }
+            if action not in actions:
+                raise CongraspError(f"The studio cannot do '{str(action)[:40]}'.", f"It can: {', '.join(actions)}.")
             try:
                 actions[action](**request)
             except TypeError as error:
@@ -237,24 +201,32 @@ class Session:
         return self.state()
 
     def _upload(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
-        """A mesh to import; the object of its name is chosen when that is done."""
-        name = pathlib.PurePosixPath(query.get("name", "").replace("\\", "/")).name
-        if not body:
-            raise CongraspError(f"{name or 'The file'} is empty (0 bytes).", "Export or download it again.")
-        path = pathlib.Path(self._folder.name) / (name or "mesh")
-        path.write_bytes(body)
+        """A mesh to import; its object is chosen when that is done, unless several units would do."""
+        upload = self._uploads.take(query.get("name", ""), body)
+        if not upload.unit:
+            with self._lock:
+                self._uploads.pending = upload
+            return self._jobs.state()
+        return self._import(upload.path.name, lambda: self._uploads.load(upload, upload.unit))
+
+    def _choose_unit(self, unit: str) -> None:
+        """Imports the uploaded mesh anew in another unit."""
+        upload, replaces = self._uploads.of(self._object), "" if self._uploads.pending else self._object
+        if upload is None or unit not in METRES:
+            raise CongraspError(f"The unit cannot be '{str(unit)[:20]}'.", "Open a mesh, then choose m, cm, mm or in.")
+        self._import(upload.path.name, lambda: self._uploads.load(upload, unit, replaces))
+
+    def _import(self, file: str, load: Callable[[], str]) -> dict[str, Any]:
+        """Begins an import, which returns the object's name; shows the object."""
 
         def work(progress: Progress) -> None:
             """Imports it."""
-            progress(f"importing {name}: repair and convex pieces, up to a minute", 0.1)
-            try:
-                obj, notes = self._take_mesh(path)
-            except CongraspError as error:  # the user knows the file, not where it was put
-                raise CongraspError(str(error).replace(str(path), name)) from None
+            progress(f"importing {file}: repair and convex pieces, up to a minute", 0.1)
+            name = load()
             with self._lock:
-                self._show(self._objects.add(obj.name, lambda: obj), notes)
+                self._show(name)
 
-        return self._jobs.start(f"importing {name}", work)
+        return self._jobs.start(f"importing {file}", work)
 
     def _choose_hand(self, name: str) -> None:
         """Loads the policy of another hand."""
@@ -266,10 +238,16 @@ class Session:
             progress(f"loading the policy of the hand {name}", 0.2)
             grasping = self._hands[name]()
             with self._lock:
-                self._hand, self._grasping = name, grasping
-                self._studio = Studio(grasping.hand, grasping.task, self._studio.obj)
+                self._hand = name
+                self._take_hand(grasping, self._studio.obj)
 
         self._jobs.start(f"loading the policy of the hand {name}", work)
+
+    def _take_hand(self, grasping: Grasping, obj: GraspObject) -> None:
+        """A studio for a policy's hand."""
+        self._grasping = grasping
+        self._studio = Studio(grasping.hand, grasping.task, obj)
+        self._history = History(self._studio)
 
     def _choose_object(self, name: str) -> None:
         """Makes or imports another object."""
@@ -283,12 +261,14 @@ class Session:
 
         if name not in self._objects.names:
             self._objects.get(name)
+        self._uploads.pending = None
         self._jobs.start(f"loading {name}", work)
 
-    def _show(self, name: str, notes: Sequence[str] = ()) -> None:
+    def _show(self, name: str) -> None:
         """Puts an object that is there into the studio."""
         self._studio.take(self._objects.get(name))
-        self._object, self._notes = name, list(notes)
+        self._history = History(self._studio)
+        self._object, self._shown = name, self._shown + 1
 
     def _grasp(self) -> None:
         """Begins the grasp that is requested; its motion is kept."""
@@ -299,39 +279,22 @@ class Session:
             """Grasps; returns the motion's key."""
             episode = grasping.grasp(obj, request, progress)
             with self._lock:
-                self._number += 1
-                self._motions[str(self._number)] = episode
-                while len(self._motions) > MOTIONS:
-                    del self._motions[next(iter(self._motions))]
-                return str(self._number)
+                return self._motions.keep(episode)
 
         self._jobs.start("grasping", work)
 
-    def _forget(self, id: str) -> None:
-        """Deletes a motion."""
-        self._motions.pop(id, None)
+    def _draw_motion(self, id: str, kind: str, camera: Mapping[str, Any], frame: int = 0) -> None:
+        """Begins to draw a motion as one of `DRAWN`; `drawn` then has it."""
+        episode = self.motion(str(id))
 
-    def _described(self, key: str) -> dict[str, Any]:
-        """What a list shows of a motion."""
-        episode = self._motions[key]
-        meta, metrics = episode.meta, episode.meta.get("metrics", {})
-        return {
-            "id": key,
-            "object": meta["object"],
-            "success": bool(meta["success"]),
-            "held": bool(metrics.get("held", 0.0) > 0),
-            "note": meta.get("note", ""),
-            "version": meta.get("version"),
-            "steps": len(episode.arrays["table"]),
-            "metrics": {name: float(value) for name, value in metrics.items() if np.isfinite(value)},
-        }
+        def work(progress: Progress) -> str:
+            """Draws it."""
+            self._drawn = drawing(
+                episode, id, kind, camera, frame, lambda share: progress(f"drawing the {kind}", share)
+            )
+            return _DRAWING
 
-
-_ACTIONS = (
-    *("set_rest_pose", "ask", "choose", "set_heading", "snap_heading", "roll", "paint", "fill"),
-    *("close_hand", "draw", "suggest"),
-)
-"""Methods of `Studio` that a page may call, with their arguments by name."""
+        self._jobs.start(f"drawing the {kind}", work)
 
 
 def hand_message(name: str) -> Message:

@@ -2,17 +2,14 @@
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from actors.initial import initial_hand
-from common import rotations
 from common.config import TaskConfig
 from common.errors import CongraspError
-from common.hands import kinematics
 from common.hands.spec import Hand
 from common.objects.shapes import matrix
 from common.objects.spec import GraspObject
@@ -25,22 +22,12 @@ from common.task.types import Goal, Surface
 from common.wire.codec import Message
 from services.grasp.constraint_sets import make_sets
 from services.grasp.grasper import with_avoid
-from services.viz.studio.canvas import Canvas
+from services.viz.studio.arrow import Arrow, arrow_of, from_above, vector
+from services.viz.studio.canvas import Canvas, Paint
 
 TOOLS = ("affordance", "pose", "trajectory")
 """Constraints that have tools of their own; the page makes toggles for the flags of the others."""
 _LEAST_PATH = 0.03  # m
-
-
-class Arrow(NamedTuple):
-    """A heading in the object frame."""
-
-    position: np.ndarray
-    """(3,) where the middle of the grasping hand should be, m."""
-    direction: np.ndarray
-    """(3,) unit, the way the hand comes."""
-    cross: np.ndarray
-    """(3,) unit, orthogonal to the direction: along the hand's cross-finger axis."""
 
 
 class Path(NamedTuple):
@@ -52,6 +39,18 @@ class Path(NamedTuple):
     """(K, 4) w x y z."""
 
 
+class Edit(NamedTuple):
+    """All that a user sets of a request for one object; nothing in it is ever changed."""
+
+    rest: int
+    asked: frozenset[str]
+    arrow: Arrow
+    pose: Poses | None
+    path: Path | None
+    others: Mapping[str, Mapping[str, np.ndarray]]
+    paint: Paint
+
+
 class Studio:
     """One user's request: every method is something that the user does, and raises a CongraspError if it cannot be.
 
@@ -60,6 +59,9 @@ class Studio:
       rest: index of its resting pose.
       asked: names of the optional constraints that are switched on.
       arrow: the heading.
+      pose: the reference pose, or None.
+      path: the wrist path, or None.
+      others: flags of the constraints without tools of their own.
       canvas: the object's surface, with the painted avoid region.
     """
 
@@ -71,23 +73,32 @@ class Studio:
     def take(self, obj: GraspObject) -> None:
         """Another object, with nothing requested but its heading from above."""
         self.obj, self.rest = obj, 0
-        self.asked: set[str] = set()
+        self.asked: frozenset[str] = frozenset()
         self.canvas = Canvas(obj)
         self.pose: Poses | None = None
         self.path: Path | None = None
-        self.others: dict[str, dict[str, np.ndarray]] = {
+        self.others: Mapping[str, Mapping[str, np.ndarray]] = {
             c.name: c.suggested(self.hand, self.task) for c in optional(self.task) if c.name not in TOOLS
         }
         self._sets: tuple[bytes, Message] | None = None
         self._next = {"heading": 0, "pose": 0, "trajectory": 0}
-        self.arrow = self._from_above()
+        self.arrow = from_above(obj, self.rest)
+
+    @property
+    def edit(self) -> Edit:
+        """All that the user has set; setting it brings another state back."""
+        return Edit(self.rest, self.asked, self.arrow, self.pose, self.path, self.others, self.canvas.paint)
+
+    @edit.setter
+    def edit(self, edit: Edit) -> None:
+        self.rest, self.asked, self.arrow, self.pose, self.path, self.others, self.canvas.paint = edit
 
     def set_rest_pose(self, rest: int) -> None:
         """Another resting pose."""
         if not 0 <= rest < len(self.obj.rest_poses):
             raise CongraspError(f"The object '{self.obj.name}' has no resting pose {rest + 1}.")
         self.rest = rest
-        self.arrow = self._from_above()
+        self.arrow = from_above(self.obj, rest)
 
     def ask(self, constraint: str, on: bool) -> None:
         """Switches an optional constraint; what it needs and is not there yet is suggested."""
@@ -97,10 +108,10 @@ class Studio:
         if on and constraint == "affordance" and not self.canvas.avoid.any():
             self.canvas.take_parts()
         if on and constraint == "pose" and self.pose is None:
-            self.close_hand()
+            self._close()
         if on and constraint == "trajectory" and self.path is None:
-            self.suggest("trajectory")
-        (self.asked.add if on else self.asked.discard)(constraint)
+            self._suggest("trajectory")
+        self._switch(constraint, on)
 
     def choose(self, constraint: str, field: str, values: Any) -> None:
         """Sets the flags of a constraint without tools of its own, and asks for it."""
@@ -110,8 +121,9 @@ class Studio:
         flags = self.others[constraint][field]
         if not isinstance(values, list) or len(values) != len(flags):
             raise CongraspError(f"'{constraint}' takes {len(flags)} flags.")
-        self.others[constraint] = {**self.others[constraint], field: np.array([bool(value) for value in values])}
-        self.asked.add(constraint)
+        chosen = {**self.others[constraint], field: np.array([bool(value) for value in values])}
+        self.others = {**self.others, constraint: chosen}
+        self._switch(constraint, True)
 
     def set_heading(self, position: Any, direction: Any, cross: Any = None) -> None:
         """Sets the heading.
@@ -121,24 +133,17 @@ class Studio:
           direction: (3,) of any length but zero.
           cross: (3,) along the cross-finger axis; the present one, made orthogonal, if not given.
         """
-        position, direction = _vector("arrow's position", position), _vector("arrow's direction", direction)
-        length = np.linalg.norm(direction)
-        if length < 1e-6:
-            raise CongraspError("The arrow has no direction.", "Drag its tail away from its tip.")
-        direction = direction / length
-        wanted = self.arrow.cross if cross is None else _vector("arrow's roll", cross)
-        self.arrow = Arrow(position, direction, _orthogonal(wanted, direction))
+        self.arrow = arrow_of(position, direction, self.arrow.cross if cross is None else cross)
 
     def snap_heading(self, surface: Any, direction: Any) -> None:
         """Sets the heading through a point (3,) of the surface: its target is as deep inside as in training."""
-        surface, direction = _vector("point", surface), _vector("arrow's direction", direction)
+        surface, direction = vector("point", surface), vector("arrow's direction", direction)
         self.set_heading(surface + INWARD * direction / max(1e-6, float(np.linalg.norm(direction))), direction)
 
-    def roll(self, angle: float) -> None:
-        """Turns the hand around the arrow, by an angle in rad."""
-        angle = float(_vector("angle", [angle, 0.0, 0.0])[0])
-        other = np.cross(self.arrow.direction, self.arrow.cross)
-        self.arrow = self.arrow._replace(cross=np.cos(angle) * self.arrow.cross + np.sin(angle) * other)
+    def set_roll(self, angle: float) -> None:
+        """Sets the angle of the hand around the arrow, in rad; see `Arrow.roll`."""
+        angle = float(vector("angle", [angle, 0.0, 0.0])[0])
+        self.arrow = self.arrow.with_roll(angle, self.up)
 
     def paint(self, points: Any, radius: float, avoid: bool) -> None:
         """Brushes over points (N, 3) of the surface: they join the avoid region, or leave it.
@@ -154,17 +159,24 @@ class Studio:
         self._repainted()
 
     def close_hand(self) -> None:
-        """A reference pose: the hand at the arrow, closed around the object."""
+        """Asks for a reference pose: the hand at the arrow, closed around the object."""
+        require_known(["pose"], self.task)
+        self._close()
+        self._switch("pose", True)
+
+    def _close(self) -> None:
+        """The pose of `close_hand`."""
         arrow = (np.asarray(part, np.float32)[None] for part in self.arrow)
         pose = closed_poses(self.hand, np.asarray(self.obj.points), np.asarray(self.obj.normals), *arrow)
         self.pose = Poses(*(np.asarray(field)[0] for field in pose))
 
     def draw(self, points: Any) -> None:
-        """A wrist path through points (N, 3) of the object frame, from far to near.
+        """Asks for a wrist path through points (N, 3) of the object frame, from far to near.
 
         It is moved little by little along its way, so that it ends where the wrist of the reference pose is, or of the
         hand closed at the arrow; the wrist is turned as there all the way.
         """
+        require_known(["trajectory"], self.task)
         drawn = np.asarray(points, float)
         if drawn.ndim != 2 or drawn.shape[1:] != (3,) or not 2 <= len(drawn) <= 2000 or not np.isfinite(drawn).all():
             raise CongraspError("A path must be 2 to 2000 points of three numbers.")
@@ -174,21 +186,29 @@ class Studio:
                 f"The path is {100 * along[-1]:.1f} cm long.", f"Draw {100 * _LEAST_PATH:.0f} cm or more."
             )
         if self.pose is None:
-            self.close_hand()
+            self._close()
         assert self.pose is not None
         share = np.linspace(0.0, 1.0, self.task.trajectory_points)
         even = np.stack([np.interp(share * along[-1], along, drawn[:, i]) for i in range(3)], -1)
         position = even + share[:, None] * (self.pose.position - even[-1])
         self.path = Path(position, np.tile(self.pose.quaternion, (len(share), 1)))
+        self._switch("trajectory", True)
 
     def suggest(self, constraint: str) -> None:
-        """The next of the headings, reference poses or wrist paths that training would draw for this object.
+        """Asks for the next heading, reference pose or wrist path that training would draw for this object.
 
         Raises:
           CongraspError: there are none in this resting pose.
         """
         if constraint not in self._next:
             raise CongraspError(f"Nothing can be suggested for '{constraint}'.", "Choose heading, pose or trajectory.")
+        require_known([constraint], self.task)
+        self._suggest(constraint)
+        if get_constraint(constraint).optional:
+            self._switch(constraint, True)
+
+    def _suggest(self, constraint: str) -> None:
+        """The heading, pose or path of `suggest`."""
         sets = self._constraint_sets().arrays
         region = int("affordance" in self.asked and bool(self.canvas.avoid.any()))
         allowed = sets["heading/allowed" if constraint == "heading" else "pose/allowed"][region, self.rest]
@@ -228,9 +248,9 @@ class Studio:
 
     def _request(self) -> GraspRequest:
         """The request, whether or not it is possible."""
-        given: dict[str, dict[str, np.ndarray]] = {"affordance": {}, **self.others}
+        given: dict[str, Mapping[str, np.ndarray]] = {"affordance": {}, **self.others}
         given |= {name: part._asdict() for name, part in (("pose", self.pose), ("trajectory", self.path)) if part}
-        constraints = {"heading": self.arrow._asdict()}
+        constraints: dict[str, Mapping[str, np.ndarray]] = {"heading": self.arrow._asdict()}
         constraints |= {c.name: given[c.name] for c in optional(self.task) if c.name in self.asked}
         avoid = self.canvas.avoid if "affordance" in self.asked else None
         return GraspRequest(constraints, avoid, rest=self.rest)
@@ -274,64 +294,18 @@ class Studio:
             return "The wrist path goes through the table. Draw it higher, or take another suggestion."
         return ""
 
-    def view(self) -> dict[str, Any]:
-        """Everything that a page shows of it, as JSON; object frame but for the resting pose."""
-        resolution = self.resolution
-        goal = resolution.goal
-        active = {block: bool(on) for block, on in goal.active.items()}
-        size = np.ptp(self.obj.visual_vertices, axis=0)
-        return {
-            "hand": self.hand.name,
-            "object": {
-                "name": self.obj.name,
-                "size_cm": [round(100 * float(side), 1) for side in size],
-                "mass_g": round(1000 * self.obj.mass),
-                "faces": len(self.canvas.faces),
-                "rests": len(self.obj.rest_poses),
-            },
-            "rest": {"index": self.rest, **_pose(self.obj.rest_poses[self.rest])},
-            "asked": sorted(self.asked),
-            "known": [constraint.name for constraint in optional(self.task)],
-            "others": [self._toggles(name, fields) for name, fields in self.others.items()],
-            "arrow": {name: part.tolist() for name, part in self.arrow._asdict().items()},
-            "active": {
-                "masks": active,
-                "position": goal["heading"].position.tolist(),
-                "direction": goal["heading"].direction.tolist(),
-                "overruled": bool(resolution.redirected)
-                or any("heading" in get_constraint(n).overrides for n in self.asked),
-            },
-            "explanation": self.explanation,
-            "trouble": self.trouble,
-            "start": self._start(goal),
-            "pose": None if self.pose is None else self._ghost(self.pose),
-            "path": None if self.path is None else np.asarray(self.path.position).tolist(),
-            "painted": self.canvas.version,
-            "avoid_share": round(float(self.canvas.avoid.mean()), 3),
-        }
-
     def _repainted(self) -> None:
         """Asks for the affordance where there is paint."""
-        (self.asked.add if self.canvas.avoid.any() else self.asked.discard)("affordance")
+        self._switch("affordance", bool(self.canvas.avoid.any()))
 
-    def _toggles(self, name: str, fields: dict[str, np.ndarray]) -> dict[str, Any]:
-        """A constraint without tools of its own, as the page shows it."""
-        constraint = get_constraint(name)
-        labels = constraint.labels(self.hand)
-        shown = {field: dict(zip(labels[field], fields[field].tolist(), strict=True)) for field in labels}
-        return {"name": name, "title": constraint.title, "flags": shown}
+    def _switch(self, constraint: str, on: bool) -> None:
+        """Asks for a constraint, or no longer."""
+        self.asked = self.asked | {constraint} if on else self.asked - {constraint}
 
-    def _start(self, goal: Goal) -> dict[str, Any]:
-        """Link frames (L, 3), (L, 4) in the world from which a grasp would begin."""
-        one = jax.tree.map(lambda array: np.asarray(array)[None], goal)
-        rest = np.asarray(self.obj.rest_poses[self.rest], np.float32)[None]
-        position, quaternion = _start(self.hand, self.task, one, rest)
-        return {"position": np.asarray(position).tolist(), "quaternion": np.asarray(quaternion).tolist()}
-
-    def _ghost(self, pose: Poses) -> dict[str, Any]:
-        """Link frames (L, 3), (L, 4) of a reference pose in the object frame."""
-        position, quaternion = _links(self.hand, *(np.asarray(field, np.float32) for field in pose))
-        return {"position": np.asarray(position).tolist(), "quaternion": np.asarray(quaternion).tolist()}
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) unit, away from the table in the object frame."""
+        return matrix(self.obj.rest_poses[self.rest][3:])[2]
 
     def _constraint_sets(self) -> Message:
         """The constraint set of the object with its present paint, made when it is needed."""
@@ -345,59 +319,8 @@ class Studio:
         rest = self.obj.rest_poses[self.rest]
         return rest[:3] + matrix(rest[3:]) @ point
 
-    def _from_above(self) -> Arrow:
-        """Straight down onto the object's top, across its narrower side."""
-        turn = matrix(self.obj.rest_poses[self.rest][3:])
-        world = self.obj.points @ turn.T
-        near = np.linalg.norm(world[:, :2] - (world[:, :2].max(0) + world[:, :2].min(0)) / 2, axis=-1)
-        top = world[near.argsort()[: len(world) // 8], 2].max()
-        middle = (world.max(0) + world.min(0)) / 2
-        narrow = np.eye(3)[int(np.ptp(world[:, :2], axis=0).argmin())]
-        height = max(top - INWARD, world[:, 2].min() + 0.012)
-        target = np.array([middle[0], middle[1], height])
-        return Arrow(target @ turn, np.array([0.0, 0.0, -1.0]) @ turn, narrow @ turn)
-
 
 @functools.partial(jax.jit, static_argnums=0)
 def _resolve(hand: Hand, surface: Surface, goal: Goal, asked: dict[str, jax.Array]) -> Resolution:
     """`resolve`, compiled."""
     return resolve(hand, surface, goal, asked)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _start(hand: Hand, task: TaskConfig, goal: Goal, rest: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Link frames (L, 3), (L, 4) in the world at the start of an episode."""
-    q, position, quaternion = initial_hand(hand, task, goal, rest)
-    return _links(hand, q[0], position[0], quaternion[0])
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _links(hand: Hand, q: jax.Array, position: jax.Array, quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Link frames (L, 3), (L, 4) of finger angles (F,) and a wrist pose (3,), (4,), in the pose's frame."""
-    local = kinematics.link_poses(hand, q)
-    turn = jnp.broadcast_to(quaternion, local[1].shape)
-    return rotations.compose_pose(jnp.broadcast_to(position, local[0].shape), turn, *local)
-
-
-def _vector(what: str, value: Any) -> np.ndarray:
-    """(3,) three finite numbers, or a CongraspError."""
-    try:
-        vector = np.asarray(value, float)
-    except (TypeError, ValueError):
-        vector = np.zeros(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise CongraspError(f"The {what} must be three numbers, not {ascii(value)[:60]}.")
-    return vector
-
-
-def _orthogonal(wanted: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(3,) unit, the part of a vector that is orthogonal to a direction, or any such where there is none."""
-    cross = wanted - wanted @ direction * direction
-    if np.linalg.norm(cross) < 1e-3:
-        cross = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
-    return cross / np.linalg.norm(cross)
-
-
-def _pose(row: np.ndarray) -> dict[str, list[float]]:
-    """A pose (7,) as JSON."""
-    return {"position": row[:3].tolist(), "quaternion": row[3:].tolist()}

@@ -9,10 +9,11 @@ import dataclasses
 import pathlib
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from common.errors import CongraspError
 from common.task.constraints import CONSTRAINTS
@@ -22,9 +23,13 @@ from common.wire.codec import Message, decode
 from services.ops import status as statuses
 from services.record.channels import flatten
 from services.record.reader import Record, is_episode, log_files, metrics_of, read_records
+from services.viz.plots import figures
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows first."""
+_LAST = {"success": "episode/success", "steps_per_second": "steps_per_second"}
+_REPORTED = ("version", "rollouts", "steps_per_second")
+_READ = ("/metrics/", "/events/")
 _EVENTS = 100
 _TREND = 200  # points of an actor's own history that are kept
 _STALE = 15.0  # seconds after which an actor that nobody lists any more is forgotten
@@ -69,22 +74,28 @@ class Actor:
     episodes: int = 0
     recent: collections.deque[bool] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=_TREND))
     """Whether its last episodes succeeded."""
+    last: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Version, rollouts and steps per second as it reported them last."""
 
 
 class TrainingWindow:
-    """Takes what comes from any thread, and gives a page what it shows."""
+    """Takes what comes from any thread, and gives a page what it shows.
+
+    Attributes:
+      live: somebody follows the run; false for one that is read from its recordings alone.
+      damaged: messages that were not what their key says.
+    """
 
     def __init__(self, run: str):
         """Nothing is known yet."""
-        self.run = run
+        self.run, self.live, self.damaged = run, False, 0
         self._lock = threading.Lock()
         self._curves: dict[str, Curve] = {}
         self._actors: dict[str, Actor] = {}
         self._events: collections.deque[dict[str, Any]] = collections.deque(maxlen=_EVENTS)
         self._status: Mapping[str, Any] | None = None
-        self._disconnected = True
-        self.damaged = 0
-        """Messages that were not what their key says."""
+        self._disconnected, self._loading = True, False
+        self._labels: dict[str, dict[str, str]] = {}
 
     def take(self, key: str, message: Message, now: float) -> None:
         """One log message, as published under `log/**`; `now` in seconds since 1970."""
@@ -95,7 +106,7 @@ class TrainingWindow:
                     self._metrics(role, name, message.meta, now)
                 elif kind == "event":
                     text, level = str(message.meta["text"]), str(message.meta["level"])
-                    self._events.append({"time": float(message.meta.get("time", now)), "level": level, "text": text})
+                    self._event(float(message.meta.get("time", now)), level, text)
                 elif kind == "episode":
                     self._episode(name, message, now)
         except (AttributeError, KeyError, TypeError, ValueError):
@@ -116,15 +127,27 @@ class TrainingWindow:
                     del self._actors[name]
 
     def load(self, path: pathlib.Path) -> None:
-        """Curves of a run's recordings, and every actor's newest episode there.
+        """Curves and events of a run's recordings, and what every actor reported last, with its newest episode.
 
         Raises:
           CongraspError: there are none.
         """
+        self._loading = True
+        try:
+            self._read(path)
+        finally:
+            self._loading = False
+
+    def _read(self, path: pathlib.Path) -> None:
+        """The work of `load`."""
         newest: dict[str, Record] = {}
         for file in log_files(path):
-            for record in read_records(file, lambda topic: topic.startswith("/metrics/") or is_episode(topic)):
+            for record in read_records(file, lambda topic: topic.startswith(_READ) or is_episode(topic)):
                 _, kind, role, name = record.topic.split("/", 3)
+                if kind == "events":
+                    with self._lock:
+                        self._event(*_logged(record))
+                    continue
                 if kind == "episode":
                     newest[role] = record
                     continue
@@ -165,18 +188,21 @@ class TrainingWindow:
             found, roles = self._status, {}
             if found is not None:
                 roles = {role["id"]: role for role in found["roles"] if role["role"] == "actor"}
-            wanted = [name for name in names if name in self._curves] or [n for n in FIRST if n in self._curves]
+            phase = self._phase()
+            first = FIRST if phase in ("training", "disconnected") else (*FIRST, *self._labels_of_all())
+            wanted = [name for name in names or dict.fromkeys(first) if name in self._curves]
             return {
                 "run": self.run,
-                "disconnected": self._disconnected,
+                "phase": phase,
+                "loading": self._loading,
+                "last": self._last(),
                 "version": None if found is None else found["version"],
                 "rates": {} if found is None else found["rates"],
                 "queue": None if found is None else found["queue"],
                 "counters": {} if found is None else found["ledger"],
                 "warnings": [] if found is None else found["warnings"],
-                "finished": bool(found and found["finished"]),
                 "curves": {name: self._curves[name].thinned(points) for name in wanted},
-                "names": sorted(self._curves),
+                "names": self._labels_of_all(),
                 "constraints": {
                     constraint.name: self._curves[f"success/{constraint.name}"].values[-1]
                     for constraint in CONSTRAINTS
@@ -186,6 +212,30 @@ class TrainingWindow:
                 "events": list(self._events)[-20:][::-1],
             }
 
+    def _phase(self) -> str:
+        """Whether the run trains, is finished, cannot be reached, or is read from its recordings."""
+        if self._status is not None and self._status["finished"]:
+            return "finished"
+        if not self.live and self._status is None:
+            return "recorded"
+        return "disconnected" if self._disconnected else "training"
+
+    def _last(self) -> dict[str, float]:
+        """Update and time (seconds since 1970) of the newest point, and the newest success and throughput."""
+        found = {name: self._curves[curve].values[-1] for name, curve in _LAST.items() if curve in self._curves}
+        ends = [(curve.steps[-1], curve.times[-1]) for curve in self._curves.values()]
+        return found | (dict(zip(("update", "time"), max(ends), strict=True)) if ends else {})
+
+    def _labels_of_all(self) -> dict[str, dict[str, str]]:
+        """For each curve what people call it, its unit and its group, in the order of the figures."""
+        if self._labels.keys() != self._curves.keys():
+            self._labels = labels_of(self._curves)
+        return self._labels
+
+    def _event(self, time: float, level: str, text: str) -> None:
+        """Keeps a line of the log."""
+        self._events.append({"time": time, "level": level, "text": text})
+
     def _metrics(self, role: str, name: str, meta: Mapping[str, Any], now: float) -> None:
         """Adds the numbers of a learner's update or of an actor's rollout."""
         when = float(meta.get("time", now))
@@ -193,6 +243,8 @@ class TrainingWindow:
         if role == "actor":
             actor = self._actors.setdefault(name, Actor(now))
             actor.seen = now
+            reported = {"version": float(meta.get("version", 0)), **values}
+            actor.last = {key: reported[key] for key in _REPORTED if key in reported}
             return
         if role != "learner" or name != "0":
             return  # every rank of a learner publishes the same
@@ -212,7 +264,7 @@ class TrainingWindow:
     def _row(self, name: str, role: Mapping[str, Any] | None) -> dict[str, Any]:
         """What a list shows of an actor."""
         actor = self._actors[name]
-        status = role or {}
+        status = role or actor.last
         row: dict[str, Any] = {"id": name, "alive": role is not None, "episodes": actor.episodes}
         row |= {key: status.get(key) for key in ("version", "lag", "rollouts", "steps_per_second")}
         if actor.recent:
@@ -223,12 +275,31 @@ class TrainingWindow:
         return row
 
 
+def labels_of(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Title, unit and group of each metric, as the figures of `congrasp plot` have them, in their order."""
+    any_values = np.arange(2.0), np.arange(2.0)
+    found = {}
+    for group, panels in figures({f"learner/0/{name}": any_values for name in metrics}).values():
+        for panel in panels:
+            for name in panel.metrics:
+                title = panel.title if len(panel.metrics) == 1 else f"{panel.title}: {name.rpartition('_')[2]}"
+                found[name] = {"title": title, "unit": panel.unit, "group": group}
+    return found | {n: {"title": n, "unit": "", "group": "Details"} for n in sorted(metrics) if n not in found}
+
+
+def _logged(record: Record) -> tuple[float, str, str]:
+    """Time (seconds since 1970), level and text of a recorded event."""
+    log = Log.FromString(record.data)
+    return record.time / 1e9, Log.Level.Name(log.level).lower(), log.message
+
+
 class Follower:
     """Feeds a window from a run, in two threads of its own, until it is closed."""
 
     def __init__(self, transport: Transport, window: TrainingWindow, every: float = 1.0):
         """Subscribes and begins; the transport stays the caller's."""
         self._transport, self._window, self._every = transport, window, every
+        window.live = True
         self._stop = threading.Event()
         self._subscription = transport.subscribe(Keys(window.run).logs, depth=1024)
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._receive, self._ask)]

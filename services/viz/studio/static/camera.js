@@ -15,6 +15,11 @@ export class Camera {
     this.aspect = 1;
   }
 
+  // What a picture of another size needs to look the same way: m in the world, and degrees from bottom to top.
+  get view() {
+    return { position: this.position, target: this.target, field_of_view: (FIELD * 180) / Math.PI };
+  }
+
   // Unit vector from the target to the camera.
   get direction() {
     const flat = Math.cos(this.elevation);

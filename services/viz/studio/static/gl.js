@@ -1,7 +1,13 @@
 // Draws triangle meshes with WebGL 2: light is worked out at the vertices, so that a processor without a graphics card
 // keeps up too.
 
-import { IDENTITY } from "./math.js";
+import { IDENTITY, multiply } from "./math.js";
+
+const KEY = [0.35, -0.5, 0.8]; // towards the light that casts shadows
+const GROUND = 1; // in the stencil
+const SHADE = 0.2;
+const LIFT = 0.0004; // m of a shadow over its ground
+const FLAT = [1, 0, 0, 0, 0, 1, 0, 0, -KEY[0] / KEY[2], -KEY[1] / KEY[2], 0, 0, 0, 0, LIFT, 1];
 
 const VERTEX = `#version 300 es
 layout(location = 0) in vec3 position;
@@ -13,7 +19,7 @@ uniform float lit;
 out vec4 shade;
 void main() {
   vec3 n = normalize(mat3(model) * normal);
-  float light = 0.50 + 0.16 * n.z + 0.40 * max(dot(n, normalize(vec3(0.35, -0.5, 0.8))), 0.0)
+  float light = 0.50 + 0.16 * n.z + 0.40 * max(dot(n, normalize(vec3(${KEY}))), 0.0)
     + 0.12 * max(dot(n, normalize(vec3(-0.7, 0.5, 0.25))), 0.0);
   shade = vec4(colour * tint.rgb * mix(1.0, light, lit), tint.a);
   gl_Position = view * model * vec4(position, 1.0);
@@ -48,8 +54,9 @@ export class Renderer {
     this.canvas = canvas;
     this.software = drawnInSoftware();
     this.coarse = 1; // share of the pixels, along each side, while something moves
+    this.shadows = true; // while something moves
     this.mean = 0; // ms of a frame
-    const gl = canvas.getContext("webgl2", { antialias: !this.software, alpha: false });
+    const gl = canvas.getContext("webgl2", { antialias: !this.software, alpha: false, stencil: true });
     if (!gl) throw new Error("This browser offers no WebGL 2. Use a newer one, or allow hardware acceleration.");
     this.gl = gl;
     const program = gl.createProgram();
@@ -106,14 +113,15 @@ export class Renderer {
     for (const buffer of mesh.buffers) this.gl.deleteBuffer(buffer);
   }
 
-  // Told how long a frame took while something moves: without a graphics card fewer pixels are drawn until it is fast.
+  // Told how long a frame took while something moves: without a graphics card fewer pixels are drawn until it is fast,
+  // and if that is not enough no shadows.
   pace(milliseconds, slowest) {
     if (!this.software) return;
     this.mean += 0.2 * (milliseconds - this.mean);
-    if (this.mean > 0.85 * slowest && this.coarse > 0.45) {
-      this.coarse = Math.max(0.45, 0.8 * this.coarse);
-      this.mean = 0.7 * slowest;
-    }
+    if (this.mean <= 0.85 * slowest) return;
+    if (this.coarse > 0.45) this.coarse = Math.max(0.45, 0.8 * this.coarse);
+    else this.shadows = false;
+    this.mean = 0.7 * slowest;
   }
 
   // Fits the frame to the space that the page gives it.
@@ -125,22 +133,44 @@ export class Renderer {
       this.canvas.width = width;
       this.canvas.height = height;
     }
-    this.gl.viewport(0, 0, width, height);
   }
 
-  // Draws things {mesh, model, tint, alpha, lit} with the camera's matrix; those that are seen through come last.
-  draw(view, things, background, moving) {
+  // Draws views {matrix, things, left, width} beside each other, `left` and `width` as shares of the canvas. Things are
+  // {mesh, model, tint, alpha, lit}; those that are seen through come last. A thing that `casts` has a shadow on one that
+  // is the `ground`, at height zero; what is `above` is seen through everything.
+  draw(views, background, moving) {
     const gl = this.gl;
     this.resize(moving);
     gl.clearColor(...background, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    gl.uniformMatrix4fv(this.places.view, false, view);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
+    for (const view of views) this.#view(view, this.shadows || !moving);
+  }
+
+  #view({ matrix, things, left = 0, width = 1 }, shadows) {
+    const gl = this.gl;
+    gl.viewport(Math.round(left * this.canvas.width), 0, Math.round(width * this.canvas.width), this.canvas.height);
+    gl.uniformMatrix4fv(this.places.view, false, matrix);
+    const clear = (thing) => (thing.alpha ?? 1) < 1;
     gl.disable(gl.BLEND);
     gl.depthMask(true);
-    for (const thing of things) if ((thing.alpha ?? 1) === 1) this.#draw(thing);
+    gl.enable(gl.STENCIL_TEST);
+    gl.stencilFunc(gl.ALWAYS, GROUND, 255);
+    gl.stencilOp(gl.KEEP, gl.KEEP, gl.REPLACE);
+    for (const thing of things) if (thing.ground) this.#draw(thing);
+    gl.disable(gl.STENCIL_TEST);
+    for (const thing of things) if (!thing.ground && !thing.above && !clear(thing)) this.#draw(thing);
     gl.enable(gl.BLEND);
     gl.depthMask(false);
-    for (const thing of things) if ((thing.alpha ?? 1) < 1) this.#draw(thing);
+    // The stencil keeps a shadow on the ground, and lets none fall twice on one place.
+    gl.enable(gl.STENCIL_TEST);
+    gl.stencilFunc(gl.EQUAL, GROUND, 255);
+    gl.stencilOp(gl.KEEP, gl.KEEP, gl.INCR);
+    for (const thing of things) if (shadows && thing.casts) this.#draw({ mesh: thing.mesh, model: multiply(FLAT, thing.model ?? IDENTITY), tint: [0, 0, 0], alpha: SHADE, lit: 0 });
+    gl.disable(gl.STENCIL_TEST);
+    for (const thing of things) if (!thing.above && clear(thing)) this.#draw(thing);
+    gl.disable(gl.DEPTH_TEST);
+    for (const thing of things) if (thing.above) this.#draw(thing);
+    gl.enable(gl.DEPTH_TEST);
     gl.depthMask(true);
   }
 

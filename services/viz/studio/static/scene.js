@@ -1,8 +1,9 @@
 // What is seen: hand, object, constraints and contacts, as things for the renderer.
 
-import { add, cross, dot, norm, pose, rotate, scale, sub, toWorld, unit, perpendicular, IDENTITY } from "./math.js";
+import { add, cross, dot, multiply, norm, pose, rotate, scale, sub, toWorld, unit, perpendicular, IDENTITY } from "./math.js";
 import * as shapes from "./shapes.js";
 import { Skin } from "./skin.js";
+import { rgb } from "./theme.js";
 
 const OBJECT = [0.95, 0.64, 0.28];
 const AVOID = [0.8, 0.22, 0.22];
@@ -10,7 +11,7 @@ const TOUCHING = [0.13, 0.74, 0.63];
 const HEADING = [0.22, 0.4, 0.86];
 const COUNTS = [0.1, 0.62, 0.85];
 const PATH = [0.53, 0.3, 0.75];
-const FORCE = [0.93, 0.26, 0.21];
+const FORCE = [0.98, 0.8, 0.12];
 const GHOST = [0.22, 0.4, 0.86];
 
 export const ARROW = 0.1; // length of the approach arrow, m
@@ -19,6 +20,8 @@ const LEAST = 0.05; // N from which a force is drawn
 const FORCE_LENGTH = 0.015; // m per newton
 const LONGEST = 0.09; // m
 const TABLE = 0.3; // m
+const HINT = 0.55; // share of its colour that a brush shows before it paints
+const BEHIND = 0.4; // opacity of a motion that another is laid over
 
 // The matrix that lays a mesh along +z onto a line from a point.
 function along(start, direction, stretch = 1) {
@@ -50,13 +53,27 @@ export class Body {
     this.renderer.recolour(this.mesh, this.colours);
   }
 
+  // Shows what a brush at a point of the object frame would paint; nothing without a point.
+  preview(point, radius, avoid) {
+    if (!point && !this.previewed) return;
+    this.previewed = Boolean(point);
+    const colours = point ? this.colours.slice() : this.colours;
+    const colour = avoid ? AVOID : OBJECT;
+    if (point) this.#within(point, radius, (i) => { for (let k = 0; k < 3; k++) colours[i + k] += HINT * (colour[k] - colours[i + k]); });
+    this.renderer.recolour(this.mesh, colours);
+  }
+
+  #within(point, radius, act) {
+    for (let i = 0; i < this.points.length; i += 3) {
+      const [x, y, z] = [this.points[i] - point[0], this.points[i + 1] - point[1], this.points[i + 2] - point[2]];
+      if (x * x + y * y + z * z <= radius * radius) act(i);
+    }
+  }
+
   // Colours what a brush at a point of the object frame touches, until the server's answer is there.
   brush(point, radius, avoid) {
     const colour = avoid ? AVOID : OBJECT;
-    for (let i = 0; i < this.points.length; i += 3) {
-      const [x, y, z] = [this.points[i] - point[0], this.points[i + 1] - point[1], this.points[i + 2] - point[2]];
-      if (x * x + y * y + z * z <= radius * radius) this.colours.set(colour, i);
-    }
+    this.#within(point, radius, (i) => this.colours.set(colour, i));
     this.renderer.recolour(this.mesh, this.colours);
   }
 
@@ -104,8 +121,8 @@ export class Scene {
     this.shaft = renderer.mesh(shapes.arrow(ARROW, 0.0028));
     this.force = renderer.mesh(shapes.arrow(1, 0.03));
     this.ball = renderer.mesh(shapes.capsules([{ start: [0, 0, 0], end: [0, 0, 0], radius: 0.006 }]));
-    this.beads = null;
-    this.drawnPath = "";
+    this.ring = renderer.mesh(shapes.ring(0.025));
+    this.paths = new Map(); // beads by use
   }
 
   setHand(name, message) {
@@ -127,66 +144,72 @@ export class Scene {
     return { mesh: this.shaft, model: along(sub(tip, scale(direction, ARROW)), direction), tint, alpha };
   }
 
-  #path(points, place, alpha) {
+  #path(use, points, place, alpha) {
     const key = JSON.stringify(points);
-    if (key !== this.drawnPath) {
-      if (this.beads) this.renderer.release(this.beads);
-      this.beads = this.renderer.mesh(shapes.beads(points, 0.0035));
-      this.drawnPath = key;
+    let known = this.paths.get(use);
+    if (known?.key !== key) {
+      if (known) this.renderer.release(known.mesh);
+      known = { key, mesh: this.renderer.mesh(shapes.beads(points, 0.0035)) };
+      this.paths.set(use, known);
     }
-    return { mesh: this.beads, model: pose(place.position, place.quaternion), tint: PATH, alpha };
+    return { mesh: known.mesh, model: pose(place.position, place.quaternion), tint: PATH, alpha };
   }
 
   #table(center) {
-    return { mesh: this.table, model: [...IDENTITY.slice(0, 12), center[0], center[1], 0, 1], lit: 0 };
+    return { mesh: this.table, model: [...IDENTITY.slice(0, 12), center[0], center[1], 0, 1], tint: rgb("--table"), lit: 0, ground: true };
   }
 
   // A reference pose, which is given in the object's frame.
-  #ghost(hand, links, place) {
+  #ghost(use, hand, links, place) {
     const turned = {
       position: links.position.map((point) => toWorld(place, point)),
       quaternion: links.quaternion.map((turn) => product(place.quaternion, turn)),
     };
     const whole = new Array(links.position.length).fill(1);
-    return this.#hand("ghost", hand, turned, GHOST, whole).map((thing) => ({ ...thing, alpha: 0.28 }));
+    return this.#hand(use, hand, turned, GHOST, whole).map((thing) => ({ ...thing, alpha: 0.28 }));
   }
 
-  // Things while constraints are edited. `arrow`: {tip, direction} in the world.
-  editing(state, arrow, handles) {
+  // Things while constraints are edited. `arrow`: {tip, direction} in the world; `brush`: {point, normal} in the object's
+  // frame and {radius, avoid} of the brush over it, or null.
+  editing(state, arrow, handles, brush) {
     const place = state.rest;
     const things = [this.#table(place.position)];
-    if (this.body) things.push({ mesh: this.body.mesh, model: pose(place.position, place.quaternion) });
-    things.push(...this.#hand("hand", state.hand, state.start, TOUCHING));
+    const model = pose(place.position, place.quaternion);
+    if (this.body) things.push({ mesh: this.body.mesh, model, casts: true });
+    things.push(...this.#hand("hand", state.hand, state.start, TOUCHING).map((thing) => ({ ...thing, casts: true })));
     // An arrow that the rules overrule is faint, and beside it is the one that counts.
     const counts = toWorld(place, state.active.position);
     things.push(this.#arrow(arrow.tip, arrow.direction, HEADING, state.active.overruled ? 0.3 : 1));
     if (state.active.overruled) things.push(this.#arrow(counts, rotate(place.quaternion, state.active.direction), COUNTS, 1));
     for (const [name, point] of Object.entries(handles.points))
       things.push({ mesh: this.ball, model: [...IDENTITY.slice(0, 12), ...point, 1], tint: name === handles.hover ? [1, 0.8, 0.2] : HEADING, lit: 0.5 });
-    if (state.path && state.asked.includes("trajectory")) things.push(this.#path(state.path, place, 1));
-    if (state.pose && state.asked.includes("pose")) things.push(...this.#ghost(state.hand, state.pose, place));
+    if (state.path && state.asked.includes("trajectory")) things.push(this.#path("path", state.path, place, 1));
+    if (state.pose && state.asked.includes("pose")) things.push(...this.#ghost("ghost", state.hand, state.pose, place));
+    if (brush) things.push({ mesh: this.ring, model: multiply(model, along(brush.point, brush.normal).map((x, k) => (k < 12 ? brush.radius * x : x))), tint: brush.avoid ? AVOID : rgb("--ink"), lit: 0, above: true });
     return things;
   }
 
-  // Things of a frame of a motion; see `Motion.at`.
-  playing(motion, body, frame) {
+  // Things of a frame of a motion (see `Motion.at`) in one of the player's slots; faint where it is `behind` another.
+  playing({ motion, body }, frame, slot, behind) {
     const place = frame.object;
     const things = [];
-    if (frame.table) things.push(this.#table(motion.center));
-    things.push({ mesh: body.mesh, model: pose(place.position, place.quaternion) });
+    if (frame.table && !behind) things.push(this.#table(motion.center));
+    const solid = behind ? { alpha: BEHIND } : { casts: true };
+    const faint = (alpha) => (behind ? BEHIND * alpha : alpha);
+    things.push({ mesh: body.mesh, model: pose(place.position, place.quaternion), ...solid });
     const strengths = frame.forces.map(norm);
     const shares = strengths.map((strength) => (strength > LEAST ? 0.3 + 0.3 * Math.min(strength / FULL, 1) : 0));
-    things.push(...this.#hand("hand", motion.hand, frame.links, TOUCHING, shares));
+    things.push(...this.#hand(`hand ${slot}`, motion.hand, frame.links, TOUCHING, shares).map((thing) => ({ ...thing, ...solid })));
     frame.forces.forEach((force, i) => {
       const strength = norm(force);
-      if (strength > LEAST) things.push({ mesh: this.force, model: along(frame.links.position[i], scale(force, 1 / strength), Math.min(FORCE_LENGTH * strength, LONGEST)).map((x, k) => (k < 8 ? 0.09 * x : x)), tint: FORCE });
+      if (strength > LEAST) things.push({ mesh: this.force, model: along(frame.links.position[i], scale(force, 1 / strength), Math.min(FORCE_LENGTH * strength, LONGEST)).map((x, k) => (k < 8 ? 0.09 * x : x)), tint: FORCE, alpha: faint(1) });
     });
     const { goal } = motion;
     const direction = rotate(place.quaternion, goal.direction);
     const target = toWorld(place, goal.position);
-    things.push(this.#arrow(target, direction, HEADING, 0.6));
-    if (goal.path) things.push(this.#path(goal.path, place, 0.7));
-    if (motion.ghost) things.push(...this.#ghost(motion.hand, motion.ghost, place));
+    things.push(this.#arrow(target, direction, HEADING, faint(0.6)));
+    if (goal.path) things.push(this.#path(`path ${slot}`, goal.path, place, faint(0.7)));
+    if (motion.ghost) things.push(...this.#ghost(`ghost ${slot}`, motion.hand, motion.ghost, place));
     return things;
   }
 }

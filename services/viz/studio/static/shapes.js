@@ -77,6 +77,15 @@ export function arrow(length, radius) {
   return builder.build();
 }
 
+// A ring of radius 1 around the origin, across +z.
+export function ring(thickness) {
+  const builder = new Builder();
+  const count = 40;
+  const at = (i) => [Math.cos((2 * Math.PI * i) / count), Math.sin((2 * Math.PI * i) / count), 0];
+  for (let i = 0; i < count; i++) builder.capsule(at(i), at(i + 1), thickness);
+  return builder.build();
+}
+
 // Balls at points on a string; the path of a wrist.
 export function beads(points, radius) {
   const builder = new Builder();
@@ -94,7 +103,7 @@ export function table(radius) {
   const ring = 0.05;
   for (let inner = 0; inner < radius - 1e-9; inner += ring) {
     const line = 0.0006;
-    const parts = [[inner, inner + ring - line, [0.865, 0.86, 0.845]], [inner + ring - line, inner + ring, [0.79, 0.785, 0.77]]];
+    const parts = [[inner, inner + ring - line, [1, 1, 1]], [inner + ring - line, inner + ring, [0.913, 0.913, 0.911]]];
     for (const [from, to, colour] of parts) {
       const before = builder.positions.length;
       const fine = 48;

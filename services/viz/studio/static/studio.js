@@ -1,10 +1,13 @@
 // The studio's panel: the request, the resolved constraints, and the motions.
 
+import { outcomeOf } from "./player.js";
 import { ask, download, post, upload } from "./wire.js";
 
 const $ = (id) => document.getElementById(id);
 const MASK_NAMES = { pose_finger: "pose: fingers", pose_wrist: "pose: wrist" };
 const POLL = 200; // ms between two looks at a job
+const KEEPS_MOTION = new Set(["grasp", "draw_motion", "delete"]);
+const DRAWING = "drawing"; // what a job says it made when that is a file to save
 
 function fill(select, names, chosen) {
   if ([...select.options].map((o) => o.value).join("\n") !== names.map(([value]) => value).join("\n"))
@@ -13,38 +16,40 @@ function fill(select, names, chosen) {
 }
 
 export class StudioPanel {
-  // `app` has: takeState(state), play(id), canvas.
+  // `app` has: takeState(state), play(id), canvas, player.
   constructor(app) {
     this.app = app;
     this.queue = Promise.resolve(true);
     $("hand").addEventListener("change", () => this.act("hand", { name: $("hand").value }));
     $("object").addEventListener("change", () => this.act("object", { name: $("object").value }));
-    $("rest").addEventListener("change", () => this.act("set_rest_pose", { rest: Number($("rest").value) }));
+    $("unit").addEventListener("change", () => this.act("unit", { unit: $("unit").value }));
+    for (const name of ["undo", "redo"]) $(name).addEventListener("click", () => this.act(name, {}));
+    addEventListener("keydown", (event) => this.#key(event));
     $("file").addEventListener("change", () => {
       if ($("file").files.length) this.take($("file").files[0]);
       $("file").value = "";
     });
     for (const box of document.querySelectorAll("[data-ask]")) box.addEventListener("change", () => this.act("ask", { constraint: box.dataset.ask, on: box.checked }));
     for (const button of document.querySelectorAll("[data-suggest]"))
-      button.addEventListener("click", async () => {
-        const constraint = button.dataset.suggest;
-        if ((await this.act("suggest", { constraint })) && constraint !== "heading") this.act("ask", { constraint, on: true });
-      });
+      button.addEventListener("click", () => this.act("suggest", { constraint: button.dataset.suggest }));
     $("clear-paint").addEventListener("click", () => this.act("fill", { avoid: false }));
-    $("close-hand").addEventListener("click", async () => {
-      if (await this.act("close_hand", {})) this.act("ask", { constraint: "pose", on: true });
-    });
-    $("roll").addEventListener("input", () => {
-      const angle = (($("roll").value - (this.rolled ?? 0)) * Math.PI) / 180;
-      this.rolled = Number($("roll").value);
-      this.act("roll", { angle });
+    $("close-hand").addEventListener("click", () => this.act("close_hand", {}));
+    this.gesture = 0; // of the roll's slider: what one drag does is one edit
+    $("roll").addEventListener("input", () => this.#roll($("roll").value, this.gesture));
+    $("roll").addEventListener("change", () => this.gesture++);
+    $("roll-number").addEventListener("change", () => this.#roll($("roll-number").value));
+    $("save").addEventListener("change", () => {
+      this.#save($("save").value);
+      $("save").value = "";
     });
     $("grasp").addEventListener("click", () => this.act("grasp", {}));
     this.#drops();
   }
 
-  // Asks the server to do something, one thing after another; false if it would not.
+  // Asks the server to do something, one thing after another; false if it would not. What changes the request is seen
+  // without a motion over it.
   act(action, values) {
+    if (!KEEPS_MOTION.has(action) && this.app.player.motion) this.app.player.close();
     this.queue = this.queue.then(async () => {
       this.busy(true);
       try {
@@ -63,10 +68,40 @@ export class StudioPanel {
     return this.queue;
   }
 
-  // Shows what the server knows now, such as a run's newer weights.
+  // Turns the hand to an angle in degrees; of those that come while the server is busy only the last one counts.
+  async #roll(degrees, gesture = null) {
+    this.rolling = { angle: (Number(degrees) * Math.PI) / 180, gesture };
+    if (this.turning || !Number.isFinite(this.rolling.angle)) return;
+    this.turning = true;
+    while (this.rolling) {
+      const values = this.rolling;
+      this.rolling = null;
+      await this.act("set_roll", values);
+    }
+    this.turning = false;
+    this.#showRoll();
+  }
+
+  #showRoll() {
+    if (this.turning) return;
+    $("roll").value = this.state.studio.roll_deg;
+    $("roll-number").value = this.state.studio.roll_deg;
+  }
+
+  // Ctrl-Z undoes, Ctrl-Shift-Z and Ctrl-Y redo; text fields keep their own.
+  #key(event) {
+    const key = event.key.toLowerCase();
+    if (!(event.ctrlKey || event.metaKey) || event.altKey || (key !== "z" && key !== "y")) return;
+    if (event.target.closest("input:is([type=number], [type=search])") || document.body.dataset.view !== "studio") return;
+    event.preventDefault();
+    this.act(key === "y" || event.shiftKey ? "redo" : "undo", {});
+  }
+
+  // Shows what the server knows now, such as a run's newer weights; whether it answered.
   async refresh() {
     const state = await ask("/api/state").catch(() => null);
     if (state) await this.show(state);
+    return Boolean(state);
   }
 
   busy(on) {
@@ -93,10 +128,15 @@ export class StudioPanel {
     this.state = state;
     fill($("hand"), state.hands.map((name) => [name, name]), state.hand);
     fill($("object"), state.objects.map((name) => [name, name]), state.chosen);
-    const rests = Array.from({ length: studio.object.rests }, (_, i) => [String(i), i ? `resting pose ${i + 1}` : "most stable"]);
-    fill($("rest"), rests, String(studio.rest.index));
+    this.#rests(state);
+    this.#unit(state.upload);
     const { size_cm: size, mass_g: mass, faces } = studio.object;
     $("facts").textContent = [`${size.join(" × ")} cm, ${mass} g, ${faces} faces`, ...state.notes].join(". ");
+    this.#showRoll();
+    for (const [name, what] of Object.entries(state.history)) {
+      $(name).disabled = !what;
+      $(name).title = what ? `${name === "undo" ? "Undo" : "Redo"}: ${what} (Ctrl-${name === "undo" ? "" : "Shift-"}Z)` : `Nothing to ${name}`;
+    }
     $("policy").textContent = `${state.policy.source}, version ${state.policy.version}`;
     this.#toggles(studio.others);
     for (const box of document.querySelectorAll("[data-ask]")) {
@@ -118,6 +158,38 @@ export class StudioPanel {
     $("grasp").disabled = Boolean(studio.trouble) || state.job.running;
     this.#motions(state.motions);
     return this.app.takeState(state);
+  }
+
+  // A thumbnail for each resting pose.
+  #rests({ studio, shown }) {
+    const places = $("rests");
+    if (this.drawnRests !== shown) {
+      this.drawnRests = shown;
+      places.replaceChildren(...studio.object.tilts_deg.map((tilt, i) => {
+        const button = document.createElement("button");
+        button.dataset.rest = i;
+        button.title = `Resting pose ${i + 1}: its z axis is ${tilt}° from up`;
+        const picture = Object.assign(new Image(), { src: `/api/rest?index=${i}&shown=${shown}`, alt: "" });
+        button.append(picture, i ? `${i + 1}` : "1, most stable");
+        button.addEventListener("click", () => this.act("set_rest_pose", { rest: i }));
+        return button;
+      }));
+    }
+    for (const button of places.children) button.setAttribute("aria-pressed", String(Number(button.dataset.rest) === studio.rest.index));
+  }
+
+  // The units that an uploaded mesh may have, with the size that each makes of it.
+  #unit(upload) {
+    $("unit-choice").hidden = !upload;
+    $("unit-choice").classList.toggle("asks", Boolean(upload && !upload.unit));
+    if (!upload) return;
+    $("unit-question").textContent = upload.unit ? `Unit of ${upload.file}` : `In which unit are the numbers of ${upload.file}?`;
+    const options = upload.units.map(({ unit, name, size, possible }) => Object.assign(new Option(`${name}: ${size}`, unit), { disabled: !possible }));
+    if (!upload.unit) options.unshift(new Option("choose …", ""));
+    $("unit").replaceChildren(...options);
+    $("unit").value = upload.unit;
+    if (!upload.unit && this.questioned !== upload.file) $("unit-choice").scrollIntoView({ block: "center" });
+    this.questioned = upload.unit ? null : upload.file;
   }
 
   // Constraints without tools of their own: a box to ask for each, and one for each of its flags.
@@ -154,7 +226,9 @@ export class StudioPanel {
     else if (!job.running && job.number !== this.settled) {
       this.settled = job.number;
       this.error(job.error);
-      if (!job.error && job.made) this.app.play(job.made);
+      if (job.error || !job.made) return;
+      if (job.made === DRAWING) this.#download("/api/drawn", {});
+      else this.app.play(job.made, this.#name(job.made));
     }
   }
 
@@ -166,36 +240,59 @@ export class StudioPanel {
       job = await ask("/api/job").catch(() => null);
       if (job?.running) this.#job(job);
     } while (!job || job.running);
+    // Without the new state nobody would hear what came of the job.
+    while (!(await this.refresh())) await new Promise((resolve) => setTimeout(resolve, POLL));
     this.watching = false;
-    await this.refresh();
+  }
+
+  // "3. mug: held"
+  #name(id) {
+    const motion = this.state.motions.find((other) => other.id === id);
+    return motion ? `${motion.id}. ${motion.object}: ${outcomeOf(motion.success, motion.held).outcome}` : "";
   }
 
   #motions(motions) {
-    $("motions-title").hidden = !motions.length;
+    $("kept").hidden = !motions.length;
     $("motions").replaceChildren(...motions.map((motion) => {
       const item = document.createElement("li");
-      const name = document.createElement("button");
-      name.className = "name";
-      name.textContent = `${motion.id}. ${motion.object}: ${motion.held ? "held" : motion.success ? "held briefly" : "not held"}`;
-      name.title = motion.note;
-      name.classList.add(motion.held ? "good" : "bad");
-      name.addEventListener("click", () => this.app.play(motion.id));
-      const save = document.createElement("select");
-      save.title = "save this motion";
-      save.append(new Option("save as …", ""), ...this.state.exports.map((kind) => new Option(kind, kind)));
-      save.addEventListener("change", () => {
-        this.#save(motion.id, save.value);
-        save.value = "";
-      });
-      item.append(name, save);
+      item.dataset.motion = motion.id;
+      const button = (text, title, act, className) => {
+        const made = Object.assign(document.createElement("button"), { textContent: text, title, className });
+        made.addEventListener("click", act);
+        item.append(made);
+      };
+      const name = this.#name(motion.id);
+      button(name, motion.note, () => this.app.play(motion.id, name), `name ${motion.held ? "good" : "warn"}`);
+      button("Compare", "Show it beside the motion that is played", () => this.app.player.compare(motion.id, name), "compare");
+      button("×", `Delete motion ${motion.id}`, () => this.#delete(motion.id), "delete");
       return item;
     }));
+    if ($("save").options.length < 2) $("save").append(...this.state.saves.map((kind) => new Option(kind, kind)));
+    this.mark();
   }
 
-  async #save(id, kind) {
+  // Marks the motions that are played.
+  mark() {
+    for (const item of $("motions").children) item.toggleAttribute("data-shown", this.app.player.shows(item.dataset.motion));
+  }
+
+  #delete(id) {
+    if (this.app.player.shows(id)) this.app.player.close();
+    this.act("delete", { id });
+  }
+
+  // Saves the motion that is played: data at once, pictures and videos as they are seen when they are drawn.
+  #save(kind) {
+    const { player, camera } = this.app;
+    const { id } = player.motion;
+    if (!this.state.drawn.includes(kind)) return this.#download("/api/export", { id, kind });
+    return this.act("draw_motion", { id, kind, camera: camera.view, frame: player.motion.step(player.time) });
+  }
+
+  async #download(path, query) {
     this.error("");
     try {
-      await download("/api/export", { id, kind });
+      await download(path, query);
     } catch (error) {
       this.error(error.message);
     }

@@ -1,9 +1,7 @@
 // The lanes of a motion under its player: green while a constraint is met, with force and reward below.
 
-const GOOD = "#4bbd8b";
-const BAD = "#e0605f";
-const ALMOST = "#bfe5d3"; // met where it does not count yet
-const IDLE = "#e4e8ed";
+import { colour, onTheme } from "./theme.js";
+
 const ROW = 22;
 
 const UNITS = {
@@ -35,6 +33,7 @@ export class Timeline {
     });
     canvas.addEventListener("pointermove", (event) => event.buttons && go(event));
     new ResizeObserver(() => this.#prepare()).observe(canvas.parentElement);
+    onTheme(() => this.#prepare());
   }
 
   show(motion) {
@@ -47,7 +46,7 @@ export class Timeline {
       item.firstChild.textContent = name;
       return item;
     });
-    for (const [name, title] of [["force", "sum of all contact forces"], ["reward", "sum of all reward terms"]]) {
+    for (const [name, title] of [["force", "sum of all contact forces, N"], ["reward", "sum of all reward terms, per step"]]) {
       const item = document.createElement("li");
       item.dataset.curve = name;
       item.title = title;
@@ -74,7 +73,7 @@ export class Timeline {
     const width = canvas.clientWidth;
     const cell = width / Math.max(1, motion.steps - 1);
     motion.lanes.forEach((lane, row) => {
-      const looks = (t) => (lane.counts[t] ? (lane.met[t] ? GOOD : BAD) : lane.met[t] ? ALMOST : IDLE);
+      const looks = (t) => colour(lane.counts[t] ? (lane.met[t] ? "--met" : "--unmet") : lane.met[t] ? "--almost" : "--track"); // almost: met where it does not count yet
       for (let t = 0, from = 0; t < motion.steps; t++) {
         if (t + 1 < motion.steps && looks(t + 1) === looks(from)) continue;
         g.fillStyle = looks(from);
@@ -82,17 +81,17 @@ export class Timeline {
         from = t + 1;
       }
     });
-    this.#curve(g, motion.totalForce, motion.lanes.length, width, "#d6524a");
-    this.#curve(g, motion.totalReward, motion.lanes.length + 1, width, "#2f6fdb");
+    this.#curve(g, motion.totalForce, motion.lanes.length, width, colour("--force"));
+    this.#curve(g, motion.totalReward, motion.lanes.length + 1, width, colour("--accent"));
     const gone = motion.table.indexOf(0);
     if (gone > 0) {
-      g.strokeStyle = "#667080";
+      g.strokeStyle = colour("--quiet");
       g.setLineDash([3, 3]);
       g.beginPath();
       g.moveTo(gone * cell, 0);
       g.lineTo(gone * cell, height);
       g.stroke();
-      g.fillStyle = "#667080";
+      g.fillStyle = colour("--quiet");
       g.font = "11px system-ui, sans-serif";
       g.fillText("table removed", gone * cell + 4, height - 4);
     }

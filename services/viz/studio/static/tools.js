@@ -25,11 +25,14 @@ export class Tools {
     this.hover = "";
     this.arrow = null; // {position, direction} in the object frame while it is dragged
     this.stroke = null;
+    this.over = null; // {point, normal} of the object's surface under a brush
+    this.fingers = new Map(); // places of what touches the canvas, by pointer
     const { canvas } = app;
     canvas.addEventListener("pointerdown", (event) => this.#down(event));
     canvas.addEventListener("pointermove", (event) => this.#move(event));
     canvas.addEventListener("pointerup", (event) => this.#up(event));
     canvas.addEventListener("pointercancel", (event) => this.#up(event));
+    canvas.addEventListener("pointerleave", () => this.#hover(null));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
@@ -41,6 +44,7 @@ export class Tools {
     radius.addEventListener("input", () => {
       this.radius = radius.value / 1000;
       radius.nextElementSibling.textContent = `${radius.value} mm`;
+      this.#hover(this.over);
     });
     this.choose("look");
   }
@@ -51,6 +55,24 @@ export class Tools {
     document.getElementById("brush").hidden = tool !== "avoid" && tool !== "graspable";
     document.getElementById("hint").textContent = HINTS[tool];
     this.app.canvas.style.cursor = tool === "look" ? "grab" : "crosshair";
+    if (!this.painting) this.#hover(null);
+  }
+
+  get painting() {
+    return this.tool === "avoid" || this.tool === "graspable";
+  }
+
+  // The brush where the mouse is over the object, or null.
+  get brush() {
+    return this.over && { ...this.over, radius: this.radius, avoid: this.tool === "avoid" };
+  }
+
+  // Shows what the brush would paint at a place on the object, or nothing.
+  #hover(hit) {
+    if (!hit && !this.over) return;
+    this.over = hit;
+    this.app.body?.preview(hit?.point ?? null, this.radius, this.tool === "avoid");
+    this.app.redraw();
   }
 
   // The arrow as it is drawn: it ends where its line enters the object.
@@ -102,7 +124,13 @@ export class Tools {
     app.canvas.focus({ preventScroll: true });
     app.canvas.setPointerCapture(event.pointerId);
     this.last = [event.clientX, event.clientY];
-    const painting = this.tool === "avoid" || this.tool === "graspable";
+    this.fingers.set(event.pointerId, this.last);
+    if (this.fingers.size > 1) {
+      this.#drop();
+      this.doing = "pinch";
+      return;
+    }
+    const { painting } = this;
     const hit = painting || this.tool === "arrow" ? this.#hit(event) : null;
     if (event.button === 2 || event.button === 1 || event.shiftKey) this.doing = "pan";
     else if (!painting && this.#handle(event)) this.doing = this.#handle(event);
@@ -126,12 +154,17 @@ export class Tools {
 
   #move(event) {
     const { app } = this;
+    if (this.painting && event.pointerType === "mouse") this.#hover(this.doing === "orbit" || this.doing === "pan" ? null : this.#hit(event));
     if (!event.buttons) {
       const over = this.#handle(event);
       if (over !== this.hover) {
         this.hover = over;
         app.redraw();
       }
+      return;
+    }
+    if (this.doing === "pinch") {
+      this.#pinch(event);
       return;
     }
     const [dx, dy] = [event.clientX - this.last[0], event.clientY - this.last[1]];
@@ -146,10 +179,31 @@ export class Tools {
     app.redraw();
   }
 
+  // Two fingers move the picture, and zoom it by how far they are apart.
+  #pinch(event) {
+    const { app } = this;
+    const before = [...this.fingers.values()];
+    this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    const after = [...this.fingers.values()];
+    if (after.length !== 2) return;
+    const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
+    const middle = ([a, b]) => [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
+    app.camera.zoom(Math.log(apart(before) / apart(after)) / 0.12);
+    app.camera.pan(middle(after)[0] - middle(before)[0], middle(after)[1] - middle(before)[1], app.canvas.clientHeight);
+    app.redraw();
+  }
+
+  // What was begun with one finger is not meant once there is a second.
+  #drop() {
+    this.stroke = this.arrow = null;
+    if (this.doing === "paint") this.app.repaint();
+  }
+
   #up(event) {
     const { app } = this;
+    this.fingers.delete(event.pointerId);
     if (this.doing === "paint") app.act("paint", { points: this.stroke, radius: this.radius, avoid: this.tool === "avoid" });
-    if (this.doing === "path" && this.stroke.length > 1) app.act("draw", { points: this.stroke }).then((done) => done && app.act("ask", { constraint: "trajectory", on: true }));
+    if (this.doing === "path" && this.stroke.length > 1) app.act("draw", { points: this.stroke });
     if ((this.doing === "tip" || this.doing === "tail") && this.arrow) {
       const surface = sub(this.arrow.position, scale(this.arrow.direction, INWARD));
       app.act("snap_heading", { surface, direction: this.arrow.direction }).finally(() => {

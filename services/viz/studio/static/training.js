@@ -1,10 +1,19 @@
 // The window on a training: how it goes, its curves, its actors, and the episodes around a time.
 
+import { colour as styled, onTheme } from "./theme.js";
 import { ask } from "./wire.js";
 
 const $ = (id) => document.getElementById(id);
 const EVERY = 1000; // ms
-const COLOURS = ["#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a"];
+const ALL = "*";
+const COLOURS = ["#2f6fdb", "#e08a2c", "#1f9d88", "#0e8fb3", "#7a4cc2", "#5b8c2a"];
+
+const ENDED = ["finished", "recorded"]; // phases in which nothing more comes
+const PHASES = { training: "training", finished: "finished", recorded: "recorded", disconnected: "disconnected" };
+const COUNTERS = {
+  granted: "tickets granted", running: "tickets in use", redeemed: "tickets redeemed", returned: "tickets returned", expired: "tickets expired",
+  accepted: "rollouts accepted", consumed: "rollouts learnt from", dropped: "rollouts dropped", queued: "rollouts queued",
+};
 
 const short = (x) => (x === null || x === undefined ? "" : Math.abs(x) >= 1000 ? x.toLocaleString("en", { maximumFractionDigits: 0 }) : Number(x.toPrecision(3)).toString());
 
@@ -22,10 +31,13 @@ export class TrainingPanel {
     this.watched = ""; // the actor whose newest episode is played
     this.seen = -1;
     $("more-curves").addEventListener("change", () => {
-      if ($("more-curves").value) this.chosen.push($("more-curves").value);
+      const { value } = $("more-curves");
+      if (value === ALL) this.chosen = Object.keys(this.view.names);
+      else if (value) this.chosen = [...Object.keys(this.view.curves), value];
       $("more-curves").value = "";
       this.look();
     });
+    onTheme(() => this.view && this.#curves());
     $("filter").addEventListener("input", () => this.view && this.#actors(this.view.actors));
     $("actors").addEventListener("click", (event) => {
       const line = event.target.closest("[data-actor]");
@@ -40,7 +52,19 @@ export class TrainingPanel {
     clearInterval(this.timer);
     if (!on) return;
     this.look();
-    this.timer = setInterval(() => this.look(), EVERY);
+    this.timer = setInterval(() => (this.#ended() ? null : this.look()), EVERY);
+  }
+
+  error(text) {
+    $("run-trouble").textContent = text;
+  }
+
+  // Whether a run that is over has been seen to its end, so that nothing more comes.
+  #ended() {
+    const last = this.view && JSON.stringify([this.view.phase, this.view.last, this.view.loading]);
+    const same = last === this.before;
+    this.before = last;
+    return same && this.view && !this.view.loading && ENDED.includes(this.view.phase);
   }
 
   async look() {
@@ -61,24 +85,29 @@ export class TrainingPanel {
     const { view } = this;
     const watched = view.actors.find((actor) => actor.id === this.watched);
     const warnings = [...view.warnings];
-    if (view.disconnected && view.version !== null) warnings.push("The learner is disconnected.");
+    if (view.phase === "disconnected") warnings.push("The learner is disconnected.");
     if (watched && !watched.episodes) warnings.push(`${watched.id} has sent no episode yet; the next one is played when it comes.`);
     $("run-trouble").textContent = warnings.join(" ");
   }
 
   #show() {
     const { view } = this;
-    if (!this.chosen.length) this.chosen = Object.keys(view.curves);
+    // Until somebody chooses, the server does: a run that is over has more to show than one that trains.
     const tiles = {
       run: view.run,
-      version: view.version ?? "–",
-      actors: view.actors.filter((actor) => actor.alive).length,
-      "steps/s": short(view.rates.steps_per_second),
-      "rollouts/s": short(view.rates.rollouts_per_second),
-      "largest lag": Math.max(0, ...view.actors.map((actor) => actor.lag ?? 0)),
-      queue: view.queue ? `${view.queue.length} of ${view.queue.limit}` : "–",
+      state: view.loading ? "reading …" : PHASES[view.phase],
+      update: short(view.last.update ?? view.version),
+      success: view.last.success === undefined ? "" : `${(100 * view.last.success).toFixed(1)} %`,
+      version: short(view.version),
+      "steps/s": short(ENDED.includes(view.phase) ? view.last.steps_per_second : view.rates.steps_per_second),
+      ...(ENDED.includes(view.phase) ? { "last update": view.last.time ? new Date(1000 * view.last.time).toLocaleString() : "" } : {
+        actors: view.actors.filter((actor) => actor.alive).length,
+        "rollouts/s": short(view.rates.rollouts_per_second),
+        "largest lag": `${Math.max(0, ...view.actors.map((actor) => actor.lag ?? 0))} versions`,
+        queue: view.queue ? `${view.queue.length} of ${view.queue.limit} rollouts` : "",
+      }),
     };
-    const known = Object.entries(tiles).filter(([name]) => view.version !== null || name === "run");
+    const known = Object.entries(tiles).filter(([, value]) => value !== "");
     $("tiles").replaceChildren(...known.map(([name, value]) => {
       const tile = document.createElement("div");
       tile.dataset.tile = name;
@@ -99,7 +128,9 @@ export class TrainingPanel {
       return bar;
     }));
     this.#actors(view.actors);
-    $("counters").replaceChildren(...Object.entries(view.counters).map(([name, value]) => row([name, String(value)])));
+    $("counters").replaceChildren(...Object.entries(view.counters).map(([name, value]) => row([COUNTERS[name] ?? name, String(value)])));
+    $("counters").parentElement.hidden = !Object.keys(view.counters).length;
+    $("bars").parentElement.hidden = !Object.keys(view.constraints).length;
     $("events").parentElement.hidden = !view.events.length;
     $("events").replaceChildren(...view.events.map(({ time, level, text }) => {
       const item = document.createElement("li");
@@ -130,8 +161,18 @@ export class TrainingPanel {
 
   #curves() {
     const { view } = this;
-    const names = view.names.filter((name) => !this.chosen.includes(name));
-    if ($("more-curves").options.length !== names.length + 1) $("more-curves").replaceChildren(new Option("add …", ""), ...names.map((name) => new Option(name, name)));
+    const names = Object.keys(view.names).filter((name) => !(name in view.curves));
+    if ($("more-curves").dataset.names !== names.join()) {
+      $("more-curves").dataset.names = names.join();
+      $("more-curves").disabled = !names.length;
+      const groups = new Map();
+      for (const name of names) groups.set(view.names[name].group, [...(groups.get(view.names[name].group) ?? []), name]);
+      $("more-curves").replaceChildren(new Option("add …", ""), new Option(`all ${Object.keys(view.names).length} curves`, ALL), ...[...groups].map(([label, members]) => {
+        const group = Object.assign(document.createElement("optgroup"), { label });
+        group.append(...members.map((name) => new Option(view.names[name].title, name)));
+        return group;
+      }));
+    }
     const places = $("curves");
     const known = new Map([...places.children].map((figure) => [figure.dataset.curve, figure]));
     const figures = Object.keys(view.curves).map((name) => known.get(name) ?? this.#figure(name));
@@ -142,10 +183,11 @@ export class TrainingPanel {
   #figure(name) {
     const figure = document.createElement("figure");
     figure.dataset.curve = name;
-    figure.innerHTML = "<figcaption><span></span><span class='quiet'></span><button title='hide'>×</button></figcaption><canvas></canvas>";
-    figure.querySelector("span").textContent = name;
+    figure.innerHTML = "<figcaption><span></span><button title='hide'>×</button></figcaption><span class='quiet'></span><canvas></canvas>";
+    figure.querySelector("span").textContent = this.view.names[name].title;
+    figure.querySelector("span").title = name;
     figure.querySelector("button").addEventListener("click", () => {
-      this.chosen = this.chosen.filter((other) => other !== name);
+      this.chosen = Object.keys(this.view.curves).filter((other) => other !== name);
       this.look();
     });
     const canvas = figure.querySelector("canvas");
@@ -184,19 +226,19 @@ export class TrainingPanel {
     const { steps, values } = curve;
     if (!steps.length) return;
     const low = Math.min(...values, values[0] >= 0 ? 0 : Infinity);
-    const high = Math.max(...values, low + 1e-9);
+    const high = Math.max(...values);
     const x = (i) => (steps.length < 2 ? 0 : ((steps[i] - steps[0]) / (steps[steps.length - 1] - steps[0])) * width);
-    const y = (i) => height - 14 - ((values[i] - low) / (high - low)) * (height - 22);
-    g.strokeStyle = "#e3e6ea";
+    const y = (i) => height - 14 - ((values[i] - low) / (high - low || 1)) * (height - 22);
+    g.strokeStyle = styled("--line");
     g.beginPath();
     for (const part of [0, 0.5, 1]) {
       g.moveTo(0, 8 + part * (height - 22));
       g.lineTo(width, 8 + part * (height - 22));
     }
     g.stroke();
-    g.fillStyle = "#667080";
+    g.fillStyle = styled("--quiet");
     g.font = "10px system-ui, sans-serif";
-    g.fillText(short(high), 2, 8 - 0 + 2);
+    if (high > low) g.fillText(short(high), 2, 10);
     g.fillText(short(low), 2, height - 16);
     g.fillText(`update ${short(steps[0])}`, 2, height - 2);
     g.textAlign = "right";
@@ -209,7 +251,8 @@ export class TrainingPanel {
     g.stroke();
     const near = figure.near ?? null;
     const shown = near !== null && near < values.length ? near : values.length - 1;
-    figure.querySelector(".quiet").textContent = near === null ? short(values[shown]) : `update ${short(steps[shown])}: ${short(values[shown])}`;
+    const value = `${short(values[shown])} ${this.view.names[figure.dataset.curve].unit}`;
+    figure.querySelector(".quiet").textContent = near === null ? value : `update ${short(steps[shown])}: ${value}`;
     g.fillStyle = colour;
     g.beginPath();
     g.arc(x(shown), y(shown), 3, 0, 7);
@@ -230,7 +273,7 @@ export class TrainingPanel {
       found.replaceChildren(title, ...episodes.map((episode) => {
         const button = document.createElement("button");
         button.dataset.episode = episode.id;
-        button.className = episode.success ? "good" : "bad";
+        button.className = episode.success ? "good" : "warn";
         button.textContent = `${new Date(1000 * episode.time).toLocaleTimeString()}  ${episode.actor}  ${episode.object}  version ${episode.version}  ${episode.success ? "success" : "no success"}`;
         button.addEventListener("click", () => {
           this.watched = "";

@@ -35,7 +35,8 @@ def page(browser: Any, request: pytest.FixtureRequest, tmp_path: pathlib.Path) -
     """A page whose console must stay empty: errors and warnings there fail the test."""
     context = browser.new_context(viewport=SIZE, accept_downloads=True)
     context.set_default_timeout(60_000)
-    context.tracing.start(screenshots=True, snapshots=True)
+    # Without a picture of every frame, which costs more than drawing them: a failure keeps the last one.
+    context.tracing.start(screenshots=bool(os.environ.get("KEEP_TRACES")), snapshots=True)
     opened = context.new_page()
     messages: list[str] = []
     opened.on(

@@ -18,10 +18,11 @@ from common.objects import procedural
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.wire.codec import Message
+from services.viz.studio.catalogue import Catalogue
 from services.viz.studio.server import PageServer
-from services.viz.studio.session import Catalogue, Session
+from services.viz.studio.session import Session
 from tests.services.viz.studio.conftest import BROWSERS, SIZE
-from tests.studio import MadeUpGrasping, take_mesh
+from tests.studio import MadeUpGrasping, MadeUpImporter
 
 SECONDS = 8
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
@@ -53,7 +54,7 @@ def fine_object() -> GraspObject:
 @contextlib.contextmanager
 def studio() -> Iterator[str]:
     """The address of a studio on that object."""
-    session = Session({"human": Fine}, Catalogue({"ball": fine_object}), take_mesh)
+    session = Session({"human": Fine}, Catalogue({"ball": fine_object}), MadeUpImporter())
     server = PageServer(session.gets, session.posts, "127.0.0.1", 0)
     yield server.url
     server.close()

@@ -110,6 +110,19 @@ def drag(page: Any, points: list[tuple[float, float]]) -> None:
     page.mouse.up()
 
 
+def grasp(page: Any, site: Site) -> str:
+    """Grasps; returns the motion's number once it is shown.
+
+    What the server does and what the page shows of it have deadlines of their own: on a busy machine either takes long.
+    """
+    before = {motion["id"] for motion in site.session.state()["motions"]}
+    page.click("#grasp")
+    (made,) = eventually(lambda: {motion["id"] for motion in site.session.state()["motions"]} - before)
+    page.wait_for_selector(f"[data-motion='{made}'][data-shown]")
+    page.wait_for_selector("#player:not([hidden])")
+    return str(made)
+
+
 def handle(page: Any, name: str) -> tuple[float, float]:
     picture(page)
     x, y = json.loads(page.get_attribute("#scene", "data-handles"))[name]
@@ -125,6 +138,9 @@ def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
     difference = np.abs(small - wanted).max(-1)[12:-6]
     assert (difference > 40).mean() < 0.02, "the picture is another than tests/services/viz/studio/first_picture.png"
     assert orange(seen).mean() > 0.01
+    grey = np.ptp(seen, axis=-1) < 14
+    shadow = grey & (abs(seen.mean(-1) - 0.8 * 219) < 8)  # on the table, which is 219 bright
+    assert shadow[: len(seen) // 2].sum() < shadow[len(seen) // 2 :].sum() and shadow.mean() > 0.003
 
 
 def test_the_rules_act_and_are_explained_when_constraints_are_ticked(opened: Any, site: Site) -> None:
@@ -144,10 +160,21 @@ def test_the_brush_paints_what_it_goes_over(opened: Any, site: Site) -> None:
     x, y = on_object(opened)
     before = red(picture(opened)).sum()
     opened.click("[data-tool=avoid]")
+    opened.mouse.move(x, y)  # the brush shows what it would paint, and paints nothing
+    hovered = red(picture(opened)).sum()
+    assert hovered > before + 50 and site.studio["avoid_share"] == 0
+    opened.mouse.move(x, 5)
+    assert red(picture(opened)).sum() < before + 10
     drag(opened, [(x, y), (x + 12, y + 4)])
     opened.wait_for_selector("[data-mask=affordance][data-on=true]")
     painted = site.studio["avoid_share"]
     assert painted > 0 and red(picture(opened)).sum() > before + 100
+    opened.keyboard.press("Control+z")
+    opened.wait_for_selector("[data-mask=affordance][data-on=false]")
+    assert site.studio["avoid_share"] == 0 and opened.is_disabled("#undo") is False
+    opened.keyboard.press("Control+Shift+Z")
+    opened.wait_for_selector("[data-mask=affordance][data-on=true]")
+    assert site.studio["avoid_share"] == painted and opened.is_disabled("#redo")
     opened.click("[data-tool=graspable]")
     drag(opened, [(x, y), (x + 12, y + 4)])
     eventually(lambda: site.studio["avoid_share"] < painted)
@@ -166,6 +193,14 @@ def test_the_arrow_is_placed_by_a_click_and_turned_by_its_tail(opened: Any, site
     turned = eventually(lambda: (arrow := site.studio["arrow"]) != before and arrow)
     angle = np.arccos(np.clip(np.dot(turned["direction"], before["direction"]), -1, 1))
     assert 0.05 < angle < 1.5
+    opened.fill("#roll-number", "45")
+    opened.press("#roll-number", "Enter")
+    eventually(lambda: site.studio["roll_deg"] == 45.0)
+    opened.focus("#roll")
+    opened.keyboard.press("ArrowRight")
+    eventually(lambda: site.studio["roll_deg"] > 45.0 and opened.input_value("#roll-number") != "45")
+    opened.click("#undo")
+    eventually(lambda: opened.input_value("#roll-number") == "45")
 
 
 def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
@@ -228,8 +263,7 @@ def test_an_older_recording_is_played_with_its_constraints_and_contact_alone(ope
 def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_path: pathlib.Path) -> None:
     assert opened.input_value("#hand") == "of the run"
     still, tail = picture(opened), handle(opened, "tail")
-    opened.click("#grasp")
-    opened.wait_for_selector("#player:not([hidden])")
+    grasp(opened, site)
     assert [item.get_attribute("data-lane") for item in opened.locator("#lanes [data-lane]").all()] == [
         "contact", "heading",
     ]  # fmt: skip
@@ -242,22 +276,66 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
     opened.mouse.click(box["x"] + 0.97 * box["width"], box["y"] + 10)
     opened.wait_for_selector("[data-lane=heading][data-met=true]")
     assert opened.inner_text("#time") != "0.00 s" and "7.5 N" in opened.inner_text("#lanes")
-    assert "contact force" in opened.inner_text("#values")
+    assert "Contact force, N" in opened.inner_text("#values") and "Reward per step" in opened.inner_text("#values")
+    assert "w_c: for all links in contact" in opened.get_attribute("#values tr:has-text('Contact') >> nth=-1", "title")
     last = picture(opened)
     for one, other in ((still, first), (first, last)):
         rows = min(len(one), len(other))
         assert (np.abs(one[:rows] - other[:rows]).max(-1) > 40).mean() > 0.01
     for kind in ("npz", "mcap", "glb"):
         with opened.expect_download() as download:
-            opened.select_option("#motions select", kind)
+            opened.select_option("#save", kind)
         download.value.save_as(tmp_path / f"motion.{kind}")
     assert load_motion(tmp_path / "motion.npz").hand == "human"
     assert len(list(read_episodes(tmp_path / "motion.mcap"))) == 1
     assert (tmp_path / "motion.glb").read_bytes()[:4] == b"glTF"
+    with opened.expect_download() as download:
+        opened.select_option("#save", "png")
+    download.value.save_as(tmp_path / "motion.png")
+    assert Image.open(tmp_path / "motion.png").size == (1280, 720)
     opened.click("#edit")
     opened.wait_for_selector("#player", state="hidden")
     assert site.grasping.asked[-1][0].name == "mug_1"
     assert handle(opened, "tail") == pytest.approx(tail, abs=1.0)  # the constraints are seen from where they were
+
+
+def test_two_motions_are_compared_and_one_is_deleted(opened: Any, site: Site) -> None:
+    first = grasp(opened, site)
+    opened.check("[data-ask=affordance]")  # closes the motion: what is edited is seen
+    opened.wait_for_selector("#player", state="hidden")
+    second = grasp(opened, site)
+    opened.select_option("#speed", "1")
+    opened.click(f"[data-motion='{first}'] .compare")
+    opened.wait_for_selector("#names:not([hidden])")
+    opened.wait_for_selector("#play:has-text('Play')")
+    both = picture(opened)
+    left, right = both[:, : both.shape[1] // 2], both[:, both.shape[1] // 2 :]
+    assert red(left).mean() > 0.001 and red(right).mean() < 0.0002  # the affordance was of the second alone
+    assert orange(right).mean() > 0.005
+    assert opened.inner_text("#values tr").split() == ["motion", second, "motion", first]
+    opened.select_option("#layout", "over")
+    over = picture(opened)
+    middle = over[:, over.shape[1] // 4 : 3 * over.shape[1] // 4]
+    assert red(middle).sum() > 0.8 * red(over).sum() > 0 and red(over[:, : over.shape[1] // 4]).sum() == 0
+    opened.click(f"[data-motion='{first}'] .delete")
+    opened.wait_for_selector(f"[data-motion='{first}']", state="detached")
+    opened.wait_for_selector("#player", state="hidden")
+    assert first not in [motion["id"] for motion in site.session.state()["motions"]]
+
+
+def test_on_a_phone_and_in_the_dark_everything_is_within_reach(opened: Any) -> None:
+    opened.set_viewport_size({"width": 390, "height": 844})
+    opened.emulate_media(color_scheme="dark")
+    assert opened.evaluate("document.documentElement.scrollWidth") == 390
+    assert opened.locator("#scene").bounding_box()["width"] == 390
+    for place in (0, 300, 10_000):
+        opened.locator("#studio").evaluate("(aside, place) => aside.scrollTo(0, place)", place)
+        box = opened.locator("#grasp").bounding_box()
+        assert box["y"] > 0 and box["y"] + box["height"] <= 844 and box["width"] > 300
+    corner = picture(opened)[60, 5]  # beside the hand, above the table
+    assert corner.max() < 60
+    opened.emulate_media(color_scheme="light")
+    assert picture(opened)[60, 5].min() > 200
 
 
 def test_a_mesh_is_opened_and_a_wrong_file_is_explained(opened: Any, site: Site, tmp_path: pathlib.Path) -> None:
@@ -268,8 +346,19 @@ def test_a_mesh_is_opened_and_a_wrong_file_is_explained(opened: Any, site: Site,
     opened.set_input_files("#file", tmp_path / "mug.stl")
     opened.wait_for_selector("#facts:has-text('a bit small')")
     assert site.studio["object"]["name"] == "bottle_5"
-    assert opened.input_value("#object") == "bottle_5"
+    assert opened.input_value("#object") == "bottle_5" and opened.input_value("#unit") == "m"
     assert orange(picture(opened)).mean() > 0.005
+    (tmp_path / "unknown.stl").write_bytes(b"something")
+    opened.set_input_files("#file", tmp_path / "unknown.stl")
+    opened.wait_for_selector("#unit-question:has-text('In which unit are the numbers of unknown.stl?')")
+    assert "inches: 2.29 x 2.29 x 7.62 cm" in opened.inner_text("#unit")
+    opened.select_option("#unit", "in")
+    eventually(lambda: max(site.studio["object"]["size_cm"]) < 8)
+    opened.wait_for_selector("#unit-question:has-text('Unit of unknown.stl')")
+    opened.click("[data-rest='1']")
+    opened.wait_for_selector("[data-rest='1'][aria-pressed=true]")
+    assert site.studio["rest"]["index"] == 1
+    eventually(lambda: opened.evaluate("document.querySelector('[data-rest=\"1\"] img').naturalWidth") == 150)
 
 
 def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_episodes(opened: Any, site: Site) -> None:
@@ -277,7 +366,9 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     opened.wait_for_selector("tr[data-actor=a099]", state="attached")
     assert not opened.is_visible("#policy")  # the studio's policy may be older than the run's, which a tile shows
     assert opened.locator("tr[data-actor]").count() == 100
-    assert opened.inner_text("[data-tile='largest lag'] b") == "2"
+    assert opened.inner_text("[data-tile='largest lag'] b") == "2 versions"
+    assert "Throughput" in opened.inner_text("figure[data-curve=steps_per_second]")
+    assert "100,000 control steps/s" in opened.inner_text("figure[data-curve=steps_per_second]")
     assert "50.0 %" in opened.inner_text("[data-constraint=pose]")
     opened.fill("#filter", "a04")
     opened.wait_for_selector("tr[data-actor=a099]", state="detached")
@@ -296,3 +387,11 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     opened.wait_for_selector("#result:has-text('thing-2')")
     opened.click("#show-studio")
     opened.wait_for_selector("#player", state="hidden")
+    # Once the run is over and its learner has gone, it is shown whole, and nothing is missed.
+    assert opened.locator("#curves figure").count() == 4
+    site.window.take_status(made_up.status(100) | {"finished": True}, time.time())
+    site.window.take_status(None, time.time())
+    opened.click("#show-training")
+    opened.wait_for_selector("[data-tile=state] b:has-text('finished')")
+    eventually(lambda: opened.locator("#curves figure").count() == len(site.window.view()["names"]) == 6)
+    assert opened.inner_text("#run-trouble") == "" and opened.inner_text("[data-tile=update] b") == "59"

@@ -1,6 +1,7 @@
 """The page's server answers its own page alone, and any request with a result or a message."""
 
 import http.client
+import io
 import json
 import pathlib
 import time
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from common.errors import CongraspError
 from common.wire.codec import decode
@@ -87,8 +89,10 @@ def test_other_sites_are_turned_away(page: Page) -> None:
         (b"[1]", "JSON"),
         (b'{"action": "explode"}', "cannot do 'explode'"),
         (b'{"action": "view"}', "cannot do 'view'"),
-        (b'{"action": "roll", "turns": 2}', "other values"),
+        (b'{"action": "set_roll", "turns": 2}', "other values"),
         (b'{"action": "object", "name": "moon"}', "no object 'moon'"),
+        (b'{"action": "unit", "unit": "cm"}', "Open a mesh"),
+        (b'{"action": "draw_motion", "id": "7", "kind": "png", "camera": {}}', "no motion '7'"),
         (b'{"action": "ask", "constraint": "x", "on": true}', "no constraint 'x'"),
     ],
 )
@@ -136,6 +140,49 @@ def test_a_mesh_becomes_an_object_and_an_empty_file_is_refused(page: Page) -> No
     assert code == 200 and page.wait()["error"] == ""
     state = json.loads(page.ask("GET", "/api/state")[1])
     assert state["studio"]["object"]["name"] == state["chosen"] == "bottle_5"
+    assert state["upload"]["unit"] == "m" and state["upload"]["file"] == "x.stl"
+
+
+def test_a_mesh_of_unknown_unit_waits_for_it_and_may_get_another(page: Page) -> None:
+    def state() -> dict[str, Any]:
+        return json.loads(page.ask("GET", "/api/state")[1])
+
+    before = state()
+    page.ask("POST", "/api/upload?name=unknown.stl", b"solid", Content_Type="application/octet-stream")
+    waiting = state()
+    assert waiting["chosen"] == before["chosen"] and waiting["shown"] == before["shown"]
+    assert {unit["unit"]: unit["size"] for unit in waiting["upload"]["units"]} == {
+        "m": "0.9 x 0.9 x 3 m",
+        "cm": "0.9 x 0.9 x 3 cm",
+        "mm": "0.9 x 0.9 x 3 mm",
+        "in": "2.29 x 2.29 x 7.62 cm",
+    }
+    assert [unit["unit"] for unit in waiting["upload"]["units"] if unit["possible"]] == ["cm", "in"]
+    names, sizes = [], []
+    for unit in ("cm", "in"):
+        page.do("unit", unit=unit)
+        assert page.wait()["error"] == ""
+        found = state()
+        assert found["upload"]["unit"] == unit
+        names.append(found["chosen"])
+        sizes.append(max(found["studio"]["object"]["size_cm"]))
+    assert sizes[1] / sizes[0] == pytest.approx(2.54, rel=0.05)
+    assert names[0] == names[1] and found["objects"].count(names[0]) == 1  # it took the place of the first
+    page.do("object", name="mug")
+    assert page.wait()["error"] == "" and state()["upload"] is None
+
+
+def test_resting_poses_have_thumbnails_and_edits_are_undone(page: Page) -> None:
+    before = page.do("set_rest_pose", rest=1)
+    assert before["studio"]["rest"]["index"] == 1 and before["history"]["undo"] == "resting pose"
+    assert page.do("undo")["studio"]["rest"]["index"] == 0
+    assert page.do("redo")["studio"]["rest"]["index"] == 1
+    code, picture = page.ask("GET", "/api/rest?index=1")
+    assert code == 200 and Image.open(io.BytesIO(picture)).size == (150, 112)
+    assert picture != page.ask("GET", "/api/rest?index=0")[1]
+    assert b"no resting pose 100" in page.ask("GET", "/api/rest?index=99")[1]
+    assert page.do("object", name="mug")["history"] and page.wait()["error"] == ""
+    assert page.do("undo")["history"] == {"undo": "", "redo": ""}  # nothing of the object before
 
 
 def test_a_run_is_shown_beside_the_studio(page: Page) -> None:

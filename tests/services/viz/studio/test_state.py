@@ -12,6 +12,8 @@ from common.hands.kinematics import grasp_frame
 from common.objects import procedural
 from common.objects.shapes import matrix
 from common.task.sampling.headings import BACK_OFF, INWARD
+from services.viz.studio.description import describe
+from services.viz.studio.history import ACTIONS, History
 from services.viz.studio.state import Studio
 
 MUG = procedural.generate(1, "mug")
@@ -23,7 +25,7 @@ def studio() -> Studio:
 
 
 def masks(studio: Studio) -> dict[str, bool]:
-    return studio.view()["active"]["masks"]
+    return describe(studio)["active"]["masks"]
 
 
 def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
@@ -38,7 +40,7 @@ def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
 
 def test_the_hand_begins_before_the_arrow_and_aligned_with_it(studio: Studio) -> None:
     hand, rest = studio.hand, MUG.rest_poses[0]
-    start = studio.view()["start"]
+    start = describe(studio)["start"]
     wrist, turn = np.array(start["position"][0]), matrix(np.array(start["quaternion"][0]))
     center = wrist + turn @ grasp_frame(hand).center
     target = rest[:3] + matrix(rest[3:]) @ studio.arrow.position
@@ -52,7 +54,7 @@ def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: St
     far = np.linalg.norm(MUG.points - center, axis=-1)
     np.testing.assert_array_equal(studio.canvas.avoid, far <= 0.02)
     shown = np.linalg.norm(studio.canvas.vertices - center, axis=-1)
-    np.testing.assert_array_equal(studio.canvas.shown, shown <= 0.02)
+    np.testing.assert_array_equal(studio.canvas.paint.shown, shown <= 0.02)
     assert studio.asked == {"affordance"} and masks(studio)["affordance"]
     np.testing.assert_array_equal(studio.labelled.non_graspable_points, studio.canvas.avoid)
     np.testing.assert_array_equal(studio.request.avoid, studio.canvas.avoid)
@@ -63,7 +65,7 @@ def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: St
 def test_without_paint_the_affordance_takes_the_parts_that_the_object_came_with(studio: Studio) -> None:
     studio.ask("affordance", True)
     np.testing.assert_array_equal(studio.canvas.avoid, MUG.non_graspable_points)
-    assert 0 < studio.canvas.shown.mean() < 1
+    assert 0 < studio.canvas.paint.shown.mean() < 1
 
 
 def test_the_rules_are_explained_and_set_the_masks(studio: Studio) -> None:
@@ -81,7 +83,7 @@ def test_the_rules_are_explained_and_set_the_masks(studio: Studio) -> None:
 
 def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studio) -> None:
     studio.paint([studio.arrow.position - INWARD * studio.arrow.direction], 0.03, avoid=True)
-    view = studio.view()
+    view = describe(studio)
     assert view["active"]["overruled"] and any(
         "turned towards the graspable region" in line for line in view["explanation"]
     )
@@ -92,9 +94,25 @@ def test_the_arrow_is_aimed_as_deep_as_in_training_and_rolls_around_itself(studi
     studio.snap_heading([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
     np.testing.assert_allclose(studio.arrow.position, [0.01, -INWARD, 0.02])
     before = studio.arrow.cross
-    studio.roll(np.pi / 2)
+    studio.set_roll(studio.arrow.roll(studio.up) + np.pi / 2)
     assert studio.arrow.cross @ before == pytest.approx(0.0, abs=1e-6)
     assert studio.arrow.cross @ studio.arrow.direction == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("direction", [[0.0, 0.0, -1.0], [0.3, -0.5, -0.4], [1.0, 0.0, 0.0]])
+def test_the_roll_is_the_angle_of_the_cross_finger_axis_from_level(studio: Studio, direction: list[float]) -> None:
+    turn = matrix(MUG.rest_poses[0][3:])
+    studio.set_heading([0.0, 0.0, 0.0], turn.T @ direction)
+    studio.set_roll(0.0)
+    assert (turn @ studio.arrow.cross)[2] == pytest.approx(0.0, abs=1e-9)
+    level = studio.arrow.cross
+    for degrees in (-150.0, -30.0, 75.0, 180.0):
+        studio.set_roll(np.radians(degrees))
+        assert describe(studio)["roll_deg"] == degrees
+        assert studio.arrow.cross @ level == pytest.approx(np.cos(np.radians(degrees)))
+        assert np.cross(level, studio.arrow.cross) @ studio.arrow.direction == pytest.approx(
+            np.sin(np.radians(degrees))
+        )
 
 
 def test_a_drawn_path_keeps_its_begin_and_ends_at_the_wrist_of_the_grasp(studio: Studio) -> None:
@@ -139,6 +157,7 @@ def test_suggestions_are_for_the_object_as_it_is_shown(studio: Studio) -> None:
         (lambda s: s.ask("heading", True), "heading is always active. Set it with the arrow"),
         (lambda s: s.set_rest_pose(99), "no resting pose"),
         (lambda s: s.suggest("affordance"), "Nothing can be suggested"),
+        (lambda s: s.set_roll(np.inf), "three numbers"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(studio: Studio, do, says) -> None:
@@ -160,4 +179,69 @@ def test_an_impossible_request_is_explained_before_it_is_sent(studio: Studio) ->
 def test_another_object_forgets_what_was_asked_of_the_one_before(studio: Studio) -> None:
     studio.ask("pose", True)
     studio.take(dataclasses.replace(MUG, name="other"))
-    assert studio.asked == set() and studio.pose is None and studio.view()["object"]["name"] == "other"
+    assert studio.asked == set() and studio.pose is None and describe(studio)["object"]["name"] == "other"
+
+
+def same(one: Studio, edit: object) -> bool:
+    """Whether the request is that of an edit, to the last bit."""
+    return all(np.array_equal(a, b) for a, b in zip(leaves(one.edit), leaves(edit), strict=True))
+
+
+def leaves(tree: object) -> list[object]:
+    if isinstance(tree, dict):
+        return [leaf for key in sorted(tree) for leaf in leaves(tree[key])]
+    if isinstance(tree, tuple):
+        return [leaf for part in tree for leaf in leaves(part)]
+    return [tree]
+
+
+def test_every_edit_is_undone_and_redone_and_a_new_one_ends_what_could_be_redone(studio: Studio) -> None:
+    studio.take(MUG)
+    history, up = History(studio), matrix(MUG.rest_poses[0][3:])[2]
+    edits = [
+        ("set_rest_pose", {"rest": 0}),
+        ("snap_heading", {"surface": MUG.points[0], "direction": -MUG.normals[0]}),
+        ("set_heading", {"position": [0.0, 0.0, 0.0], "direction": -up}),
+        ("set_roll", {"angle": 0.5}),
+        ("paint", {"points": [MUG.points[0]], "radius": 0.02, "avoid": True}),
+        ("close_hand", {}),
+        ("draw", {"points": [studio.arrow.position + up * h for h in (0.35, 0.2)]}),
+        ("suggest", {"constraint": "pose"}),
+        ("ask", {"constraint": "pose", "on": False}),
+        ("fill", {"avoid": False}),
+    ]
+    assert {name for name, _ in edits} == ACTIONS.keys() - {"choose"}
+    states = [studio.edit]
+    for name, values in edits:
+        history.do(name, **values)
+        states.append(studio.edit)
+        assert history.view() == {"undo": ACTIONS[name], "redo": ""}
+    assert studio.asked == {"trajectory"} and studio.path is not None
+    for state in states[-2::-1]:
+        history.undo()
+        assert same(studio, state)
+    assert history.view() == {"undo": "", "redo": ACTIONS["set_rest_pose"]} and studio.asked == set()
+    history.undo()  # there is nothing more
+    for state in states[1:]:
+        history.redo()
+        assert same(studio, state)
+    history.undo()
+    history.undo()
+    history.do("ask", constraint="trajectory", on=False)
+    assert history.view()["redo"] == ""
+    before = studio.edit
+    history.redo()
+    assert same(studio, before)
+
+
+def test_what_one_gesture_does_is_undone_at_once_and_what_fails_is_no_edit(studio: Studio) -> None:
+    history, first = History(studio), studio.edit
+    for gesture, angle in ((1, 0.1), (1, 0.2), (1, 0.3), (2, 0.4)):
+        history.do("set_roll", gesture=gesture, angle=angle)
+    with pytest.raises(CongraspError, match="3 cm or more"):
+        history.do("draw", points=[[0, 0, 0.1], [0, 0, 0.101]])
+    assert studio.arrow.roll(studio.up) == pytest.approx(0.4)
+    history.undo()
+    assert studio.arrow.roll(studio.up) == pytest.approx(0.3)
+    history.undo()
+    assert same(studio, first) and history.view()["undo"] == ""

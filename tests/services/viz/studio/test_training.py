@@ -16,7 +16,7 @@ from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import Message
 from services.record.recorder import Recorder
 from services.viz.studio.recordings import MOST, Recordings
-from services.viz.studio.training import Curve, Follower, TrainingWindow
+from services.viz.studio.training import FIRST, Curve, Follower, TrainingWindow, labels_of
 from tests import studio as made_up
 from tests.studio import BEGIN, DIP
 
@@ -59,7 +59,7 @@ def test_actors_that_are_gone_are_forgotten_after_a_while_and_an_absent_learner_
     window.take_status(made_up.status(2), now + 60)
     assert [row["id"] for row in window.view()["actors"]] == ["a000", "a001"]
     window.take_status(None, now + 61)
-    assert window.view()["disconnected"] and window.view()["version"] == 12
+    assert window.view()["phase"] == "disconnected" and window.view()["version"] == 12
 
 
 def test_thinned_curves_keep_every_dip() -> None:
@@ -90,7 +90,7 @@ def test_damaged_messages_are_counted_and_change_nothing(message: Message) -> No
     window = TrainingWindow("made-up")
     for kind in ("metrics", "event", "episode"):
         window.take(KEYS.log(kind, "learner", "0"), message, 0.0)
-    assert window.damaged == 3 and window.view()["names"] == []
+    assert window.damaged == 3 and window.view()["names"] == {}
 
 
 def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_go() -> None:
@@ -108,9 +108,9 @@ def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_g
             assert time.monotonic() < deadline
             learner.publish(KEYS.log("metrics", "learner", "0"), made_up.metrics(1))
             stop.wait(0.05)
-        assert not window.view()["disconnected"]
+        assert window.view()["phase"] == "training"
         learner.close()
-        while not window.view()["disconnected"]:
+        while window.view()["phase"] != "disconnected":
             assert time.monotonic() < deadline
             stop.wait(0.05)
     finally:
@@ -167,8 +167,12 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
     with Recorder(transport, "made-up", tmp_path) as recorder:
         for update in range(40):
             transport.publish(KEYS.log("metrics", "learner", "0"), made_up.metrics(update))
+        reported = {"time": BEGIN, "version": 39, "values": {"rollouts": 12.0, "steps_per_second": 800.0, "x": 1.0}}
+        transport.publish(KEYS.log("metrics", "actor", "a003"), Message({}, reported))
+        told = {"time": BEGIN + 400, "level": "info", "text": "The run is complete after 40 updates."}
+        transport.publish(KEYS.log("event", "learner", "0"), Message({}, told))
         deadline = time.monotonic() + 10
-        while recorder.messages < 40:
+        while recorder.messages < 42:
             assert time.monotonic() < deadline
             time.sleep(0.02)
     made_up.record(tmp_path, [(BEGIN, 3), (BEGIN + 5, 3), (BEGIN + 6, 4)])
@@ -178,3 +182,34 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
     assert window.episode("a004").meta["object"] == "thing-4"
     assert window.curve("episode/success").values[DIP] == 0.1
     assert window.curve("episode/success").times[DIP] == BEGIN + 10 * DIP
+    # A run that is over is shown whole: its last state, and no learner is missed.
+    view = window.view()
+    assert view["phase"] == "recorded" and view["last"]["update"] == 39 and view["last"]["success"] == 0.78
+    assert list(view["curves"]) == list(dict.fromkeys((*FIRST, *view["names"]))) and len(view["curves"]) == 6
+    assert [event["text"] for event in view["events"]] == ["The run is complete after 40 updates."]
+    row = view["actors"][0]
+    assert (row["version"], row["rollouts"], row["steps_per_second"]) == (39, 12.0, 800.0)
+
+
+def test_a_finished_run_stays_finished_when_its_learner_has_gone() -> None:
+    window = made_up.window(actors=2)
+    window.take_status(made_up.status(2) | {"finished": True}, time.time())
+    window.take_status(None, time.time())
+    view = window.view()
+    assert view["phase"] == "finished" and len(view["curves"]) == 6 and view["version"] == 12
+
+
+def test_curves_have_the_titles_and_units_of_the_figures_and_their_order() -> None:
+    found = labels_of(
+        ["term/force_excess", "episode/heading_rad", "staleness_mean", "update_seconds", "episode/success"]
+    )
+    units = {name: label["unit"] for name, label in found.items()}
+    assert units == {
+        "episode/success": "share of episodes",
+        "staleness_mean": "versions",
+        "term/force_excess": "reward",
+        "episode/heading_rad": "rad",
+        "update_seconds": "s",
+    }
+    assert list(found)[:2] == ["episode/success", "staleness_mean"]
+    assert not any({"_", "/"} & set(label["title"]) for label in found.values())

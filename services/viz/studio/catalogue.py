@@ -1,0 +1,136 @@
+"""Objects that a studio offers, and uploaded meshes among them, whose unit the user may choose."""
+
+import dataclasses
+import pathlib
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from common.errors import CongraspError
+from common.objects.spec import GraspObject
+from services.assets.objects.sizes import UNIT_NAMES, guessed_unit, sizes_by_unit
+
+
+class Importer(Protocol):
+    """Makes objects of meshes."""
+
+    def sides(self, path: pathlib.Path) -> tuple[float, float, float]:
+        """The sides of a mesh in its own unit; a CongraspError if it cannot be read."""
+
+    def load(self, path: pathlib.Path, unit: str) -> tuple[GraspObject, list[str]]:
+        """The object of a mesh in one of the units m, cm, mm and in, with notes for the user."""
+
+
+class Catalogue:
+    """Objects to choose from, by name; they are made or imported when they are chosen."""
+
+    def __init__(self, makers: Mapping[str, Callable[[], GraspObject]]):
+        """The first is what a studio begins with."""
+        self._makers = dict(makers)
+        self._made: dict[str, GraspObject] = {}
+
+    @property
+    def names(self) -> list[str]:
+        """What there is."""
+        return list(self._makers)
+
+    def add(self, name: str, maker: Callable[[], GraspObject]) -> str:
+        """One more; returns the name that it got."""
+        free = next(n for n in (name, *(f"{name} ({i})" for i in range(2, 10_000))) if n not in self._makers)
+        self._makers[free] = maker
+        return free
+
+    def drop(self, name: str) -> None:
+        """One less."""
+        self._makers.pop(name, None)
+        self._made.pop(name, None)
+
+    def get(self, name: str) -> GraspObject:
+        """The object; a CongraspError if there is none or it cannot be imported."""
+        if name not in self._makers:
+            raise CongraspError(f"There is no object '{name[:60]}'.", "Choose one of the list.")
+        if name not in self._made:
+            self._made[name] = self._makers[name]()
+        return self._made[name]
+
+
+@dataclasses.dataclass(frozen=True)
+class Upload:
+    """A mesh that the user brought."""
+
+    path: pathlib.Path
+    sides: tuple[float, float, float]
+    """In the file's own unit."""
+    unit: str = ""
+    """Its unit: the user's choice, else the one that makes an object for a hand; empty where that is not only one."""
+    notes: tuple[str, ...] = ()
+    """What its import mended."""
+
+    def view(self) -> dict[str, Any]:
+        """For the page: the file, its unit, and the size that each unit makes of it."""
+        units = [
+            {"unit": unit, "name": UNIT_NAMES[unit], "size": size, "possible": possible}
+            for unit, (size, possible) in sizes_by_unit(self.sides).items()
+        ]
+        return {"file": self.path.name, "unit": self.unit, "units": units}
+
+
+class Uploads:
+    """Uploaded meshes by the names of their objects in a catalogue.
+
+    Attributes:
+      pending: the one that waits for its unit, or None.
+    """
+
+    def __init__(self, folder: pathlib.Path, catalogue: Catalogue, importer: Importer):
+        """None has come yet; files go into the folder."""
+        self._folder, self._catalogue, self._importer = folder, catalogue, importer
+        self._known: dict[str, Upload] = {}
+        self.pending: Upload | None = None
+
+    def of(self, name: str) -> Upload | None:
+        """The one that waits for its unit, else that of an object."""
+        return self.pending or self._known.get(name)
+
+    def take(self, name: str, body: bytes) -> Upload:
+        """A mesh's file as it comes, whose unit is guessed.
+
+        Raises:
+          CongraspError: it is empty or cannot be read, or in no unit a hand could grasp it.
+        """
+        name = pathlib.PurePosixPath(name.replace("\\", "/")).name or "mesh"
+        if not body:
+            raise CongraspError(f"{name} is empty (0 bytes).", "Export or download it again.")
+        path = self._folder / name
+        path.write_bytes(body)
+        try:
+            sides = self._importer.sides(path)
+            return Upload(path, sides, guessed_unit(name, sides))
+        except CongraspError as error:
+            raise self._told(error, path) from None
+
+    def load(self, upload: Upload, unit: str, replaces: str = "") -> str:
+        """Imports a mesh in a unit; returns the name of its object.
+
+        Args:
+          upload: the mesh.
+          unit: m, cm, mm or in.
+          replaces: name of the object that it was until now.
+
+        Raises:
+          CongraspError: it cannot be imported, or is too large or too small for a hand.
+        """
+        try:
+            obj, notes = self._importer.load(upload.path, unit)
+        except CongraspError as error:
+            raise self._told(error, upload.path) from None
+        if replaces in self._known:
+            self._catalogue.drop(replaces)
+            del self._known[replaces]
+        name = self._catalogue.add(obj.name, lambda: obj)
+        self._known[name] = dataclasses.replace(upload, unit=unit, notes=tuple(notes))
+        self.pending = None
+        return name
+
+    def _told(self, error: CongraspError, path: pathlib.Path) -> CongraspError:
+        """The error as the user knows the file, and not where it was put."""
+        return CongraspError(str(error).replace(str(path), path.name))

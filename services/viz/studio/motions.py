@@ -1,0 +1,57 @@
+"""Motions that a studio keeps to be played, compared and saved."""
+
+from typing import Any
+
+import numpy as np
+
+from common.errors import CongraspError
+from common.wire.codec import Message
+
+MOST = 30
+"""Motions that are kept; the oldest goes first."""
+
+
+class Motions:
+    """The newest motions, by number."""
+
+    def __init__(self) -> None:
+        """There is none yet."""
+        self._kept: dict[str, Message] = {}
+        self._number = 0
+
+    def keep(self, episode: Message) -> str:
+        """Keeps a motion; returns its number."""
+        self._number += 1
+        self._kept[str(self._number)] = episode
+        while len(self._kept) > MOST:
+            del self._kept[next(iter(self._kept))]
+        return str(self._number)
+
+    def get(self, key: str) -> Message:
+        """A motion by its number; a CongraspError if there is none."""
+        if key not in self._kept:
+            raise CongraspError(f"There is no motion '{key[:60]}'.", "Press Grasp, or choose one of the list.")
+        return self._kept[key]
+
+    def delete(self, key: str) -> None:
+        """Keeps a motion no longer."""
+        self._kept.pop(key, None)
+
+    def view(self) -> list[dict[str, Any]]:
+        """What a list shows of each, the newest first."""
+        return [_described(key, episode) for key, episode in self._kept.items()][::-1]
+
+
+def _described(key: str, episode: Message) -> dict[str, Any]:
+    """What a list shows of a motion."""
+    meta, metrics = episode.meta, episode.meta.get("metrics", {})
+    return {
+        "id": key,
+        "object": meta["object"],
+        "success": bool(meta["success"]),
+        "held": bool(metrics.get("held", 0.0) > 0),
+        "note": meta.get("note", ""),
+        "version": meta.get("version"),
+        "steps": len(episode.arrays["table"]),
+        "metrics": {name: float(value) for name, value in metrics.items() if np.isfinite(value)},
+    }

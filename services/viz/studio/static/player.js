@@ -1,0 +1,216 @@
+// Plays a motion, or two of them side by side or one over the other.
+
+import { Motion } from "./motion.js";
+import { Body } from "./scene.js";
+import { Timeline } from "./timeline.js";
+import { fetchMessage } from "./wire.js";
+
+const $ = (id) => document.getElementById(id);
+const READABLE = 200; // ms between two changes of the numbers while a motion plays
+
+export class Player {
+  // `app` has: scene, renderer, camera, hand(name), redraw(), shown(), closed().
+  constructor(app) {
+    this.app = app;
+    this.slots = []; // {motion, body, name}: the motion that is played, and one that it is compared with
+    this.time = 0;
+    this.playing = false;
+    this.wanted = 0; // number of the last request to play: what comes for an earlier one is too late
+    this.timeline = new Timeline($("timeline"), $("cursor"), $("lanes"), (time) => this.seek(time));
+    $("play").addEventListener("click", () => this.toggle());
+    $("scrub").addEventListener("input", () => this.seek($("scrub").value * this.step));
+    $("edit").addEventListener("click", () => this.close());
+    $("layout").addEventListener("change", () => this.#names());
+    addEventListener("keydown", (event) => {
+      if (event.target.closest("input, select, button") || !this.motion) return;
+      if (event.key === " ") this.toggle();
+      else if (event.key === "ArrowRight") this.seek(this.time + this.step);
+      else if (event.key === "ArrowLeft") this.seek(this.time - this.step);
+      else if (event.key === "Escape") this.close();
+      else return;
+      event.preventDefault();
+    });
+  }
+
+  get motion() {
+    return this.slots[0]?.motion ?? null;
+  }
+
+  get duration() {
+    return Math.max(...this.slots.map(({ motion }) => motion.duration));
+  }
+
+  get step() {
+    return this.motion.dt;
+  }
+
+  // Side by side, not one over the other.
+  get beside() {
+    return this.slots.length > 1 && $("layout").value === "beside";
+  }
+
+  shows(id) {
+    return this.slots.some(({ motion }) => motion.id === id);
+  }
+
+  // Plays a motion alone, from its begin.
+  async play(id, name = "") {
+    const slot = await this.#load(id, name, 0);
+    if (!slot) return;
+    this.slots.splice(0).forEach(({ body }) => body.release());
+    this.slots.push(slot);
+    $("player").hidden = false;
+    this.#show();
+  }
+
+  // Plays a motion beside the one that is shown; without that, alone.
+  async compare(id, name) {
+    if (!this.motion) return this.play(id, name);
+    const slot = await this.#load(id, name, 1);
+    if (!slot) return;
+    this.slots.splice(1).forEach(({ body }) => body.release());
+    this.slots.push(slot);
+    this.#show();
+  }
+
+  close() {
+    this.wanted++;
+    this.slots.splice(0).forEach(({ body }) => body.release());
+    this.playing = false;
+    $("player").hidden = $("now").hidden = $("banner").hidden = $("names").hidden = true;
+    this.app.closed();
+  }
+
+  toggle() {
+    if (!this.playing && this.time >= this.duration) this.seek(0);
+    this.playing = !this.playing;
+    this.last = performance.now();
+    this.#label();
+    this.app.redraw();
+  }
+
+  seek(time) {
+    this.time = Math.min(this.duration, Math.max(0, time));
+    this.#frame();
+    this.app.redraw();
+  }
+
+  // Goes on to the time of a frame that is drawn; whether something moves.
+  tick(now) {
+    if (!this.playing) return false;
+    const time = this.time + ((now - this.last) / 1000) * Number($("speed").value);
+    this.last = now;
+    this.time = Math.min(Math.max(time, 0), this.duration);
+    if (time >= this.duration) {
+      this.playing = false;
+      this.#label();
+    }
+    this.#frame();
+    return true;
+  }
+
+  // What is seen: for each view its things, and its part of the canvas as shares of the width.
+  views() {
+    const { scene } = this.app;
+    const things = this.slots.map((slot, i) => scene.playing(slot, slot.motion.at(this.time), i, i > 0 && !this.beside));
+    if (this.beside) return things.map((list, i) => ({ things: list, left: i / 2, width: 1 / 2 }));
+    return [{ things: things.flat() }];
+  }
+
+  // The motion with what it needs to be drawn; null if something else was asked for meanwhile, or it cannot be had.
+  async #load(id, name, slot) {
+    const number = ++this.wanted;
+    try {
+      const motion = new Motion(id, await fetchMessage("/api/motion", { id }));
+      await this.app.hand(motion.hand);
+      if (number !== this.wanted) return null;
+      const body = new Body(this.app.renderer, motion.vertices, motion.faces);
+      body.paint(motion.avoid);
+      return { motion, body, name: name || motion.meta.object };
+    } catch (error) {
+      if (number === this.wanted) this.app.error(error.message);
+      return null;
+    }
+  }
+
+  #show() {
+    const { motion } = this;
+    $("now").hidden = false;
+    $("scrub").max = Math.round(this.duration / this.step);
+    $("layout").hidden = this.slots.length < 2;
+    const { success, metrics } = motion.meta;
+    const { outcome, held } = outcomeOf(success, metrics?.held === undefined ? success : metrics.held > 0);
+    $("result").textContent = `${motion.meta.object}: ${outcome}, policy version ${motion.meta.version}`;
+    $("result").className = held ? "good" : "warn";
+    $("banner").hidden = !motion.meta.note;
+    $("banner").textContent = motion.meta.note ?? "";
+    this.#names();
+    this.timeline.show(motion);
+    this.app.shown(motion);
+    this.seek(0);
+    this.playing = true;
+    this.last = performance.now();
+    this.app.redraw();
+    this.#label();
+  }
+
+  #names() {
+    $("names").hidden = this.slots.length < 2;
+    $("names").dataset.layout = $("layout").value;
+    const texts = this.slots.map(({ name }, i) => (i && !this.beside ? `${name} (faint)` : name));
+    $("names").replaceChildren(...texts.map((textContent) => Object.assign(document.createElement("span"), { textContent })));
+    this.app.redraw();
+  }
+
+  #label() {
+    $("play").textContent = this.playing ? "Pause" : "Play";
+  }
+
+  #frame() {
+    this.timeline.at(this.time);
+    const now = performance.now();
+    if (this.playing && now - (this.written ?? 0) < READABLE) return;
+    this.written = now;
+    $("time").textContent = `${this.time.toFixed(2)} s`;
+    this.timeline.write(this.motion.step(this.time));
+    $("scrub").value = Math.round(this.time / this.step);
+    this.#values();
+  }
+
+  // Force and rewards of every motion that is shown, with what each is.
+  #values() {
+    const steps = this.slots.map(({ motion }) => motion.step(this.time));
+    const terms = Object.keys(this.motion.rewards).filter((name) => this.motion.rewards[name].some((value) => value !== 0));
+    const rows = [
+      ["", "", ...this.slots.map(({ motion }) => (this.slots.length > 1 ? `motion ${motion.id}` : ""))],
+      ["Contact force, N", "sum of all contact forces", ...this.slots.map(({ motion }, i) => motion.totalForce[steps[i]].toFixed(2))],
+      ["Reward per step", "sum of the terms below", ...this.slots.map(({ motion }, i) => motion.totalReward[steps[i]].toFixed(3))],
+      ...terms.map((name) => [
+        sentence(name), this.motion.meta.terms?.[name] ?? "", ...this.slots.map(({ motion }, i) => motion.rewards[name]?.[steps[i]].toFixed(3) ?? ""),
+      ]),
+    ];
+    const table = $("values");
+    while (table.rows.length > rows.length) table.deleteRow(-1);
+    rows.forEach(([name, title, ...values], i) => {
+      const line = table.rows[i] ?? table.insertRow();
+      line.className = i > 2 ? "term" : "";
+      line.title = title;
+      while (line.cells.length > values.length + 1) line.deleteCell(-1);
+      while (line.cells.length < values.length + 1) line.insertCell();
+      [name, ...values].forEach((text, k) => {
+        if (line.cells[k].textContent !== text) line.cells[k].textContent = text;
+      });
+    });
+  }
+}
+
+// How a motion ended. It succeeds by holding the object for the paper's quarter of a second, and holds it if it does to
+// its end.
+export function outcomeOf(success, held) {
+  return { outcome: held ? "held" : success ? "held briefly" : "not held", held };
+}
+
+// "wrist_velocity" as "Wrist velocity".
+function sentence(name) {
+  return name[0].toUpperCase() + name.slice(1).replaceAll("_", " ");
+}
