@@ -1,0 +1,83 @@
+"""The object of a motion as DexGraspBench has objects: a folder with its mesh, its convex pieces and its mass."""
+
+import json
+import pathlib
+
+import numpy as np
+import trimesh
+from scipy.spatial import QhullError
+
+from common.errors import CongraspError
+from common.files import write_atomically
+from common.objects import shapes
+from common.objects.plain import plain_object
+from common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
+from services.assets.objects.decompose import decompose
+from services.assets.objects.pieces import simplify
+from services.export.motion_file import GraspMotion
+
+_DENSITY = 500.0  # kg/m^3
+_SECONDS = 60.0  # for the convex decomposition of a body
+
+
+def convex_object(motion: GraspMotion) -> GraspObject:
+    """The object in the motion's object frame, made of convex pieces: a motion has its mesh alone.
+
+    Raises:
+      CongraspError: the mesh has no volume.
+    """
+    shape = motion.object_vertices.astype(float), motion.object_faces
+    # Bodies that only touch have no vertex in common, unless equal ones are merged.
+    bodies = trimesh.Trimesh(*shape, process=False).split(only_watertight=False, repair=False)
+    if len(bodies) > MAX_MESH_PIECES:
+        bodies = [trimesh.Trimesh(*shape)]
+    pieces = [piece for body in bodies for piece in _pieces(body, max(1, MAX_MESH_PIECES // len(bodies)))]
+    if not pieces:
+        raise CongraspError(f"The mesh of '{motion.object}' has no volume.", "Make the motion anew.")
+    return plain_object(motion.object, tuple(pieces), _DENSITY)
+
+
+def write_object(folder: pathlib.Path, obj: GraspObject, origin: np.ndarray, scale: float) -> None:
+    """Writes an object as the benchmark's preprocessing does, in the frame and unit of its file.
+
+    Args:
+      folder: gets `mesh/simplified.obj`, `urdf/meshes/convex_piece_*.obj` and `info/simplified.json`.
+      obj: convex pieces in the object frame.
+      origin: (3,) m: object frame = scale * file - origin.
+      scale: m per unit of the file.
+    """
+
+    def in_file(points: np.ndarray) -> np.ndarray:
+        return (points + origin) / scale
+
+    _write_mesh(folder / "mesh" / "simplified.obj", in_file(obj.visual_vertices), obj.visual_faces)
+    for number, piece in enumerate(obj.pieces):
+        vertices, faces = shapes.tessellate(piece)
+        _write_mesh(folder / "urdf" / "meshes" / f"convex_piece_{number:03d}.obj", in_file(vertices), faces)
+    info = {
+        "gravity_center": (origin / scale).tolist(),
+        "obb": (np.ptp(obj.visual_vertices, axis=0) / scale).tolist(),
+        "scale": 1.0,
+        "density": 1.0,
+        "mass": sum(shapes.volume(piece) for piece in obj.pieces) / scale**3,
+    }
+    write_atomically(folder / "info" / "simplified.json", json.dumps(info, indent=1).encode())
+
+
+def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
+    """Convex pieces of one body; none of a flat one."""
+    try:
+        volume = float(body.volume) if body.is_volume else None
+        found = decompose(
+            np.asarray(body.vertices), np.asarray(body.faces), volume=volume, time_limit=_SECONDS, max_pieces=most
+        )
+        return [Piece("mesh", (0.0, 0.0, 0.0), vertices=simplify(vertices)) for vertices in found.pieces]
+    except QhullError:
+        return []
+
+
+def _write_mesh(path: pathlib.Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Writes triangles as Wavefront OBJ."""
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+    write_atomically(path, "\n".join([*lines, ""]).encode())
