@@ -53,7 +53,8 @@ def sheet(
       out: The PNG file to write; with several hands, one beside another.
     """
     from common.hands import get_hand, own_hands
-    from services.assets.hands.visual import load_meshes, skin_of_meshes
+    from common.hands.meshes import load_meshes
+    from common.hands.skin import skin_of_meshes
     from services.viz.hand_sheets import hands_sheet
     from services.viz.sheets import save_png
 

@@ -14,6 +14,7 @@ from common.errors import CongraspError
 from common.hands.files import TAKEN_JOINTS, faults, hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.measures import fitting_scale
+from common.hands.meshes import Meshes
 from common.hands.motors import motor_limits
 from common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from services.assets.hands.compile import compiled_model
@@ -21,7 +22,7 @@ from services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_
 from services.assets.hands.motors import Drive
 from services.assets.hands.poses import opening, propose_poses, thumb_of
 from services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
-from services.assets.hands.visual import Meshes, link_mesh
+from services.assets.hands.visual import link_mesh
 
 _LEVER = 0.02  # m from a joint to the tip that it moves, at least
 _SMALL = 0.03  # m of opening below which a hand is doubtful
