@@ -28,6 +28,7 @@ from services.export.benchmark_objects import convex_object, write_object
 from services.export.frames import TOLERANCE_MM
 from services.export.motion_file import GraspMotion
 from services.export.motion_formats import pick_motion
+from services.record.goals import grasp_span
 
 CLEARANCE = 0.006
 """Metres between hand and object in the pregrasp."""
@@ -118,17 +119,17 @@ def motions_at(paths: Sequence[pathlib.Path]) -> Iterator[tuple[str, GraspMotion
 
 
 def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
-    """The grasp at a motion's end, where the object is held without the table.
+    """The grasp at the end of the approach: before the table is removed, or the object lifted.
 
     Raises:
       CongraspError: the benchmark does not have the hand.
     """
     match, hand = match_hand(motion), _hand_of(motion)
     obj = convex_object(motion)
-    last = len(motion.time) - 1
-    clear, clearance = _last_clear(hand, obj, motion)
+    last = max(grasp_span(motion.about, motion.control_dt, motion.table)[1] - 1, 0)
+    clear, clearance = _last_clear(hand, obj, motion, last)
     grasp = _state(motion, last)
-    squeeze = grasp._replace(q=squeezed(hand, motion, match.hand.kp))
+    squeeze = grasp._replace(q=squeezed(hand, motion, last, match.hand.kp))
     return Grasp(
         name=name,
         hand=hand,
@@ -143,16 +144,17 @@ def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
     )
 
 
-def squeezed(hand: Hand, motion: GraspMotion, kp: float) -> np.ndarray:
-    """(F,) rad, targets with which servos of `kp` (N.m/rad) apply the policy's torques at the motion's last frame.
+def squeezed(hand: Hand, motion: GraspMotion, t: int, kp: float) -> np.ndarray:
+    """(F,) rad, targets with which servos of `kp` (N.m/rad) apply the policy's torques in frame `t`.
 
     m_squeeze = m + tau / kp for each motor's position m, with tau = clip(kp' (m_target - m), limit) of the hand's own
-    servos, mean over the last tenth of a second. A motor of several joints turns them by their coefficients.
+    servos, mean over ten frames up to this one. A motor of several joints turns them by their coefficients.
     """
     own = np.array([(motor.kp, motor.torque_limit) for motor in hand.motors])
-    ahead = motor_positions(hand, (motion.joint_target - motion.joint_position)[-_STEADY:])
+    frames = slice(max(t + 1 - _STEADY, 0), t + 1)
+    ahead = motor_positions(hand, motion.joint_target[frames] - motion.joint_position[frames])
     further = np.clip(own[:, 0] * ahead, -own[:, 1], own[:, 1]).mean(0) / kp
-    q = motion.joint_position[-1].astype(float)
+    q = motion.joint_position[t].astype(float)
     for motor, way in zip(hand.motors, further, strict=True):
         coefficients = np.array([*motor.joints.values()])
         joints = [int(np.flatnonzero(motion.joint_names == joint)[0]) for joint in motor.joints]
@@ -183,8 +185,8 @@ def write_grasp(grasp: Grasp, folder: pathlib.Path) -> float:
     """Writes a grasp and its object, and reads the grasp back; nothing is left of one that is off.
 
     Returns:
-      The largest distance in mm between where the joints and points 5 cm from them are in the motion's last frame and
-      where the benchmark's kinematics has them.
+      The largest distance in mm between where the joints and points 5 cm from them are and where the benchmark's
+      kinematics has them.
 
     Raises:
       CongraspError: that is more than `TOLERANCE_MM`, or the folder cannot be written.
@@ -248,9 +250,12 @@ def _carried(motion: GraspMotion, t: int, last: int) -> State:
     return State(place, turn * state.rotation, state.q)
 
 
-def _last_clear(hand: Hand, obj: GraspObject, motion: GraspMotion) -> tuple[int, float]:
-    """The last frame in which hand and object are `CLEARANCE` apart, or the one in which they are farthest; and how
-    far (m) that is, between the hand's capsules and the object's pieces."""
+def _last_clear(hand: Hand, obj: GraspObject, motion: GraspMotion, last: int) -> tuple[int, float]:
+    """The last frame up to `last` in which hand and object are `CLEARANCE` apart, or else the one where they are most.
+
+    Returns:
+      The frame, and the distance in m between the hand's shapes and the object's pieces there.
+    """
     model = compile_scene(hand, TaskConfig(), obj)
     data = mujoco.MjData(model)
     fingers = [model.joint(joint.name).qposadr[0] for joint in hand.joints]
@@ -260,7 +265,7 @@ def _last_clear(hand: Hand, obj: GraspObject, motion: GraspMotion) -> tuple[int,
     theirs = [g for g in range(model.ngeom) if model.geom_bodyid[g] != body and model.geom_contype[g]]
     base = model.body("hand_base").id
     best, farthest = 0, -np.inf
-    for t in range(len(motion.time) - 1, -1, -1):
+    for t in range(last, -1, -1):
         model.body_pos[base], model.body_quat[base] = motion.wrist_position[t], motion.wrist_quaternion[t]
         data.qpos[fingers] = motion.joint_position[t]
         data.qpos[free : free + 7] = *motion.object_position[t], *motion.object_quaternion[t]

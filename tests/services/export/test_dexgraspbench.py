@@ -214,7 +214,7 @@ def test_squeezing_applies_the_policys_torque_within_the_motors_limit():
         joint_position=np.tile(motion.joint_position[-1], (T, 1)),
         joint_target=motion.joint_position[-1] + ahead,
     )
-    torque = 5.0 * (dexgraspbench.squeezed(hand, motion, 5.0) - motion.joint_position[-1])
+    torque = 5.0 * (dexgraspbench.squeezed(hand, motion, T - 1, 5.0) - motion.joint_position[-1])
     np.testing.assert_allclose(torque[:3], [0.3, -0.7, 0.0], atol=1e-6)
 
 
@@ -226,7 +226,9 @@ def test_a_motor_of_two_joints_squeezes_at_the_sum_of_its_joints():
     first = motion.joint_names.tolist().index("index_2")
     target = motion.joint_position.copy()
     target[:, first + 1] += 1.0  # the tendon is 2 rad ahead: 4 N.m, of which it has 0.5
-    way = dexgraspbench.squeezed(pulled, dataclasses.replace(motion, joint_target=target), 5.0)[first : first + 2]
+    way = dexgraspbench.squeezed(pulled, dataclasses.replace(motion, joint_target=target), T - 1, 5.0)[
+        first : first + 2
+    ]
     way -= motion.joint_position[-1, first : first + 2]
     assert way @ [1.0, 2.0] == pytest.approx(0.1)
     assert way[1] == pytest.approx(2 * way[0])
@@ -247,6 +249,7 @@ def test_the_pregrasp_is_the_last_clear_state_beside_the_object_as_it_lies_in_th
         object_position=motion.wrist_position + wrist.apply(middle),
     )
     grasp = dexgraspbench.benchmark_grasp("ball", motion)
+    assert grasp.object_position == pytest.approx(motion.object_position[-1])
     assert grasp.clearance == pytest.approx(0.007, abs=5e-4)  # the ball has corners
     state = grasp.states["pregrasp"]
     # Where the hand is, seen from the object, is what it was in that frame.
@@ -255,6 +258,16 @@ def test_the_pregrasp_is_the_last_clear_state_beside_the_object_as_it_lies_in_th
         was = Rotation.from_quat(motion.object_quaternion[2], scalar_first=True).inv().apply(was)
         now = state.rotation.apply(point) + state.position - grasp.object_position
         np.testing.assert_allclose(grasp.object_rotation.inv().apply(now), was, atol=1e-6)
+
+
+def test_the_grasp_is_that_at_the_end_of_the_approach():
+    motion = motion_of(get_hand("allegro"))
+    removed = dataclasses.replace(motion, table=np.arange(T) < 4)
+    lifted = dataclasses.replace(motion, about={"phases": {"grasp": 0.0, "lift": 0.03, "hold": 0.05}}, control_dt=0.01)
+    for case, frame in ((removed, 3), (lifted, 2)):
+        grasp = dexgraspbench.benchmark_grasp("ball", case)
+        np.testing.assert_allclose(grasp.states["grasp"].q, motion.joint_position[frame])
+        np.testing.assert_allclose(grasp.object_position, motion.object_position[frame])
 
 
 def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(monkeypatch):

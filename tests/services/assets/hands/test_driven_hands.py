@@ -14,13 +14,14 @@ from common.hands import VARIABLE, get_hand
 from common.hands.files import hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame, link_transforms
 from common.hands.meshes import MAX_FACES, load_meshes
+from common.hands.mjcf import add_hand
 from common.hands.skin import skin_of, skin_of_meshes
 from common.hands.spec import chain_of
 from common.objects.distance import distance_field
 from common.objects.plain import plain_object
 from common.objects.spec import Piece
 from common.task import plausibility
-from services.assets.hands.model_files import describe, import_hand
+from services.assets.hands.model_files import Choices, describe, import_hand
 from services.assets.hands.visual import save_meshes
 from services.cli import main
 from services.export.frames import skin_of_motion
@@ -160,6 +161,47 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
     refused("has no link 'wing'", {"wing": (vertices, faces)})
     save_meshes(path, {})
     assert load_meshes(path, driven.hand) == {}
+
+
+def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
+    """Every geom of the file that collides is in the hand's model, where it is in the file, and the masses stay."""
+    hand = import_hand(HANDS / "driven.xml", Choices(own_collision=True)).hand
+    assert hand_from_text(hand_text(hand)) is hand and all(link.solids for link in hand.links)
+    theirs = mujoco.MjModel.from_xml_path(str(HANDS / "driven.xml"))
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    add_hand(spec, hand, self_collision=True)
+    ours = spec.compile()
+
+    def shapes(model, palm, bodies):
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        root, turn = data.body(palm).xpos, data.body(palm).xmat.reshape(3, 3)
+        geoms = [g for g in range(model.ngeom) if bodies(g) and model.geom_contype[g] | model.geom_conaffinity[g]]
+        rows = [(*model.geom_size[g], *((data.geom_xpos[g] - root) @ turn)) for g in geoms]
+        return np.array(sorted(rows)), sorted(model.geom_type[geoms].tolist())
+
+    part = {theirs.body("base").id}
+    for body in range(theirs.nbody):
+        part |= {body} if theirs.body_parentid[body] in part else set()
+    expected, found = (
+        shapes(theirs, "base", lambda g: theirs.geom_bodyid[g] in part),
+        shapes(ours, "palm", lambda g: True),
+    )
+    assert found[1] == expected[1] and {2, 3, 6} <= {*found[1]}  # balls, capsules and boxes
+    np.testing.assert_allclose(found[0], expected[0], atol=2e-6)
+    assert ours.body_mass.sum() == pytest.approx(sum(link.mass for link in driven.hand.links))
+
+
+def test_links_that_collide_by_meshes_keep_their_capsules(tmp_path):
+    trimesh.creation.icosphere(1, 0.009).export(tmp_path / "pad.stl")
+    text = (HANDS / "claw.urdf").read_text()
+    text = text.replace('<sphere radius="0.009"/>', '<mesh filename="package://x/pad.stl"/>')
+    (tmp_path / "claw.urdf").write_text(text)
+    proposal = import_hand(tmp_path / "claw.urdf", Choices(own_collision=True))
+    (note,) = (note for note in proposal.notes if "collide by their capsules" in note)
+    links = {link.name: link for link in proposal.hand.links}
+    assert "left_upper" in note and not links["left_upper"].solids and links["left_upper"].capsules
 
 
 @pytest.fixture
