@@ -1,5 +1,6 @@
 """The object of a motion as DexGraspBench has objects: a folder with its mesh, its convex pieces and its mass."""
 
+import hashlib
 import json
 import pathlib
 
@@ -7,17 +8,20 @@ import numpy as np
 import trimesh
 from scipy.spatial import QhullError
 
+from common.caches import keep, read_kept
 from common.errors import CongraspError
-from common.files import write_atomically
+from common.files import cache_folder, write_atomically
 from common.objects import shapes
 from common.objects.plain import plain_object
 from common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
+from common.wire.codec import Message
 from services.assets.objects.decompose import decompose
 from services.assets.objects.pieces import simplify
 from services.export.motion_file import GraspMotion
 
 _DENSITY = 500.0  # kg/m^3
 _SECONDS = 60.0  # for the convex decomposition of a body
+_MOST_FILES = 1024  # bodies whose pieces are kept
 
 
 def convex_object(motion: GraspMotion) -> GraspObject:
@@ -65,15 +69,26 @@ def write_object(folder: pathlib.Path, obj: GraspObject, origin: np.ndarray, sca
 
 
 def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
-    """Convex pieces of one body; none of a flat one."""
+    """Convex pieces of one body, kept in the user's cache folder where it took a decomposition; none of a flat one."""
+    vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
+    key = hashlib.sha256(b"".join([vertices.tobytes(), faces.tobytes(), bytes([most])])).hexdigest()[:32]
+    file = cache_folder("pieces") / f"{key}.safetensors"
+    if (kept := read_kept(file)) is not None:
+        return [_piece(kept.arrays[name]) for name in sorted(kept.arrays)]
     try:
         volume = float(body.volume) if body.is_volume else None
-        found = decompose(
-            np.asarray(body.vertices), np.asarray(body.faces), volume=volume, time_limit=_SECONDS, max_pieces=most
-        )
-        return [Piece("mesh", (0.0, 0.0, 0.0), vertices=simplify(vertices)) for vertices in found.pieces]
+        found = decompose(vertices, faces, volume=volume, time_limit=_SECONDS, max_pieces=most)
+        hulls = [simplify(piece) for piece in found.pieces]
     except QhullError:
         return []
+    if found.method != "convex":
+        keep(file, Message({f"{i:03d}": hull.astype(np.float32) for i, hull in enumerate(hulls)}), _MOST_FILES)
+    return [_piece(hull) for hull in hulls]
+
+
+def _piece(vertices: np.ndarray) -> Piece:
+    """A convex piece of vertices (V, 3) in the object frame."""
+    return Piece("mesh", (0.0, 0.0, 0.0), vertices=vertices.astype(np.float64))
 
 
 def _write_mesh(path: pathlib.Path, vertices: np.ndarray, faces: np.ndarray) -> None:
