@@ -5,13 +5,16 @@ Here are their names and kinematics as facts, in the frame of the palm's body wi
 by these, not by names: it is the benchmark's if its joints are where the benchmark has them.
 """
 
+import dataclasses
 import itertools
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
+from common.hands.spec import Hand, Joint, Solid, Vector, vector
 from services.export.motion_file import GraspMotion
 
 Row = tuple[float, float, float, float, float, float]
@@ -19,6 +22,20 @@ Row = tuple[float, float, float, float, float, float]
 PLACES_MM = 0.1
 """How far a joint may be from where the benchmark has it."""
 _FACING = 1e-3  # rad, how far an axis may be turned
+
+
+class Shape(NamedTuple):
+    """A collision shape of a benchmark's hand, in the palm's frame at zero."""
+
+    joint: str
+    """The joint that moves it; empty for the palm."""
+    kind: Literal["box", "capsule"]
+    size: Vector
+    """Half extents, or radius and half length along z."""
+    position: tuple[float, ...]
+    """(3,) m."""
+    quaternion: tuple[float, ...]
+    """(4,) w x y z, its frame to the palm's."""
 
 
 class BenchmarkHand(NamedTuple):
@@ -38,6 +55,8 @@ class BenchmarkHand(NamedTuple):
     """N.m.s/rad of every joint."""
     torque_limit: float
     """N.m of every motor."""
+    shapes: tuple[Shape, ...] = ()
+    """What collides; empty where that is meshes."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -64,42 +83,85 @@ def _straight(x: float, z: float, side: int) -> tuple[Row, ...]:
     )
 
 
+def _phalanges(
+    finger: str,
+    rows: tuple[Row, ...],
+    quaternion: tuple[float, ...],
+    boxes: Sequence[tuple[Vector, Vector]],
+    tip: float,
+) -> tuple[Shape, ...]:
+    """An Allegro finger: a box on each joint, half extents and place in the finger's frame, and a capsule at the tip.
+
+    Args:
+      finger: its joints' name.
+      rows: of its joints.
+      quaternion: (w, x, y, z) of the finger's frame, whose z axis is along it, in the palm's.
+      boxes: for each joint.
+      tip: m from the last joint to the capsule's middle.
+    """
+    turn, found = Rotation.from_quat(quaternion, scalar_first=True), []
+    for i, (row, (size, place)) in enumerate(zip(rows, boxes, strict=True)):
+        found.append(Shape(f"{finger}{i}", "box", size, tuple(row[:3] + turn.apply(place)), quaternion))
+    end = tuple(rows[-1][:3] + turn.apply((0, 0, tip)))
+    return (*found, Shape(f"{finger}3", "capsule", (_TIP, _TIP_HALF[tip], 0.0), end, quaternion))
+
+
+def _upright(length: float) -> tuple[Vector, Vector]:
+    """Half extents and place of the box of an Allegro phalanx of a length in metres."""
+    return (0.0098, 0.01375, length / 2), (0.0, 0.0, length / 2)
+
+
+_TIP, _TIP_HALF = 0.012, {0.019: 0.01, 0.035: 0.008}  # m, radius of Allegro's fingertips, half length by their place
 _S, _C = 0.0871558, 0.9961947  # of the 5 degrees by which Allegro's outer fingers lean
 _H = np.sqrt(0.5)
+_ALLEGRO: dict[str, tuple[Row, ...]] = {
+    "ffj": (
+        (0, 0.0435, -0.001542, 0, _S, _C),
+        (0, 0.0449294, 0.0147956, 0, _C, -_S),
+        (0, 0.0496358, 0.0685901, 0, _C, -_S),
+        (0, 0.0529825, 0.1068440, 0, _C, -_S),
+    ),
+    "mfj": (
+        (0, 0, 0.0007, 0, 0, 1),
+        (0, 0, 0.0171, 0, 1, 0),
+        (0, 0, 0.0711, 0, 1, 0),
+        (0, 0, 0.1095, 0, 1, 0),
+    ),
+    "rfj": (
+        (0, -0.0435, -0.001542, 0, -_S, _C),
+        (0, -0.0449294, 0.0147956, 0, _C, _S),
+        (0, -0.0496358, 0.0685901, 0, _C, _S),
+        (0, -0.0529825, 0.1068440, 0, _C, _S),
+    ),
+    "thj": (
+        (-0.0182, 0.019333, -0.045987, 0, -_S, -_C),
+        (-0.0132, 0.0567279, -0.0763618, 0, _C, -_S),
+        (-0.0132, 0.0743606, -0.0779045, 1, 0, 0),
+        (-0.0132, 0.1255650, -0.0823844, 1, 0, 0),
+    ),
+}
+_FINGER = [_upright(length) for length in (0.0164, 0.054, 0.0384, 0.016)]
+_THUMB = [
+    ((0.0179, 0.017, 0.02275), (-0.0179, 0.009, 0.0145)),
+    *(_upright(length) for length in (0.0177, 0.0514, 0.0314)),
+]
+_LEAN = (0.9990482, 0.0436194)
 BENCHMARK_HANDS = {
     "allegro": BenchmarkHand(
-        fingers={
-            "ffj": (
-                (0, 0.0435, -0.001542, 0, _S, _C),
-                (0, 0.0449294, 0.0147956, 0, _C, -_S),
-                (0, 0.0496358, 0.0685901, 0, _C, -_S),
-                (0, 0.0529825, 0.1068440, 0, _C, -_S),
-            ),
-            "mfj": (
-                (0, 0, 0.0007, 0, 0, 1),
-                (0, 0, 0.0171, 0, 1, 0),
-                (0, 0, 0.0711, 0, 1, 0),
-                (0, 0, 0.1095, 0, 1, 0),
-            ),
-            "rfj": (
-                (0, -0.0435, -0.001542, 0, -_S, _C),
-                (0, -0.0449294, 0.0147956, 0, _C, _S),
-                (0, -0.0496358, 0.0685901, 0, _C, _S),
-                (0, -0.0529825, 0.1068440, 0, _C, _S),
-            ),
-            "thj": (
-                (-0.0182, 0.019333, -0.045987, 0, -_S, -_C),
-                (-0.0132, 0.0567279, -0.0763618, 0, _C, -_S),
-                (-0.0132, 0.0743606, -0.0779045, 1, 0, 0),
-                (-0.0132, 0.1255650, -0.0823844, 1, 0, 0),
-            ),
-        },
+        fingers=_ALLEGRO,
         from_tip=False,
         position=(0.0, 0.0, 0.0),
         quaternion=(0.0, _H, 0.0, _H),
         kp=5.0,
         damping=0.1,
         torque_limit=100.0,
+        shapes=(
+            Shape("", "box", (0.0204, 0.0565, 0.0475), (-0.0093, 0.0, -0.0475), (1.0, 0.0, 0.0, 0.0)),
+            *_phalanges("ffj", _ALLEGRO["ffj"], (_LEAN[0], -_LEAN[1], 0.0, 0.0), _FINGER, 0.019),
+            *_phalanges("mfj", _ALLEGRO["mfj"], (1.0, 0.0, 0.0, 0.0), _FINGER, 0.019),
+            *_phalanges("rfj", _ALLEGRO["rfj"], (_LEAN[0], _LEAN[1], 0.0, 0.0), _FINGER, 0.019),
+            *_phalanges("thj", _ALLEGRO["thj"], (0.477714, -0.521334, -0.521334, -0.477714), _THUMB, 0.035),
+        ),
     ),
     "shadow": BenchmarkHand(
         fingers={
@@ -152,6 +214,23 @@ class Match(NamedTuple):
         turn = rotation * self.rotation.inv()
         quaternion = turn.as_quat(scalar_first=True)
         return np.concatenate([position - turn.apply(self.position), quaternion, self.sign * q[self.order]])
+
+    def solids(self, link_of: np.ndarray) -> dict[int, tuple[Solid, ...]]:
+        """The benchmark's collision shapes in the wrist frame at zero, by links; none where they are meshes.
+
+        Args:
+          link_of: (F,) index of the link that each of this project's joints moves.
+        """
+        palm = Rotation.from_quat(self.hand.quaternion, scalar_first=True)
+        turn = self.rotation.inv() * palm  # from the palm's frame to the wrist's
+        place = self.rotation.inv().apply(self.hand.position - self.position)
+        found: dict[int, tuple[Solid, ...]] = {}
+        for shape in self.hand.shapes:
+            link = int(link_of[self.order[self.hand.joints.index(shape.joint)]]) if shape.joint else 0
+            w, x, y, z = (turn * Rotation.from_quat(shape.quaternion, scalar_first=True)).as_quat(scalar_first=True)
+            solid = Solid(shape.kind, shape.size, vector(turn.apply(shape.position) + place), (w, x, y, z))
+            found[link] = (*found.get(link, ()), solid)
+        return found
 
     def joint_frames(self, qpos: np.ndarray) -> tuple[np.ndarray, Rotation]:
         """Where the benchmark's kinematics has what each joint moves, by the product of exponentials.
@@ -208,6 +287,27 @@ def match_hand(motion: GraspMotion) -> Match:
             f"It has {' and '.join(BENCHMARK_HANDS)}; of another make of one, import the benchmark's own file.",
         )
     return match
+
+
+def benchmarked(hand: Hand, match: Match) -> Hand:
+    """The hand with the benchmark's motors, damping, and collision shapes where they are no meshes."""
+    motor = match.hand
+
+    def driven(joint: Joint) -> Joint:
+        joint = dataclasses.replace(joint, damping=motor.damping)
+        if not joint.kp:
+            return joint
+        return dataclasses.replace(joint, kp=motor.kp, kv=0.0, torque_limit=motor.torque_limit)
+
+    solids = match.solids(hand.joint_links)
+    links = tuple(
+        dataclasses.replace(link, joints=tuple(map(driven, link.joints)), solids=solids.get(i, link.solids))
+        for i, link in enumerate(hand.links)
+    )
+    tendons = tuple(
+        dataclasses.replace(tendon, kp=motor.kp, kv=0.0, torque_limit=motor.torque_limit) for tendon in hand.tendons
+    )
+    return dataclasses.replace(hand, links=links, tendons=tendons)
 
 
 def _chains(motion: GraspMotion) -> list[np.ndarray]:

@@ -23,7 +23,7 @@ from common.hands.motors import motor_positions
 from common.hands.spec import Hand
 from common.npz import read_npz
 from common.objects.spec import GraspObject
-from services.export.benchmark_hands import Match, match_hand
+from services.export.benchmark_hands import Match, benchmarked, match_hand
 from services.export.benchmark_objects import convex_object, write_object
 from services.export.frames import TOLERANCE_MM
 from services.export.motion_file import GraspMotion
@@ -127,7 +127,7 @@ def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
     match, hand = match_hand(motion), _hand_of(motion)
     obj = convex_object(motion)
     last = max(grasp_span(motion.about, motion.control_dt, motion.table)[1] - 1, 0)
-    clear, clearance = _last_clear(hand, obj, motion, last)
+    clear, clearance = _last_clear(benchmarked(hand, match), obj, motion, last)
     grasp = _state(motion, last)
     squeeze = grasp._replace(q=squeezed(hand, motion, last, match.hand.kp))
     return Grasp(

@@ -3,10 +3,10 @@
 An object of 0.1 kg floats without table and gravity, friction 0.6. The hand is at the grasp with its targets at the
 squeeze, or at the pregrasp, from which targets go to the grasp and on to the squeeze, 0.4 s each, open loop. Then the
 object is pushed for two seconds by 1 N along or against an axis of the world, each push from the start. Motors have the
-benchmark's gains and no speed feedback beside the joints' damping. What touches are this project's capsules.
+benchmark's gains and no speed feedback beside the joints' damping. What touches are Allegro's boxes as the benchmark
+has them, and of Shadow this project's shapes.
 """
 
-import dataclasses
 import itertools
 import json
 import pathlib
@@ -23,9 +23,9 @@ from actors.protocols import FARTHEST, MOST_TURNED, PUSH_FORCE
 from common.config import TaskConfig
 from common.files import write_atomically
 from common.hands.motors import motor_positions
-from common.hands.spec import Hand, Joint
+from common.hands.spec import Hand
 from common.parallel import cores
-from services.export.benchmark_hands import BenchmarkHand
+from services.export.benchmark_hands import benchmarked
 from services.export.dexgraspbench import STATES, Grasp, State
 
 MASS, FRICTION = 0.1, 0.6
@@ -55,7 +55,7 @@ class Replayed(NamedTuple):
 
 def replay(grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda done: None) -> list[Replayed]:
     """What becomes of grasps of one hand; `progress` is told how many are done."""
-    hand = driven_by(grasps[0].hand, grasps[0].match.hand)
+    hand = benchmarked(grasps[0].hand, grasps[0].match)
     found: list[Replayed] = []
     for first in range(0, len(grasps), _TOGETHER):
         found += _replay(hand, grasps[first : first + _TOGETHER])
@@ -108,23 +108,6 @@ def _pushed(physics: NativePhysics, hand: Hand, grasps: Sequence[Grasp], start: 
         if force.any() and step % _LOOK == 0:
             deepest = np.maximum(deepest, [_depths(instance)[0] for instance in physics.instances])
     return np.all(kept.reshape(-1, 6), 1), np.max(deepest.reshape(-1, 6), 1)
-
-
-def driven_by(hand: Hand, benchmark: BenchmarkHand) -> Hand:
-    """The hand with the benchmark's motors and damping."""
-
-    def driven(joint: Joint) -> Joint:
-        joint = dataclasses.replace(joint, damping=benchmark.damping)
-        if not joint.kp:
-            return joint
-        return dataclasses.replace(joint, kp=benchmark.kp, kv=0.0, torque_limit=benchmark.torque_limit)
-
-    links = tuple(dataclasses.replace(link, joints=tuple(map(driven, link.joints))) for link in hand.links)
-    tendons = tuple(
-        dataclasses.replace(tendon, kp=benchmark.kp, kv=0.0, torque_limit=benchmark.torque_limit)
-        for tendon in hand.tendons
-    )
-    return dataclasses.replace(hand, links=links, tendons=tendons)
 
 
 def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:

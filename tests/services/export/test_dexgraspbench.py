@@ -15,12 +15,13 @@ from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.kinematics import keypoints, link_transforms
+from common.hands.mjcf import add_hand
 from common.hands.spec import Motor
 from services.assets.hands import grips
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.cli.main import run
 from services.export import dexgraspbench
-from services.export.benchmark_hands import BENCHMARK_HANDS, match_hand
+from services.export.benchmark_hands import BENCHMARK_HANDS, benchmarked, match_hand
 from services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
 from services.export.replay import replay
 from tests.docs.test_docs import ROOT
@@ -51,6 +52,16 @@ ALLEGRO = [
         ("thj3", (0, 0, 0.0514), PLAIN, (0, 1, 0)),
     ]
 ]
+# Its collision geoms in the bodies' frames: boxes (half extents, place), at the tips capsules (radius, half length).
+PHALANX = [(0.0098, 0.01375, 0.0082), (0.0098, 0.01375, 0.027), (0.0098, 0.01375, 0.0192), (0.0098, 0.01375, 0.008)]
+BOXES = {f"{name}j{i}": (size, (0, 0, size[2])) for name in ("ff", "mf", "rf") for i, size in enumerate(PHALANX)} | {
+    "thj0": ((0.0179, 0.017, 0.02275), (-0.0179, 0.009, 0.0145)),
+    "thj1": ((0.0098, 0.01375, 0.00885), (0, 0, 0.00885)),
+    "thj2": ((0.0098, 0.01375, 0.0257), (0, 0, 0.0257)),
+    "thj3": ((0.0098, 0.01375, 0.0157), (0, 0, 0.0157)),
+}
+CAPSULES = {name: ((0.012, 0.01), (0, 0, 0.019)) for name in ("ffj3", "mfj3", "rfj3")}
+CAPSULES["thj3"] = ((0.012, 0.008), (0, 0, 0.035))
 ALLEGRO_TIPS = {"ffj3": 0.0267, "mfj3": 0.0267, "rfj3": 0.0267, "thj3": 0.0423}
 
 
@@ -81,12 +92,12 @@ SHADOW = [
 ]
 
 
+def numbers(values):
+    return " ".join(map(str, values))
+
+
 def benchmark_model(fingers, palm, *, root=True):
     """Their hand on the root that the benchmark places: a free body that carries the palm."""
-
-    def numbers(values):
-        return " ".join(map(str, values))
-
     free = "<freejoint/>" if root else ""
     xml = f"<mujoco><compiler angle='radian'/><worldbody><body name='root'>{free}<geom size='.01'/>"
     xml += f"<body name='palm' {palm}><geom size='.01'/>"
@@ -94,6 +105,10 @@ def benchmark_model(fingers, palm, *, root=True):
         for joint, place, quat, axis in finger:
             xml += f"<body name='{joint}' pos='{numbers(place)}' quat='{numbers(quat)}'>"
             xml += f"<joint name='{joint}' axis='{numbers(axis)}' range='-0.3 1.2'/>"
+            for kind, shapes in (("box", BOXES), ("capsule", CAPSULES)):
+                if joint in shapes:
+                    size, middle = map(numbers, shapes[joint])
+                    xml += f"<geom type='{kind}' size='{size}' pos='{middle}'/>"
             xml += "<geom size='.008'/>"
         xml += "</body>" * len(finger)
     return xml + "</body></body></worldbody></mujoco>"
@@ -155,6 +170,39 @@ def test_allegros_fingertips_are_where_menageries_model_has_them(tmp_path):
     own = Rotation.from_quat(motion.object_quaternion[-1], scalar_first=True)
     expected = own.apply(0.5 * point - motion.object_file_origin) + motion.object_position[-1]
     np.testing.assert_allclose(turn.apply(float(arrays["obj_scale"]) * point) + place, expected, atol=1e-6)
+
+
+def test_in_the_exam_allegro_has_the_boxes_of_menageries_model():
+    hand = get_hand("allegro")
+    motion = motion_of(hand)
+    match = match_hand(motion)
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    add_hand(spec, benchmarked(hand, match))
+    ours = spec.compile()
+    here = mujoco.MjData(ours)
+    q = motion.joint_position[0]
+    here.qpos[[ours.joint(joint.name).qposadr[0] for joint in hand.joints]] = q
+    mujoco.mj_kinematics(ours, here)
+    theirs = mujoco.MjModel.from_xml_string(benchmark_model(ALLEGRO, "quat='0 1 0 1'"))
+    there = mujoco.MjData(theirs)
+    there.qpos[:] = match.qpos(np.zeros(3), Rotation.identity(), q)
+    mujoco.mj_kinematics(theirs, there)
+
+    def outlines(model, data, palm):
+        """Middles of geoms, and what of their sizes and directions does not depend on how their axes are called."""
+        drawn = [g for g in range(model.ngeom) if g not in palm and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_SPHERE]
+        turns = data.geom_xmat[drawn].reshape(-1, 3, 3)
+        spread = np.einsum("gij,gj,gkj->gik", turns, model.geom_size[drawn] ** 2, turns).reshape(-1, 9)
+        rows = np.concatenate([data.geom_xpos[drawn], 1e3 * spread], 1)
+        return rows[np.lexsort(np.round(rows[:, :3], 5).T)]
+
+    palm = [ours.geom("palm_0").id]
+    found, expected = outlines(ours, here, palm), outlines(theirs, there, [])
+    assert len(found) == len(expected) == 20
+    np.testing.assert_allclose(found, expected, atol=2e-6)
+    np.testing.assert_allclose(ours.geom_size[palm[0]], (0.0204, 0.0565, 0.0475))
+    np.testing.assert_allclose(here.geom_xpos[palm[0]], (-0.0093, 0, 0.095 - 0.0475), atol=1e-6)
 
 
 def test_a_shadow_hand_is_told_by_its_kinematics_whatever_its_joints_are_called():

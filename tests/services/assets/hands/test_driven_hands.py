@@ -9,6 +9,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from actors.physics.mjx import MjxPhysics
+from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import VARIABLE, get_hand
 from common.hands.files import hand_from_text, hand_text
@@ -191,6 +193,8 @@ def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
     assert found[1] == expected[1] and {2, 3, 6} <= {*found[1]}  # balls, capsules and boxes
     np.testing.assert_allclose(found[0], expected[0], atol=2e-6)
     assert ours.body_mass.sum() == pytest.approx(sum(link.mass for link in driven.hand.links))
+    with pytest.raises(CongraspError, match="jax collides capsules alone"):
+        MjxPhysics(hand, TaskConfig(), [])
 
 
 def test_links_that_collide_by_meshes_keep_their_capsules(tmp_path):
