@@ -18,6 +18,7 @@ from actors.physics.physics_state import has_diverged, initial_qpos, physics_sta
 from actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, addresses
 from actors.physics.slots import Pool
 from common.config import TaskConfig
+from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.objects.mjcf import CONTACT
 from common.objects.spec import GraspObject
@@ -50,7 +51,15 @@ class MjxPhysics:
           hand: the hand.
           task: timing and collision settings.
           objects: the pool that `ResetState.object_index` points into.
+
+        Raises:
+          CongraspError: the hand collides by other shapes than capsules, of which MJX lacks some pairs.
         """
+        if any(link.solids for link in hand.links):
+            raise CongraspError(
+                f"The engine jax collides capsules alone, and '{hand.name}' has solids of its own.",
+                "Choose native or warp, or import the hand without --collision own.",
+            )
         self._task = task
         self._pool = pool = Pool(hand, task, objects)
         self._where = addresses(pool.model, hand)

@@ -16,7 +16,7 @@ import numpy as np
 
 from common.errors import CongraspError
 from common.hands.motors import motor_limits
-from common.hands.spec import Hand, chain_of
+from common.hands.spec import Hand, Solid, chain_of
 from common.inputs import LONGEST_NAME, read_file
 
 FORMAT = 1
@@ -110,6 +110,10 @@ def faults(hand: Hand) -> list[str]:
             found.append(f"the link '{link.name}' has no joint: make it part of its parent")
         if not link.capsules or any(capsule.radius <= 0 for capsule in link.capsules):
             found.append(f"the link '{link.name}' needs capsules, of radii above zero")
+        if any(min(_sizes(solid)) <= 0 for solid in link.solids):
+            found.append(f"the link '{link.name}' has a solid of no size")
+        if any(abs(float(np.linalg.norm(solid.quaternion)) - 1) > 1e-3 for solid in link.solids):
+            found.append(f"the link '{link.name}' has a solid whose quaternion is not of length one")
         if not link.mass > 0 or link.contact_weight < 0:
             found.append(f"the link '{link.name}' needs a mass above zero and a contact weight of at least zero")
     for joint in hand.joints:
@@ -175,14 +179,19 @@ def _out_of_bounds(hand: Hand) -> str:
         return f"it has more than {_LINKS} links or {_JOINTS} joints"
     if max(len(hand.couplings), *(len(tendon.joints) for tendon in hand.tendons), len(hand.tendons)) > _JOINTS:
         return f"it has more than {_JOINTS} couplings, tendons or joints of a tendon"
-    if any(len(link.capsules) > _CAPSULES for link in hand.links):
-        return f"it has a link of more than {_CAPSULES} capsules"
+    if any(max(len(link.capsules), len(link.solids)) > _CAPSULES for link in hand.links):
+        return f"it has a link of more than {_CAPSULES} capsules or solids"
     fields = dataclasses.asdict(hand)
     del fields["text"]
     for number in _numbers(fields):
         if not abs(number) <= _LARGEST:
             return f"it holds {number:g}, which is not a finite number of at most {_LARGEST:g}"
     return ""
+
+
+def _sizes(solid: Solid) -> tuple[float, ...]:
+    """The numbers of its size that count."""
+    return solid.size[:2] if solid.kind in ("cylinder", "capsule") else solid.size
 
 
 def _numbers(value: Any) -> Iterator[float]:

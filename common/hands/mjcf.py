@@ -1,11 +1,15 @@
-"""A hand as MuJoCo bodies: virtual wrist, links with capsules, and position actuators."""
+"""A hand as MuJoCo bodies: virtual wrist, links with capsules or solids of their own, and position actuators."""
 
 import functools
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from common.hands.spec import Hand, Link, link_origin
+from common.hands.spec import Capsule, Hand, Link, Solid, link_origin
+from common.objects import shapes
+from common.objects.mjcf import GEOM_TYPES
+from common.objects.spec import Piece
 
 HAND_CONTYPE = 1
 """Collision bit of the hand: whatever collides with it has this bit in its conaffinity."""
@@ -50,7 +54,7 @@ def add_hand(
                 damping=joint.damping,
                 armature=joint.armature,
             )
-        _add_capsules(body, link, origin, self_collision, contact_time)
+        _add_shapes(body, link, origin, self_collision, contact_time)
     _add_transmission(spec, hand)
     if self_collision:
         for first, second in overlapping(hand):
@@ -60,9 +64,9 @@ def add_hand(
 
 @functools.cache
 def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
-    """Pairs of links whose capsules overlap while the hand is open or at zero, so that contact means nothing there.
+    """Pairs of links whose shapes overlap while the hand is open or at zero, so that contact means nothing there.
 
-    Capsules stand for housings that nest in one another at the knuckles. What touches only in a fist is not here.
+    They stand for housings that nest in one another at the knuckles. What touches only in a fist is not here.
     """
     spec = mujoco.MjSpec()
     bodies: dict[str, mujoco.MjsBody] = {}
@@ -73,7 +77,7 @@ def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
             body.add_freejoint()
         for joint in link.joints:
             body.add_joint(name=joint.name, axis=joint.axis, pos=joint.anchor)
-        _add_capsules(body, link, np.zeros(3), True, CONTACT_TIME)
+        _add_shapes(body, link, np.zeros(3), True, CONTACT_TIME)
     model = spec.compile()
     data = mujoco.MjData(model)
     found: set[tuple[int, int]] = set()
@@ -143,18 +147,16 @@ def _add_position_actuator(
     actuator.set_to_position(kp, kv=kv)
 
 
-def _add_capsules(
+def _add_shapes(
     body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_collision: bool, contact_time: float
 ) -> None:
-    """Adds a link's capsules, which share its mass by their volumes."""
-    lengths = [np.linalg.norm(np.subtract(c.end, c.start)) + 4 / 3 * c.radius for c in link.capsules]
-    shares = np.array([length * c.radius**2 for length, c in zip(lengths, link.capsules, strict=True)])
-    for i, (capsule, share) in enumerate(zip(link.capsules, shares / shares.sum(), strict=True)):
+    """Adds a link's solids, or the capsules of one without; they share its mass by their volumes."""
+    found = [_solid(solid, origin) for solid in link.solids] or [_capsule(x, origin) for x in link.capsules]
+    volumes = np.array([volume for _, volume in found])
+    for i, ((fields, _), share) in enumerate(zip(found, volumes / volumes.sum(), strict=True)):
         body.add_geom(
             name=f"{link.name}_{i}",
-            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            fromto=np.concatenate([np.subtract(capsule.start, origin), np.subtract(capsule.end, origin)]),
-            size=(capsule.radius, 0.0, 0.0),
+            **fields,
             mass=link.mass * share,
             contype=HAND_CONTYPE,
             conaffinity=HAND_CONTYPE if self_collision else 0,
@@ -163,3 +165,20 @@ def _add_capsules(
             solmix=1000.0,  # against others' 1, so that it decides
             friction=(0.1, 0.005, 0.0001),  # MuJoCo takes the greater of two: the object's friction decides
         )
+
+
+def _capsule(capsule: Capsule, origin: np.ndarray) -> tuple[dict[str, Any], float]:
+    """The geom of a capsule in a frame at `origin` (3,), and its volume over pi in m^3."""
+    ends = np.concatenate([np.subtract(capsule.start, origin), np.subtract(capsule.end, origin)])
+    length = np.linalg.norm(np.subtract(capsule.end, capsule.start)) + 4 / 3 * capsule.radius
+    fields = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "fromto": ends, "size": (capsule.radius, 0.0, 0.0)}
+    return fields, float(length * capsule.radius**2)
+
+
+def _solid(solid: Solid, origin: np.ndarray) -> tuple[dict[str, Any], float]:
+    """The geom of a solid in a frame at `origin` (3,), and its volume in m^3."""
+    place = {"pos": np.subtract(solid.position, origin), "quat": solid.quaternion}
+    fields = {"type": GEOM_TYPES[solid.kind], "size": solid.size}
+    if solid.kind == "ellipsoid" and len({*solid.size}) == 1:
+        fields = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": (solid.size[0], 0.0, 0.0)}
+    return fields | place, shapes.volume(Piece(solid.kind, solid.size))

@@ -1,4 +1,4 @@
-"""A surface for every hand: flesh for human hands, bevelled housings for the links of robots.
+"""A surface for every hand: flesh for human hands, for robots the meshes of their files or bevelled housings.
 
 A surface is made once, with every joint at zero, and follows the links by linear blend skinning.
 """
@@ -11,8 +11,9 @@ import numpy as np
 import trimesh
 
 from common.hands.flesh import Surface, flesh
+from common.hands.meshes import Meshes, own_meshes
 from common.hands.skeleton import Skeleton, skeleton_of
-from common.hands.spec import Hand
+from common.hands.spec import Hand, Link, link_origin
 
 HUMAN_HANDS = ("human", "mano")
 """Names of the hands that have flesh."""
@@ -62,8 +63,9 @@ class Skin(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def skin_of(hand: Hand) -> Skin:
-    """The surface of a hand."""
-    return skin_on(skeleton_of(hand))
+    """The surface of a hand: its file's meshes where it is one of the user's own, looked for once a process."""
+    meshes = own_meshes(hand)
+    return skin_of_meshes(hand, meshes) if meshes else skin_on(skeleton_of(hand))
 
 
 def skin_on(skeleton: Skeleton) -> Skin:
@@ -83,6 +85,39 @@ def skin_on(skeleton: Skeleton) -> Skin:
         human,
         joint,
     )
+
+
+def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
+    """A surface of links' meshes, which follow one link each, and of the capsules of links that have none."""
+    parts = [
+        trimesh.Trimesh(*meshes[link.name], process=False) if link.name in meshes else _rounded(link)
+        for link in hand.links
+    ]
+    counts = [len(part.vertices) for part in parts]
+    starts = np.cumsum([0, *counts[:-1]])
+    return Skin(
+        points=np.concatenate([part.vertices for part in parts]).astype(np.float32),
+        normals=np.concatenate([part.vertex_normals for part in parts]).astype(np.float32),
+        faces=np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]).astype(np.int32),
+        weights=np.eye(len(parts), dtype=np.float32)[np.repeat(np.arange(len(parts)), counts)],
+        origins=np.array([link_origin(link) for link in hand.links]),
+        flesh=False,
+        joint=np.zeros(sum(counts), bool),
+    )
+
+
+def _rounded(link: Link) -> trimesh.Trimesh:
+    """A link's capsules, in the wrist frame at zero."""
+    parts = []
+    for capsule in link.capsules:
+        way = np.subtract(capsule.end, capsule.start)
+        part = trimesh.creation.capsule(float(np.linalg.norm(way)), capsule.radius, count=(12, 12))
+        if way.any():
+            part.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], way))
+        parts.append(part.apply_translation(np.add(capsule.start, capsule.end) / 2))
+    whole = trimesh.util.concatenate(parts)
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole
 
 
 def _anatomical(skeleton: Skeleton) -> bool:

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -78,6 +79,18 @@ class Capsule:
 
 
 @dataclasses.dataclass(frozen=True)
+class Solid:
+    """A collision shape of a hand's own file, in the wrist frame at zero; `size` follows MuJoCo."""
+
+    kind: Literal["box", "cylinder", "capsule", "ellipsoid"]
+    """By half extents; radius and half length along z; the same; radii."""
+    size: Vector
+    position: Vector
+    quaternion: tuple[float, float, float, float]
+    """(w, x, y, z) its frame to the wrist frame."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Link:
     """A rigid body. The first link of a hand is its palm, whose frame is the wrist frame; it has no joints."""
 
@@ -90,6 +103,8 @@ class Link:
     """Relative share of this link in the contact reward."""
     tip: Vector | None = None
     """The fingertip, on the last link of a finger."""
+    solids: tuple[Solid, ...] = ()
+    """What collides in physics instead of the capsules, where the hand's own collision geometry was asked for."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Whether a motion could be one of a real hand: penetration, speed, jerk and effort, from samples of control steps.
 
 All of it is computed from joint angles, poses and contact forces, so that it means the same in every engine. The hand's
-links are capsules. What is sampled in a control step is the state after it.
+links are capsules; of a hand of the user's own, points on the meshes of its file are held against the object beside
+them. What is sampled in a control step is the state after it.
 """
 
 import functools
@@ -10,9 +11,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 
 from common import rotations
 from common.hands import kinematics
+from common.hands.meshes import own_meshes
 from common.hands.mjcf import overlapping
 from common.hands.motors import motor_positions
 from common.hands.spec import Hand
@@ -20,8 +23,8 @@ from common.objects.distance import DistanceField
 from common.task.constraints.base import Scene
 from common.task.types import Array
 
-CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0}
-"""Deepest penetrations below which an episode is clean."""
+CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}
+"""Deepest penetrations below which an episode is clean; `hand_mesh_mm` is measured of hands with meshes alone."""
 MEASURES = (
     *CLEAN_MM,
     *(f"wrist_{of}{which}" for of in ("speed", "acceleration") for which in ("", "_mean", "_p95")),
@@ -30,6 +33,8 @@ MEASURES = (
 """Names of the `measures` of an episode."""
 _SPACING = 0.004
 """Metres between points on a capsule's axis: a sharp edge 7 mm from the axis seems at most 0.3 mm further away."""
+_CELL, _MOST = 0.004, 2048
+"""Metres between points on a hand's meshes, and most of them."""
 
 
 class Sample(NamedTuple):
@@ -41,6 +46,8 @@ class Sample(NamedTuple):
     """(B,) deepest point of the hand below the table's top, m; 0 where it is removed."""
     hand_object: Array
     """(B,) deepest penetration of a link and the object's real surface, m."""
+    hand_mesh: Array
+    """(B,) how deep the hand's own surface is in the object's, m; NaN for hands without meshes."""
     wrist_velocity: Array
     """(B, 3) of the wrist's origin, m/s."""
     finger_velocity: Array
@@ -75,11 +82,13 @@ def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
     hand, state, features = scene.hand, scene.state, scene.features
     transforms = kinematics.link_transforms(hand, state.q)
     wrist = features.wrist_position, features.wrist_quaternion
+    seen = features.object_position, features.object_quaternion, index, field
     half = jnp.float16  # of what is averaged
     return Sample(
         hand_hand=hand_hand(hand, transforms),
         hand_table=jnp.where(state.table, hand_table(hand, transforms, *wrist), 0.0),
-        hand_object=hand_object(hand, transforms, features.object_position, features.object_quaternion, index, field),
+        hand_object=hand_object(hand, transforms, *seen),
+        hand_mesh=hand_mesh(hand, transforms, *seen),
         wrist_velocity=state.u_velocity[..., :3],
         finger_velocity=state.q_velocity,
         link_force=jnp.linalg.norm(features.force, axis=-1).astype(half),
@@ -147,6 +156,25 @@ def hand_object(
     return jnp.maximum(jnp.max(capsules.axis_radii - field.at(index, local), -1), 0.0)
 
 
+def hand_mesh(
+    hand: Hand,
+    transforms: tuple[Array, Array],
+    object_position: Array,
+    object_quaternion: Array,
+    index: Array,
+    field: DistanceField,
+) -> Array:
+    """(B,) how deep in metres points on the hand's meshes (`common.hands.meshes`) are in the object; NaN without any.
+
+    Arguments are those of `hand_object`. A finger through a thin blade counts with the blade's thickness.
+    """
+    links, points = _surface(hand)
+    if not len(points):
+        return jnp.full(len(index), jnp.nan)
+    local = rotations.inverse_transform(object_position, object_quaternion, _moved(transforms, links, points))
+    return jnp.maximum(jnp.max(-field.at(index, local), -1), 0.0)
+
+
 def torque_share(scene: Scene) -> Array:
     """(B, M) |clip(kp (m_target - m) - kv m_velocity, limit)| / limit: torques of the fingers' motors at m."""
     hand, state = scene.hand, scene.state
@@ -182,18 +210,20 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
       control_dt: seconds of a control step.
 
     Returns:
-      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm`: the deepest, mm. `wrist_speed` (m/s) and `wrist_acceleration`
-      (m/s^2): the peak, with `_mean` and `_p95` over the episode's steps. `finger_jerk`: root mean square over joints
-      and steps, rad/s^3. `link_force_peak` (N) of the hardest pressing link, `link_force` the mean of links that touch
-      (0 where none ever does). `torque_share` and `torque_share_peak`: over joints and steps.
+      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, of hands with meshes, `hand_mesh_mm`: the deepest, mm.
+      `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over the episode's steps.
+      `finger_jerk`: root mean square over joints and steps, rad/s^3. `link_force_peak` (N) of the hardest
+      pressing link, `link_force` the mean of links that touch (0 where none ever does). `torque_share` and
+      `torque_share_peak`: over joints and steps.
     """
     wrist, fingers = (np.asarray(x, np.float32) for x in (samples.wrist_velocity, samples.finger_velocity))
     force, torque = (np.asarray(x, np.float32) for x in (samples.link_force, samples.torque_share))
     acceleration = np.diff(wrist, axis=0, prepend=0 * wrist[:1]) / control_dt
     jerk = np.diff(fingers, n=2, axis=0, prepend=np.zeros_like(fingers[:2])) / control_dt**2
-    found = {
-        f"{name}_mm": 1e3 * np.max(getattr(samples, name), 0) for name in ("hand_hand", "hand_table", "hand_object")
-    }
+    depths = {name: getattr(samples, name) for name in ("hand_hand", "hand_table", "hand_object", "hand_mesh")}
+    if np.isnan(samples.hand_mesh).all():
+        del depths["hand_mesh"]
+    found = {f"{name}_mm": 1e3 * np.max(depth, 0) for name, depth in depths.items()}
     for name, vectors in (("wrist_speed", wrist), ("wrist_acceleration", acceleration)):
         size = np.linalg.norm(vectors, axis=-1)
         found |= {name: size.max(0), f"{name}_mean": size.mean(0), f"{name}_p95": np.percentile(size, 95, axis=0)}
@@ -213,7 +243,7 @@ def is_clean(held: np.ndarray, found: Mapping[str, np.ndarray]) -> np.ndarray:
       held: (B,) bool.
       found: the `measures`.
     """
-    return np.all([held, *(found[name] < limit for name, limit in CLEAN_MM.items())], 0)
+    return np.all([held, *(found[name] < limit for name, limit in CLEAN_MM.items() if name in found)], 0)
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -226,6 +256,33 @@ def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarra
     rotation, translation = transforms
     turned = rotations.apply(rotation[..., links, :, :], jnp.asarray(points)[:, None])[..., 0, :]
     return turned + translation[..., links, :]
+
+
+@functools.cache
+def _surface(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
+    """The link of each point on the hand's meshes (P,), and the points (P, 3) in the wrist frame at zero.
+
+    Of what lies in one cell of a grid the point farthest from its link's middle is kept, so that corners are; cells are
+    `_CELL` wide, or wider where that leaves more than `_MOST` points.
+    """
+    names, cell = [link.name for link in hand.links], _CELL
+    meshes = {names.index(name): mesh for name, mesh in own_meshes(hand).items()}
+    while True:
+        parts = {link: _thinned(*mesh, cell) for link, mesh in meshes.items()}
+        if sum(map(len, parts.values())) <= _MOST:
+            break
+        cell *= 1.2
+    links = np.repeat(np.array([*parts], int), [len(part) for part in parts.values()])
+    return links, np.concatenate([np.zeros((0, 3)), *parts.values()]).astype(np.float32)
+
+
+def _thinned(vertices: np.ndarray, faces: np.ndarray, cell: float) -> np.ndarray:
+    """(P, 3) points on a mesh, one in each cell of a grid: the farthest from the middle."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    samples = trimesh.sample.sample_surface(mesh, max(1, int(8 * mesh.area / cell**2)), seed=0)[0]
+    points = np.concatenate([vertices[np.unique(faces)], samples])
+    farthest = np.argsort(-np.linalg.norm(points - points.mean(0), axis=-1), kind="stable")
+    return points[farthest][np.unique(np.floor(points[farthest] / cell), axis=0, return_index=True)[1]]
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """The hands there are, pictures of them, and hands of one's own."""
 
 import pathlib
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -61,7 +61,8 @@ def sheet(
       congrasp hands sheet allegro sharpa --out robot-hands.png
     """
     from common.hands import get_hand, own_hands
-    from services.assets.hands.visual import load_meshes, skin_of_meshes
+    from common.hands.meshes import load_meshes
+    from common.hands.skin import skin_of_meshes
     from services.viz.hand_sheets import hands_sheet
     from services.viz.sheets import save_png
 
@@ -80,6 +81,7 @@ def import_hand(
     palm: str = "",
     thumb: str = "",
     object_scale: float = 0.0,
+    collision: Literal["capsules", "own"] = "capsules",
     out: pathlib.Path | None = None,
     png: pathlib.Path | None = None,
 ) -> int:
@@ -96,6 +98,8 @@ def import_hand(
       thumb: The last body of the finger that opposes the others;
         by default one called thumb, or the one that best faces the others.
       object_scale: Factor on the objects that it learns to grasp; by default from its opening, 1 for a human hand's.
+      collision: What touches in physics: own takes the file's boxes, cylinders, balls, ellipsoids and capsules, and
+        capsules for links that collide by meshes.
       out: The file to write; by default NAME.json in the folder of your own hands ('congrasp hands list' names it).
       png: The picture; by default beside the file.
 
@@ -108,7 +112,7 @@ def import_hand(
     from services.assets.hands.model_files import Choices
     from services.assets.hands.model_files import import_hand as proposed
 
-    proposal = proposed(file, Choices(name, palm, thumb, object_scale))
+    proposal = proposed(file, Choices(name, palm, thumb, object_scale, collision == "own"))
     if out is not None and out.suffix != SUFFIX:
         raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
     _keep(proposal, out, png)

@@ -296,8 +296,8 @@ PLAUSIBILITY = (
     "lifted",
     "pushed",
 )
-"""Columns of the table of plausibility (`plausibility_cells`): deepest penetration (mean, 95th percentile), peak speed
-and acceleration of the wrist, rates."""
+"""Columns of the table of plausibility (`plausibility_cells`): deepest penetration (mean, 95th percentile), in the
+object also that of the hand's own meshes where it has some; peak speed and acceleration of the wrist; rates."""
 FORCES = ("constraint", "link, N", "sum, N", "torque, % of limit", "links in contact at table removal", "diverged")
 """Columns of the table of forces after the removal (mean, 95th percentile); `force_cells` fills them."""
 
@@ -335,7 +335,9 @@ def force_cells(row: Row) -> tuple[str, ...]:
 def plausibility_cells(row: Row) -> tuple[str, ...]:
     """A row's cells under `PLAUSIBILITY`."""
     found = row.plausibility
-    depths = (_pair(found.get(name), found.get(f"{name}_p95"), 1.0) for name in CLEAN_MM)
+    *depths, mesh = (_pair(found.get(name), found.get(f"{name}_p95"), 1.0) for name in CLEAN_MM)
+    if found.get("hand_mesh_mm") is not None:
+        depths[-1] += f", its meshes {mesh}"
     peaks = (found.get(name) for name in ("wrist_speed", "wrist_acceleration"))
     rates = (found.get(name) for name in ("clean", "lift_survival", "push_survival"))
     return (

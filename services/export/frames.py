@@ -8,10 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
+from common.hands import get_hand, own_hands
 from common.hands.skeleton import Skeleton
-from common.hands.skin import Skin, skin_on
+from common.hands.skin import Skin, skin_of, skin_on
+from common.hands.spec import Hand
 from common.objects.painting import painted
-from services.export.motion_file import GraspMotion
+from services.export.motion_file import GraspMotion, hand_arrays
 from services.record import palette
 
 OBJECT = "object"
@@ -24,6 +26,7 @@ TOLERANCE_MM = 0.1
 """Files whose kinematics differ by more than this are not kept."""
 _LEVER = 0.1  # m; a point this far from a frame's origin shows its rotation
 _SAME_TIME = 1e-6  # s
+_KINEMATICS = ("link_names", "link_parent", "joint_link", "joint_axis", "joint_anchor")
 _STILL = 1e-6  # m; a link whose origin moves less than this in its parent's frame does not move there
 
 
@@ -88,7 +91,9 @@ def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def skin_of_motion(motion: GraspMotion) -> Skin:
-    """The surface of the motion's hand."""
+    """The surface of the motion's hand; the meshes of its file where it is one of the user's own."""
+    if motion.hand in own_hands() and _same_hand(motion, hand := get_hand(motion.hand)):
+        return skin_of(hand)
     origins = np.zeros((len(motion.link_names), 3))
     first = np.unique(motion.joint_link, return_index=True)[1]
     origins[motion.joint_link[first]] = motion.joint_anchor[first]
@@ -105,6 +110,12 @@ def skin_of_motion(motion: GraspMotion) -> Skin:
         motion.joint_link,
     )
     return skin_on(skeleton)
+
+
+def _same_hand(motion: GraspMotion, hand: Hand) -> bool:
+    """Whether a hand of the motion's name still is as in the motion."""
+    arrays = hand_arrays(hand)
+    return all(np.array_equal(arrays[name], getattr(motion, name)) for name in _KINEMATICS)
 
 
 def bodies(motion: GraspMotion) -> list[Body]:

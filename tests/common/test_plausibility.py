@@ -166,10 +166,15 @@ def test_measures_of_a_motion_worked_out_by_hand():
         assert found[name][0] == pytest.approx(value, rel=1e-5), name
 
 
+def test_hands_without_meshes_have_no_measure_of_them():
+    found = measures(motion(2, hand_mesh=np.full((2, 1), np.nan)), 0.01)
+    assert set(found) == {*plausibility.MEASURES} - {"hand_mesh_mm"}
+
+
 def test_clean_is_held_and_shallow_everywhere():
     shallow = {"hand_hand_mm": 1.9, "hand_table_mm": 1.9, "hand_object_mm": 2.9}
     assert is_clean(np.array([True]), {name: np.array([x]) for name, x in shallow.items()}).tolist() == [True]
     assert is_clean(np.array([False]), {name: np.array([x]) for name, x in shallow.items()}).tolist() == [False]
-    for name, value in (("hand_hand_mm", 2.0), ("hand_table_mm", 2.0), ("hand_object_mm", 3.0)):
+    for name, value in (("hand_hand_mm", 2.0), ("hand_table_mm", 2.0), ("hand_object_mm", 3.0), ("hand_mesh_mm", 3.0)):
         found = {**shallow, name: value}
         assert is_clean(np.array([True]), {name: np.array([x]) for name, x in found.items()}).tolist() == [False]

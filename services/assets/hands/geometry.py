@@ -1,11 +1,20 @@
 """Capsules for what a link looks like in its file: collision geometry, else what is drawn, else its inertia."""
 
+from typing import Literal
+
 import mujoco
 import numpy as np
 import trimesh
 
-from common.hands.spec import Capsule, vector
+from common.hands.spec import Capsule, Solid, vector
 
+_KINDS: dict[mujoco.mjtGeom, Literal["box", "cylinder", "capsule", "ellipsoid"]] = {
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "ellipsoid",
+}
 _FLAT = 1.6  # broader than this, a link gets several capsules side by side
 _PLAUSIBLE = (0.002, 0.15)  # m, half of an inertia's box
 _BARE = 0.005  # m, radius of a link of which nothing is known
@@ -21,6 +30,30 @@ def surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.nd
             local = np.asarray(mesh.vertices)
             found += list(local @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g])
     return found
+
+
+def solids_of(
+    model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], turn: np.ndarray, origin: np.ndarray
+) -> tuple[Solid, ...]:
+    """What collides of bodies, in the frame that `turn` (3, 3) brings to the world and that lies at `origin` (3,) m.
+
+    None where that is nothing, or has a mesh among it.
+    """
+    found = []
+    for g in np.flatnonzero(np.isin(model.geom_bodyid, bodies)):
+        if not model.geom_contype[g] | model.geom_conaffinity[g]:
+            continue
+        kind, size = _KINDS.get(mujoco.mjtGeom(model.geom_type[g])), model.geom_size[g].copy()
+        if kind is None:
+            return ()
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_SPHERE:
+            size = np.repeat(size[0], 3)
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, np.ravel(turn.T @ data.geom_xmat[g].reshape(3, 3)))
+        w, x, y, z = quaternion.round(9).tolist()
+        place = vector(((data.geom_xpos[g] - origin) @ turn).round(6))
+        found.append(Solid(kind, vector(size.round(6)), place, (w, x, y, z)))
+    return tuple(found)
 
 
 def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:

@@ -23,10 +23,9 @@ from common.config import TaskConfig
 from common.hands.kinematics import grasp_frame
 from common.hands.motors import motor_positions
 from common.hands.spec import Hand
-from common.objects import shapes
 from common.objects.families import draft
-from common.objects.spec import GraspObject, Piece
-from common.objects.surface import mass_properties, sample_union
+from common.objects.plain import plain_object
+from common.objects.spec import GraspObject
 
 OBJECTS = ("ball", "cylinder", "box")
 SIZES = (0.4, 0.3)
@@ -76,7 +75,7 @@ def grip_objects(width: float) -> list[GraspObject]:
         draft.cylinder((0, -width, 0), (0, width, 0), half),
         draft.box((half, width, half)),
     )
-    return [_object(name, piece) for name, piece in zip(OBJECTS, pieces, strict=True)]
+    return [plain_object(name, (piece,), DENSITY) for name, piece in zip(OBJECTS, pieces, strict=True)]
 
 
 def grips(hand: Hand, task: TaskConfig, threads: int) -> list[Grip]:
@@ -196,25 +195,3 @@ def _judged(
         )
         for i, index in enumerate(np.asarray(start.object_index))
     ]
-
-
-def _object(name: str, piece: Piece) -> GraspObject:
-    """One piece as an object."""
-    mass, _, inertia = mass_properties((piece,), np.array([DENSITY]))
-    points, normals, _ = sample_union((piece,), np.random.default_rng(0))
-    vertices, faces = shapes.tessellate(piece)
-    return GraspObject(
-        name=name,
-        family=name,
-        pieces=(piece,),
-        part_names=("all",),
-        graspable=np.array([True]),
-        mass=mass,
-        inertia=inertia,
-        points=points.astype(np.float32),
-        normals=normals.astype(np.float32),
-        labels=np.zeros(len(points), np.int32),
-        rest_poses=np.zeros((0, 7)),
-        visual_vertices=vertices.astype(np.float32),
-        visual_faces=faces.astype(np.int32),
-    )

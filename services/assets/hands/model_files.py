@@ -14,14 +14,15 @@ from common.errors import CongraspError
 from common.hands.files import TAKEN_JOINTS, faults, hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.measures import fitting_scale
+from common.hands.meshes import Meshes
 from common.hands.motors import motor_limits
 from common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from services.assets.hands.compile import compiled_model
-from services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_box, surface
+from services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_box, solids_of, surface
 from services.assets.hands.motors import Drive
 from services.assets.hands.poses import opening, propose_poses, thumb_of
 from services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
-from services.assets.hands.visual import Meshes, link_mesh
+from services.assets.hands.visual import link_mesh
 
 _LEVER = 0.02  # m from a joint to the tip that it moves, at least
 _SMALL = 0.03  # m of opening below which a hand is doubtful
@@ -47,6 +48,8 @@ class Choices:
     palm: str = ""
     thumb: str = ""
     object_scale: float = 0.0
+    own_collision: bool = False
+    """Whether links collide by the file's own collision geometry instead of capsules."""
 
 
 _GUESSED = Choices()
@@ -57,7 +60,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
 
     Args:
       path: URDF (.urdf) or MJCF (.xml); meshes lie where it says, as MuJoCo finds them.
-      choices: name, palm's body, thumb's last body and object scale, where they are not to be guessed.
+      choices: name, palm's body, thumb's last body and object scale, where they are not to be guessed; collision.
 
     Raises:
       CongraspError: the file cannot be read, or what it shows is no hand of hinges with at least two fingers.
@@ -73,6 +76,8 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
             "Name another --palm.",
         )
     links, drive = _links(model, data, tree, notes)
+    if choices.own_collision:
+        links = _with_solids(model, data, tree, links, notes)
     hand = Hand(
         name=identifier(choices.name or path.stem, "hand").lower(),
         links=tuple(links),
@@ -183,6 +188,17 @@ def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[s
     if empty:
         notes.append(f"no geometry and no inertia, thin capsules ('capsules' in the hand file): {', '.join(empty)}")
     return links, drive
+
+
+def _with_solids(
+    model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, links: list[Link], notes: list[str]
+) -> list[Link]:
+    """The links with the file's own collision geometry; `notes` says which keep their capsules."""
+    turn, origin = data.xmat[tree.palm].reshape(3, 3), data.xpos[tree.palm]
+    found = [solids_of(model, data, bodies, turn, origin) for bodies in tree.groups.values()]
+    if kept := [link.name for link, solids in zip(links, found, strict=True) if not solids]:
+        notes.append(f"no collision geometry but meshes, these collide by their capsules: {', '.join(kept)}")
+    return [dataclasses.replace(link, solids=solids) for link, solids in zip(links, found, strict=True)]
 
 
 def _meshes(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree) -> Meshes:

@@ -1,21 +1,36 @@
 """Files with fewer motors than joints, on arms and in scenes, left and right, of hands of our own making."""
 
+import dataclasses
 import pathlib
 
 import mujoco
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
+from actors.physics.mjx import MjxPhysics
+from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import VARIABLE, get_hand
 from common.hands.files import hand_from_text, hand_text
-from common.hands.kinematics import grasp_frame
+from common.hands.kinematics import grasp_frame, link_transforms
+from common.hands.meshes import MAX_FACES, load_meshes
+from common.hands.mjcf import add_hand
+from common.hands.skin import skin_of, skin_of_meshes
 from common.hands.spec import chain_of
-from services.assets.hands.model_files import describe, import_hand
-from services.assets.hands.visual import MAX_FACES, load_meshes, save_meshes, skin_of_meshes
+from common.objects.distance import distance_field
+from common.objects.plain import plain_object
+from common.objects.spec import Piece
+from common.task import plausibility
+from services.assets.hands.model_files import Choices, describe, import_hand
+from services.assets.hands.visual import save_meshes
 from services.cli import main
+from services.export.frames import skin_of_motion
+from services.export.motion_file import hand_arrays, motion_of_episode
 from services.viz.hand_sheets import hands_sheet
+from services.viz.shapes import posed_hand
+from tests.episodes import episode
 
 HANDS = pathlib.Path(__file__).parents[3] / "hands"
 
@@ -148,6 +163,95 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
     refused("has no link 'wing'", {"wing": (vertices, faces)})
     save_meshes(path, {})
     assert load_meshes(path, driven.hand) == {}
+
+
+def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
+    """Every geom of the file that collides is in the hand's model, where it is in the file, and the masses stay."""
+    hand = import_hand(HANDS / "driven.xml", Choices(own_collision=True)).hand
+    assert hand_from_text(hand_text(hand)) is hand and all(link.solids for link in hand.links)
+    theirs = mujoco.MjModel.from_xml_path(str(HANDS / "driven.xml"))
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    add_hand(spec, hand, self_collision=True)
+    ours = spec.compile()
+
+    def shapes(model, palm, bodies):
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        root, turn = data.body(palm).xpos, data.body(palm).xmat.reshape(3, 3)
+        geoms = [g for g in range(model.ngeom) if bodies(g) and model.geom_contype[g] | model.geom_conaffinity[g]]
+        rows = [(*model.geom_size[g], *((data.geom_xpos[g] - root) @ turn)) for g in geoms]
+        return np.array(sorted(rows)), sorted(model.geom_type[geoms].tolist())
+
+    part = {theirs.body("base").id}
+    for body in range(theirs.nbody):
+        part |= {body} if theirs.body_parentid[body] in part else set()
+    expected, found = (
+        shapes(theirs, "base", lambda g: theirs.geom_bodyid[g] in part),
+        shapes(ours, "palm", lambda g: True),
+    )
+    assert found[1] == expected[1] and {2, 3, 6} <= {*found[1]}  # balls, capsules and boxes
+    np.testing.assert_allclose(found[0], expected[0], atol=2e-6)
+    assert ours.body_mass.sum() == pytest.approx(sum(link.mass for link in driven.hand.links))
+    with pytest.raises(CongraspError, match="jax collides capsules alone"):
+        MjxPhysics(hand, TaskConfig(), [])
+
+
+def test_links_that_collide_by_meshes_keep_their_capsules(tmp_path):
+    trimesh.creation.icosphere(1, 0.009).export(tmp_path / "pad.stl")
+    text = (HANDS / "claw.urdf").read_text()
+    text = text.replace('<sphere radius="0.009"/>', '<mesh filename="package://x/pad.stl"/>')
+    (tmp_path / "claw.urdf").write_text(text)
+    proposal = import_hand(tmp_path / "claw.urdf", Choices(own_collision=True))
+    (note,) = (note for note in proposal.notes if "collide by their capsules" in note)
+    links = {link.name: link for link in proposal.hand.links}
+    assert "left_upper" in note and not links["left_upper"].solids and links["left_upper"].capsules
+
+
+@pytest.fixture
+def own(driven, tmp_path, monkeypatch):
+    """The hand among the user's own, with one mesh: a cube of 4 cm on its palm's link."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    get_hand.cache_clear()
+    cube = trimesh.creation.box((0.04, 0.04, 0.04))
+    path = tmp_path / "own_driven.json"
+    path.write_text(hand_text(dataclasses.replace(driven.hand, name="own_driven")))
+    save_meshes(path, {"palm": (np.asarray(cube.vertices, np.float32), np.asarray(cube.faces, np.int32))})
+    yield get_hand("own_driven")
+    get_hand.cache_clear()
+
+
+def test_a_hands_meshes_are_its_surface_in_pictures_and_exports(own):
+    skin = skin_of(own)
+    assert np.abs(np.sort(np.abs(skin.points[:8]), axis=None) - 0.02).max() < 1e-7 and not skin.flesh
+    drawn = posed_hand(own, own.q_open, np.zeros(3), Rotation.identity())
+    np.testing.assert_array_equal(drawn.faces, skin.faces)
+    motion = dataclasses.replace(motion_of_episode(episode()), hand=own.name, **hand_arrays(own))
+    assert skin_of_motion(motion) is skin
+    # A motion of what that hand was before keeps the surface that its own arrays tell.
+    moved = dataclasses.replace(motion, joint_anchor=motion.joint_anchor + 0.01)
+    assert not np.array_equal(skin_of_motion(moved).faces, skin.faces)
+    # A hand of this name that someone else sent is not drawn by our meshes.
+    stranger = hand_from_text(hand_text(dataclasses.replace(own, object_scale=0.5)))
+    assert not np.array_equal(skin_of(stranger).faces, skin.faces)
+
+
+def test_meshes_are_measured_against_the_object_beside_the_capsules(own):
+    """A ball of 3 cm whose centre is 4.5 cm from the cube's middle, along an edge's normal and a face's normal."""
+    ball = plain_object("ball", (Piece("ellipsoid", (0.03, 0.03, 0.03)),), 500.0)
+    transforms = link_transforms(own, np.asarray(own.q_open, np.float32)[None])
+    field, upright = distance_field([ball]), np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)
+
+    def depth(*center):
+        seen = np.array([center], np.float32), upright, np.zeros(1, int), field
+        return float(plausibility.hand_mesh(own, transforms, *seen)[0])
+
+    assert depth(-0.045, 0.0, 0.0) == pytest.approx(0.005, abs=5e-4)
+    side = 0.045 / np.sqrt(2)  # an edge is sqrt(8) cm from the middle
+    assert depth(-side, 0.0, -side) == pytest.approx(0.03 - (0.045 - 0.02 * np.sqrt(2)), abs=5e-4)
+    assert depth(-0.06, 0.0, 0.0) == 0.0
+    seen = np.zeros((1, 3), np.float32), upright, np.zeros(1, int), field
+    assert np.isnan(plausibility.hand_mesh(get_hand("allegro"), transforms, *seen)).all()
 
 
 def test_a_fine_mesh_is_simplified(tmp_path):

@@ -1,0 +1,36 @@
+"""Objects that are nothing but their convex pieces: one part, no resting poses."""
+
+import numpy as np
+
+from common.objects import shapes
+from common.objects.spec import GraspObject, Piece
+from common.objects.surface import mass_properties, sample_union
+
+
+def plain_object(name: str, pieces: tuple[Piece, ...], density: float) -> GraspObject:
+    """An object of convex pieces.
+
+    Args:
+      name: its name.
+      pieces: in the object frame, whose origin is taken for the centre of mass.
+      density: kg/m^3.
+    """
+    mass, _, inertia = mass_properties(pieces, np.full(len(pieces), density))
+    points, normals, _ = sample_union(pieces, np.random.default_rng(0))
+    parts = [shapes.tessellate(piece) for piece in pieces]
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts[:-1])])
+    return GraspObject(
+        name=name,
+        family=name,
+        pieces=pieces,
+        part_names=("all",),
+        graspable=np.array([True]),
+        mass=mass,
+        inertia=inertia,
+        points=points.astype(np.float32),
+        normals=normals.astype(np.float32),
+        labels=np.zeros(len(points), np.int32),
+        rest_poses=np.zeros((0, 7)),
+        visual_vertices=np.concatenate([vertices for vertices, _ in parts]).astype(np.float32),
+        visual_faces=np.concatenate([f + start for (_, f), start in zip(parts, starts, strict=True)]).astype(np.int32),
+    )

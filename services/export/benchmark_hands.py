@@ -1,0 +1,340 @@
+"""The hands that DexGraspBench has, and which joint of a hand of this project is which of theirs.
+
+The benchmark takes them from MuJoCo Menagerie (Allegro V3: SimLab, BSD-2; Shadow: Shadow Robot Company, Apache-2.0).
+Here are their names and kinematics as facts, in the frame of the palm's body with every joint at zero. A hand is told
+by these, not by names: it is the benchmark's if its joints are where the benchmark has them.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.errors import CongraspError
+from common.hands.spec import Hand, Joint, Solid, Vector, vector
+from services.export.motion_file import GraspMotion
+
+Row = tuple[float, float, float, float, float, float]
+"""Anchor (m) and axis (unit) of a joint, in the palm's frame at zero."""
+PLACES_MM = 0.1
+"""How far a joint may be from where the benchmark has it."""
+_FACING = 1e-3  # rad, how far an axis may be turned
+
+
+class Shape(NamedTuple):
+    """A collision shape of a benchmark's hand, in the palm's frame at zero."""
+
+    joint: str
+    """The joint that moves it; empty for the palm."""
+    kind: Literal["box", "capsule"]
+    size: Vector
+    """Half extents, or radius and half length along z."""
+    position: tuple[float, ...]
+    """(3,) m."""
+    quaternion: tuple[float, ...]
+    """(4,) w x y z, its frame to the palm's."""
+
+
+class BenchmarkHand(NamedTuple):
+    """A hand of F joints in the benchmark's order."""
+
+    fingers: dict[str, tuple[Row, ...]]
+    """The joints of each finger from the palm on; the key with a number is a joint's name."""
+    from_tip: bool
+    """Whether they are numbered from the tip, from 1 on, instead of from the palm, from 0 on."""
+    position: tuple[float, float, float]
+    """m, of the palm in the frame of the root, which is what the benchmark places."""
+    quaternion: tuple[float, float, float, float]
+    """(w, x, y, z) palm to root."""
+    kp: float
+    """N.m/rad of every motor."""
+    damping: float
+    """N.m.s/rad of every joint."""
+    torque_limit: float
+    """N.m of every motor."""
+    shapes: tuple[Shape, ...] = ()
+    """What collides; empty where that is meshes."""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """F names."""
+        return tuple(
+            f"{finger}{len(rows) - i if self.from_tip else i}"
+            for finger, rows in self.fingers.items()
+            for i in range(len(rows))
+        )
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(F, 2, 3) anchors and axes."""
+        return np.array([*itertools.chain(*self.fingers.values())]).reshape(-1, 2, 3)
+
+
+def _straight(x: float, z: float, side: int) -> tuple[Row, ...]:
+    """A finger of the Shadow hand along z, that spreads about y and bends about x."""
+    return (
+        (x, 0, z, 0, side, 0),
+        (x, 0, z, 1, 0, 0),
+        (x, 0, z + 0.045, 1, 0, 0),
+        (x, 0, z + 0.070, 1, 0, 0),
+    )
+
+
+def _phalanges(
+    finger: str,
+    rows: tuple[Row, ...],
+    quaternion: tuple[float, ...],
+    boxes: Sequence[tuple[Vector, Vector]],
+    tip: float,
+) -> tuple[Shape, ...]:
+    """An Allegro finger: a box on each joint, half extents and place in the finger's frame, and a capsule at the tip.
+
+    Args:
+      finger: its joints' name.
+      rows: of its joints.
+      quaternion: (w, x, y, z) of the finger's frame, whose z axis is along it, in the palm's.
+      boxes: for each joint.
+      tip: m from the last joint to the capsule's middle.
+    """
+    turn, found = Rotation.from_quat(quaternion, scalar_first=True), []
+    for i, (row, (size, place)) in enumerate(zip(rows, boxes, strict=True)):
+        found.append(Shape(f"{finger}{i}", "box", size, tuple(row[:3] + turn.apply(place)), quaternion))
+    end = tuple(rows[-1][:3] + turn.apply((0, 0, tip)))
+    return (*found, Shape(f"{finger}3", "capsule", (_TIP, _TIP_HALF[tip], 0.0), end, quaternion))
+
+
+def _upright(length: float) -> tuple[Vector, Vector]:
+    """Half extents and place of the box of an Allegro phalanx of a length in metres."""
+    return (0.0098, 0.01375, length / 2), (0.0, 0.0, length / 2)
+
+
+_TIP, _TIP_HALF = 0.012, {0.019: 0.01, 0.035: 0.008}  # m, radius of Allegro's fingertips, half length by their place
+_S, _C = 0.0871558, 0.9961947  # of the 5 degrees by which Allegro's outer fingers lean
+_H = np.sqrt(0.5)
+_ALLEGRO: dict[str, tuple[Row, ...]] = {
+    "ffj": (
+        (0, 0.0435, -0.001542, 0, _S, _C),
+        (0, 0.0449294, 0.0147956, 0, _C, -_S),
+        (0, 0.0496358, 0.0685901, 0, _C, -_S),
+        (0, 0.0529825, 0.1068440, 0, _C, -_S),
+    ),
+    "mfj": (
+        (0, 0, 0.0007, 0, 0, 1),
+        (0, 0, 0.0171, 0, 1, 0),
+        (0, 0, 0.0711, 0, 1, 0),
+        (0, 0, 0.1095, 0, 1, 0),
+    ),
+    "rfj": (
+        (0, -0.0435, -0.001542, 0, -_S, _C),
+        (0, -0.0449294, 0.0147956, 0, _C, _S),
+        (0, -0.0496358, 0.0685901, 0, _C, _S),
+        (0, -0.0529825, 0.1068440, 0, _C, _S),
+    ),
+    "thj": (
+        (-0.0182, 0.019333, -0.045987, 0, -_S, -_C),
+        (-0.0132, 0.0567279, -0.0763618, 0, _C, -_S),
+        (-0.0132, 0.0743606, -0.0779045, 1, 0, 0),
+        (-0.0132, 0.1255650, -0.0823844, 1, 0, 0),
+    ),
+}
+_FINGER = [_upright(length) for length in (0.0164, 0.054, 0.0384, 0.016)]
+_THUMB = [
+    ((0.0179, 0.017, 0.02275), (-0.0179, 0.009, 0.0145)),
+    *(_upright(length) for length in (0.0177, 0.0514, 0.0314)),
+]
+_LEAN = (0.9990482, 0.0436194)
+BENCHMARK_HANDS = {
+    "allegro": BenchmarkHand(
+        fingers=_ALLEGRO,
+        from_tip=False,
+        position=(0.0, 0.0, 0.0),
+        quaternion=(0.0, _H, 0.0, _H),
+        kp=5.0,
+        damping=0.1,
+        torque_limit=100.0,
+        shapes=(
+            Shape("", "box", (0.0204, 0.0565, 0.0475), (-0.0093, 0.0, -0.0475), (1.0, 0.0, 0.0, 0.0)),
+            *_phalanges("ffj", _ALLEGRO["ffj"], (_LEAN[0], -_LEAN[1], 0.0, 0.0), _FINGER, 0.019),
+            *_phalanges("mfj", _ALLEGRO["mfj"], (1.0, 0.0, 0.0, 0.0), _FINGER, 0.019),
+            *_phalanges("rfj", _ALLEGRO["rfj"], (_LEAN[0], _LEAN[1], 0.0, 0.0), _FINGER, 0.019),
+            *_phalanges("thj", _ALLEGRO["thj"], (0.477714, -0.521334, -0.521334, -0.477714), _THUMB, 0.035),
+        ),
+    ),
+    "shadow": BenchmarkHand(
+        fingers={
+            "rh_FFJ": _straight(0.033, 0.095, -1),
+            "rh_MFJ": _straight(0.011, 0.099, -1),
+            "rh_RFJ": _straight(-0.011, 0.095, 1),
+            "rh_LFJ": ((-0.033, 0, 0.02071, 0.5735764, 0, 0.8191520), *_straight(-0.033, 0.0865, 1)),
+            "rh_THJ": (
+                (0.034, -0.00858, 0.029, -_H, 0, -_H),
+                (0.034, -0.00858, 0.029, _H, 0, -_H),
+                (0.0608701, -0.00858, 0.0558701, _H, 0, -_H),
+                (0.0608701, -0.00858, 0.0558701, 0, -1, 0),
+                (0.0834975, -0.00858, 0.0784975, 0, -1, 0),
+            ),
+        },
+        from_tip=True,
+        position=(0.0, 0.0, 0.034),
+        quaternion=(1.0, 0.0, 0.0, 0.0),
+        kp=5.0,
+        damping=0.05,
+        torque_limit=3.0,
+    ),
+}
+"""By the benchmark's names. Allegro's motors have no limit there; 100 N.m is beyond what anything asks of them."""
+
+
+class Match(NamedTuple):
+    """A hand of this project as the benchmark has it."""
+
+    name: str
+    """Of the benchmark's hand."""
+    hand: BenchmarkHand
+    order: np.ndarray
+    """(F,) index of this project's joint for each of the benchmark's."""
+    sign: np.ndarray
+    """(F,) 1 or -1 where it turns the other way."""
+    position: np.ndarray
+    """(3,) m, of the wrist frame in the root's."""
+    rotation: Rotation
+    """From the wrist frame to the root's."""
+
+    def qpos(self, position: np.ndarray, rotation: Rotation, q: np.ndarray) -> np.ndarray:
+        """(7 + F,) root's place and quaternion (w, x, y, z) in the world and the joints, as the benchmark stores them.
+
+        Args:
+          position: (3,) m, of the wrist in the world.
+          rotation: from the wrist frame to the world.
+          q: (F,) rad, in this project's order.
+        """
+        turn = rotation * self.rotation.inv()
+        quaternion = turn.as_quat(scalar_first=True)
+        return np.concatenate([position - turn.apply(self.position), quaternion, self.sign * q[self.order]])
+
+    def solids(self, link_of: np.ndarray) -> dict[int, tuple[Solid, ...]]:
+        """The benchmark's collision shapes in the wrist frame at zero, by links; none where they are meshes.
+
+        Args:
+          link_of: (F,) index of the link that each of this project's joints moves.
+        """
+        palm = Rotation.from_quat(self.hand.quaternion, scalar_first=True)
+        turn = self.rotation.inv() * palm  # from the palm's frame to the wrist's
+        place = self.rotation.inv().apply(self.hand.position - self.position)
+        found: dict[int, tuple[Solid, ...]] = {}
+        for shape in self.hand.shapes:
+            link = int(link_of[self.order[self.hand.joints.index(shape.joint)]]) if shape.joint else 0
+            w, x, y, z = (turn * Rotation.from_quat(shape.quaternion, scalar_first=True)).as_quat(scalar_first=True)
+            solid = Solid(shape.kind, shape.size, vector(turn.apply(shape.position) + place), (w, x, y, z))
+            found[link] = (*found.get(link, ()), solid)
+        return found
+
+    def joint_frames(self, qpos: np.ndarray) -> tuple[np.ndarray, Rotation]:
+        """Where the benchmark's kinematics has what each joint moves, by the product of exponentials.
+
+        Args:
+          qpos: (7 + F,), see `qpos`.
+
+        Returns:
+          (F, 3) m, the joints' anchors in the world; and the turn of what follows each from this project's zero pose
+          to the world.
+        """
+        root = Rotation.from_quat(qpos[3:7], scalar_first=True)
+        palm = root * Rotation.from_quat(self.hand.quaternion, scalar_first=True)
+        base = qpos[:3] + root.apply(self.hand.position)
+        places, turns = [], []
+        number = 7
+        for rows in self.hand.fingers.values():
+            turn, way = palm, base  # of a point of the zero pose: turn.apply(point) + way
+            for row in np.array(rows).reshape(-1, 2, 3):
+                anchor = turn.apply(row[0]) + way
+                turn = turn * Rotation.from_rotvec(qpos[number] * row[1])
+                way = anchor - turn.apply(row[0])
+                places.append(anchor)
+                turns.append(turn)
+                number += 1
+        own = Rotation.from_quat(self.hand.quaternion, scalar_first=True).inv() * self.rotation
+        return np.array(places), Rotation.concatenate(turns) * own
+
+
+def match_hand(motion: GraspMotion) -> Match:
+    """The benchmark's hand that a motion's hand is, whatever its joints are called.
+
+    Every way of pairing fingers with the benchmark's is laid over it (Kabsch); the best must fit to `PLACES_MM`.
+
+    Raises:
+      CongraspError: the benchmark has no such hand.
+    """
+    chains = _chains(motion)
+    best: tuple[float, Match | None] = (np.inf, None)
+    for name, hand in BENCHMARK_HANDS.items():
+        lengths = [len(rows) for rows in hand.fingers.values()]
+        for pairing in itertools.permutations(chains):
+            if [len(chain) for chain in pairing] != lengths:
+                continue
+            order = np.concatenate(pairing)
+            found = _laid_over(name, hand, order, motion)
+            if found[0] < best[0]:
+                best = found
+    error, match = best
+    if match is None or error > PLACES_MM:
+        near = f"; the nearest, {match.name}, has a joint {error:.2g} mm off" if match else ""
+        raise CongraspError(
+            f"DexGraspBench has no hand like '{motion.hand}'{near}.",
+            f"It has {' and '.join(BENCHMARK_HANDS)}; of another make of one, import the benchmark's own file.",
+        )
+    return match
+
+
+def benchmarked(hand: Hand, match: Match) -> Hand:
+    """The hand with the benchmark's motors, damping, and collision shapes where they are no meshes."""
+    motor = match.hand
+
+    def driven(joint: Joint) -> Joint:
+        joint = dataclasses.replace(joint, damping=motor.damping)
+        if not joint.kp:
+            return joint
+        return dataclasses.replace(joint, kp=motor.kp, kv=0.0, torque_limit=motor.torque_limit)
+
+    solids = match.solids(hand.joint_links)
+    links = tuple(
+        dataclasses.replace(link, joints=tuple(map(driven, link.joints)), solids=solids.get(i, link.solids))
+        for i, link in enumerate(hand.links)
+    )
+    tendons = tuple(
+        dataclasses.replace(tendon, kp=motor.kp, kv=0.0, torque_limit=motor.torque_limit) for tendon in hand.tendons
+    )
+    return dataclasses.replace(hand, links=links, tendons=tendons)
+
+
+def _chains(motion: GraspMotion) -> list[np.ndarray]:
+    """Indices of the joints of each finger, from the palm on; none for a hand that is no palm with chains."""
+    parents, links = motion.link_parent, motion.joint_link
+    found = []
+    for tip in sorted({*range(len(parents))} - {*parents.tolist()}):
+        chain: list[int] = []
+        link = tip
+        while parents[link] >= 0:
+            chain = [*np.flatnonzero(links == link).tolist(), *chain]
+            link = int(parents[link])
+        found.append(np.array(chain, int))
+    found = [chain for chain in found if len(chain)]
+    joints = np.concatenate(found) if found else np.zeros(0)
+    return found if len(np.unique(joints)) == len(joints) == len(links) and len(found) <= 5 else []
+
+
+def _laid_over(name: str, hand: BenchmarkHand, order: np.ndarray, motion: GraspMotion) -> tuple[float, Match | None]:
+    """How far in mm the farthest joint is off with these joints for the benchmark's, and the match."""
+    theirs, anchors, axes = hand.rows, motion.joint_anchor[order].astype(float), motion.joint_axis[order].astype(float)
+    middle, center = theirs[:, 0].mean(0), anchors.mean(0)
+    turn = Rotation.align_vectors(theirs[:, 0] - middle, anchors - center)[0]
+    off = 1e3 * np.linalg.norm(turn.apply(anchors - center) - (theirs[:, 0] - middle), axis=-1).max()
+    along = np.sum(turn.apply(axes) * theirs[:, 1], -1)
+    if np.abs(along).min() < np.cos(_FACING):
+        return np.inf, None
+    palm = Rotation.from_quat(hand.quaternion, scalar_first=True)
+    place = palm.apply(middle - turn.apply(center)) + hand.position
+    return float(off), Match(name, hand, order, np.sign(along), place, palm * turn)

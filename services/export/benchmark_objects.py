@@ -1,0 +1,98 @@
+"""The object of a motion as DexGraspBench has objects: a folder with its mesh, its convex pieces and its mass."""
+
+import hashlib
+import json
+import pathlib
+
+import numpy as np
+import trimesh
+from scipy.spatial import QhullError
+
+from common.caches import keep, read_kept
+from common.errors import CongraspError
+from common.files import cache_folder, write_atomically
+from common.objects import shapes
+from common.objects.plain import plain_object
+from common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
+from common.wire.codec import Message
+from services.assets.objects.decompose import decompose
+from services.assets.objects.pieces import simplify
+from services.export.motion_file import GraspMotion
+
+_DENSITY = 500.0  # kg/m^3
+_SECONDS = 60.0  # for the convex decomposition of a body
+_MOST_FILES = 1024  # bodies whose pieces are kept
+
+
+def convex_object(motion: GraspMotion) -> GraspObject:
+    """The object in the motion's object frame, made of convex pieces: a motion has its mesh alone.
+
+    Raises:
+      CongraspError: the mesh has no volume.
+    """
+    shape = motion.object_vertices.astype(float), motion.object_faces
+    # Bodies that only touch have no vertex in common, unless equal ones are merged.
+    bodies = trimesh.Trimesh(*shape, process=False).split(only_watertight=False, repair=False)
+    if len(bodies) > MAX_MESH_PIECES:
+        bodies = [trimesh.Trimesh(*shape)]
+    pieces = [piece for body in bodies for piece in _pieces(body, max(1, MAX_MESH_PIECES // len(bodies)))]
+    if not pieces:
+        raise CongraspError(f"The mesh of '{motion.object}' has no volume.", "Make the motion anew.")
+    return plain_object(motion.object, tuple(pieces), _DENSITY)
+
+
+def write_object(folder: pathlib.Path, obj: GraspObject, origin: np.ndarray, scale: float) -> None:
+    """Writes an object as the benchmark's preprocessing does, in the frame and unit of its file.
+
+    Args:
+      folder: gets `mesh/simplified.obj`, `urdf/meshes/convex_piece_*.obj` and `info/simplified.json`.
+      obj: convex pieces in the object frame.
+      origin: (3,) m: object frame = scale * file - origin.
+      scale: m per unit of the file.
+    """
+
+    def in_file(points: np.ndarray) -> np.ndarray:
+        return (points + origin) / scale
+
+    _write_mesh(folder / "mesh" / "simplified.obj", in_file(obj.visual_vertices), obj.visual_faces)
+    for number, piece in enumerate(obj.pieces):
+        vertices, faces = shapes.tessellate(piece)
+        _write_mesh(folder / "urdf" / "meshes" / f"convex_piece_{number:03d}.obj", in_file(vertices), faces)
+    info = {
+        "gravity_center": (origin / scale).tolist(),
+        "obb": (np.ptp(obj.visual_vertices, axis=0) / scale).tolist(),
+        "scale": 1.0,
+        "density": 1.0,
+        "mass": sum(shapes.volume(piece) for piece in obj.pieces) / scale**3,
+    }
+    write_atomically(folder / "info" / "simplified.json", json.dumps(info, indent=1).encode())
+
+
+def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
+    """Convex pieces of one body, kept in the user's cache folder where it took a decomposition; none of a flat one."""
+    vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
+    key = hashlib.sha256(b"".join([vertices.tobytes(), faces.tobytes(), bytes([most])])).hexdigest()[:32]
+    file = cache_folder("pieces") / f"{key}.safetensors"
+    if (kept := read_kept(file)) is not None:
+        return [_piece(kept.arrays[name]) for name in sorted(kept.arrays)]
+    try:
+        volume = float(body.volume) if body.is_volume else None
+        found = decompose(vertices, faces, volume=volume, time_limit=_SECONDS, max_pieces=most)
+        hulls = [simplify(piece) for piece in found.pieces]
+    except QhullError:
+        return []
+    if found.method != "convex":
+        keep(file, Message({f"{i:03d}": hull.astype(np.float32) for i, hull in enumerate(hulls)}), _MOST_FILES)
+    return [_piece(hull) for hull in hulls]
+
+
+def _piece(vertices: np.ndarray) -> Piece:
+    """A convex piece of vertices (V, 3) in the object frame."""
+    return Piece("mesh", (0.0, 0.0, 0.0), vertices=vertices.astype(np.float64))
+
+
+def _write_mesh(path: pathlib.Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Writes triangles as Wavefront OBJ."""
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+    write_atomically(path, "\n".join([*lines, ""]).encode())

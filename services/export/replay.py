@@ -1,0 +1,178 @@
+"""The export's own exam by MuJoCo C, after DexGraspBench's: whether exported grasps hold without a policy.
+
+An object of 0.1 kg floats without table and gravity, friction 0.6. The hand is at the grasp with its targets at the
+squeeze, or at the pregrasp, from which targets go to the grasp and on to the squeeze, 0.4 s each, open loop. Then the
+object is pushed for two seconds by 1 N along or against an axis of the world, each push from the start. Motors have the
+benchmark's gains and no speed feedback beside the joints' damping. What touches are Allegro's boxes as the benchmark
+has them, and of Shadow this project's shapes.
+"""
+
+import itertools
+import json
+import pathlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from actors.physics.engine import PhysicsState, ResetState
+from actors.physics.native import EnvInstance, NativePhysics
+from actors.protocols import FARTHEST, MOST_TURNED, PUSH_FORCE
+from common.config import TaskConfig
+from common.files import write_atomically
+from common.hands.motors import motor_positions
+from common.hands.spec import Hand
+from common.parallel import cores
+from services.export.benchmark_hands import benchmarked
+from services.export.dexgraspbench import STATES, Grasp, State
+
+MASS, FRICTION = 0.1, 0.6
+"""kg and sliding friction of every object."""
+STARTS = ("grasp", "pregrasp")
+_STAGE, _PUSH, _LOOK = 40, 200, 10  # control steps: of a stage, of a push, and from one look at contacts to the next
+_TOGETHER = 32  # grasps side by side
+_TASK = TaskConfig(contact_time=0.006)
+_AXES = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+class Replayed(NamedTuple):
+    """What became of one grasp."""
+
+    name: str
+    from_grasp: bool
+    """It survived all six pushes from the grasp: within 5 cm and 15 degrees of where the object was."""
+    from_pregrasp: bool
+    """The same from the pregrasp."""
+    depth_mm: float
+    """Deepest penetration of hand and object at the grasp, before anything moves."""
+    self_mm: float
+    """Deepest penetration of two of the hand's links there."""
+    pushed_mm: float
+    """Deepest penetration of hand and object while it is pushed in the grasp."""
+
+
+def replay(grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda done: None) -> list[Replayed]:
+    """What becomes of grasps of one hand; `progress` is told how many are done."""
+    hand = benchmarked(grasps[0].hand, grasps[0].match)
+    found: list[Replayed] = []
+    for first in range(0, len(grasps), _TOGETHER):
+        found += _replay(hand, grasps[first : first + _TOGETHER])
+        progress(len(found))
+    return found
+
+
+def summary(found: Sequence[Replayed]) -> str:
+    """A line about replayed grasps."""
+    held, closed = (100 * np.mean([getattr(one, f"from_{start}") for one in found]) for start in STARTS)
+    depth, own, pushed = np.array([(one.depth_mm, one.self_mm, one.pushed_mm) for one in found]).T
+    return (
+        f"six pushes of {PUSH_FORCE:g} N survive {held:.0f} % from the grasp, {closed:.0f} % from the pregrasp; "
+        f"at the grasp the hand is {np.median(depth):.1f} mm (median) to {depth.max():.1f} mm (most) in the object and "
+        f"{own.max():.1f} mm in itself; pushed, {pushed.max():.1f} mm in the object"
+    )
+
+
+def save_replay(folder: pathlib.Path, found: Sequence[Replayed]) -> None:
+    """Writes what became of each grasp as `replay.json`."""
+    write_atomically(folder / "replay.json", json.dumps([one._asdict() for one in found], indent=2).encode())
+
+
+def _replay(hand: Hand, grasps: Sequence[Grasp]) -> list[Replayed]:
+    """What becomes of grasps side by side."""
+    physics = NativePhysics(hand, _TASK, [grasp.obj for grasp in grasps], cores())
+    try:
+        _begin(physics, grasps, "grasp")
+        still = [_depths(instance) for instance in physics.instances[::6]]
+        held, deepest = _pushed(physics, hand, grasps, "grasp")
+        closed, _ = _pushed(physics, hand, grasps, "pregrasp")
+    finally:
+        physics.close()
+    return [
+        Replayed(grasp.name, bool(held[i]), bool(closed[i]), *still[i], float(deepest[i]))
+        for i, grasp in enumerate(grasps)
+    ]
+
+
+def _pushed(physics: NativePhysics, hand: Hand, grasps: Sequence[Grasp], start: str) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) whether each grasp survives its six pushes from a state, and the deepest penetration in them, mm."""
+    _begin(physics, grasps, start)
+    origin = physics.read(physics)
+    kept: np.ndarray = np.ones(6 * len(grasps), bool)
+    deepest = np.zeros(6 * len(grasps))
+    script = _script(hand, grasps, STATES[STATES.index(start) :])
+    for step, (target, force) in enumerate(script):
+        _, state = physics.step(physics, target, np.zeros(len(kept), bool), force)
+        kept &= _near(origin, state)
+        if force.any() and step % _LOOK == 0:
+            deepest = np.maximum(deepest, [_depths(instance)[0] for instance in physics.instances])
+    return np.all(kept.reshape(-1, 6), 1), np.max(deepest.reshape(-1, 6), 1)
+
+
+def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:
+    """Puts six worlds for each grasp to a state, without gravity."""
+    states = [grasp.states[start] for grasp in grasps]
+    objects = [(grasp.object_position, grasp.object_rotation.as_quat(scalar_first=True)) for grasp in grasps]
+
+    def six(rows: Sequence[np.ndarray | float | int]) -> np.ndarray:
+        return np.repeat(np.array(rows), 6, 0)
+
+    physics.start(
+        ResetState(
+            object_index=six(range(len(grasps))),
+            mass_scale=six([MASS / grasp.obj.mass for grasp in grasps]),
+            friction=six([FRICTION] * len(grasps)),
+            base_position=six([state.position for state in states]),
+            base_quaternion=six([state.rotation.as_quat(scalar_first=True) for state in states]),
+            q=six([state.q for state in states]),
+            object_position=six([position for position, _ in objects]),
+            object_quaternion=six([quaternion for _, quaternion in objects]),
+            stationary=np.zeros(6 * len(grasps), bool),
+        )
+    )
+    physics.place_tables(np.zeros(6 * len(grasps), bool))
+    for instance in physics.instances:
+        instance.model.opt.gravity[:] = 0.0
+        mujoco.mj_forward(instance.model, instance.data)
+
+
+def _script(hand: Hand, grasps: Sequence[Grasp], stages: Sequence[str]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Targets (6 N, 6 + M) and forces (6 N, 3) of each control step: from state to state, then the pushes."""
+    pushes = np.tile(PUSH_FORCE * _AXES, (len(grasps), 1))
+    # From the grasp the targets are the squeeze at once.
+    shares = np.linspace(0.0, 1.0, _STAGE + 1)[1:] if len(stages) > 2 else np.ones(_STAGE)
+    rows = pushes
+    for first, second in itertools.pairwise(stages):
+        for share in shares:
+            names = stages[0], first, second
+            rows = np.repeat([_between(hand, grasp.states, names, share) for grasp in grasps], 6, 0)
+            yield rows, np.zeros_like(pushes)
+    for _ in range(_PUSH):
+        yield rows, pushes
+
+
+def _between(hand: Hand, states: Mapping[str, State], names: tuple[str, str, str], share: float) -> np.ndarray:
+    """(6 + M,) targets with the wrist's base at the first of three states, a share of the way between the others."""
+    base, first, second = (states[name] for name in names)
+    position = (1 - share) * first.position + share * second.position
+    turn = first.rotation * Rotation.from_rotvec(share * (first.rotation.inv() * second.rotation).as_rotvec())
+    q = (1 - share) * first.q + share * second.q
+    slides = base.rotation.inv().apply(position - base.position)
+    hinges = (base.rotation.inv() * turn).as_euler("XYZ")
+    return np.concatenate([slides, hinges, motor_positions(hand, q)])
+
+
+def _near(origin: PhysicsState, state: PhysicsState) -> np.ndarray:
+    """(B,) whether objects are about where they were."""
+    way = np.linalg.norm(np.asarray(state.object_position - origin.object_position), axis=-1)
+    cosine = np.abs(np.sum(np.asarray(state.object_quaternion * origin.object_quaternion), -1))
+    return (way < FARTHEST) & (2 * np.arccos(np.minimum(cosine, 1.0)) < MOST_TURNED) & ~np.asarray(state.diverged)
+
+
+def _depths(instance: EnvInstance) -> tuple[float, float]:
+    """Deepest contact of hand and object, and of two links, mm."""
+    contact, model = instance.data.contact, instance.model
+    touches = (model.geom_bodyid[contact.geom] == model.body("object").id).any(-1)
+    depth = 1e3 * np.maximum(-contact.dist, 0.0)
+    return float(depth[touches].max(initial=0.0)), float(depth[~touches].max(initial=0.0))
