@@ -29,7 +29,7 @@ CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
 _MAX_VERSION = 1 << 53
 _MAX_CONFIG = 1 << 20
-CHANGEABLE = ("updates", "checkpoint_every", "write_ahead", "collapse_patience", "physics", "ppo")
+CHANGEABLE = ("updates", "checkpoint_every", "write_ahead", "collapse_patience", "physics", "ppo", "distill")
 """Fields of the configuration that a run may go on with other values of; actors that are there do not use them."""
 
 

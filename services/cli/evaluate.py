@@ -70,7 +70,7 @@ def evaluate(
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
       hand: Whose pretrained policy.
       method: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center,
-        no-feedforward, two-phase or single-stage. A policy of another is refused; by default the policy says.
+        no-feedforward, two-phase, single-stage or student. A policy of another is refused; by default the policy says.
       by: object: also print the rates of each object; --json always has them.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.
