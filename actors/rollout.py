@@ -83,7 +83,7 @@ class Rollout(NamedTuple):
     probed: Any
     """What the probe returned, with leading axis T; None without a probe."""
     teacher_observation: Array | None = None
-    """(T, B, E) what a policy sees that sees all, where a teacher is to say what it would do."""
+    """(T, B, P) what a policy sees that sees all, where a teacher is to say what it would do."""
 
 
 class _Decision(NamedTuple):
@@ -265,7 +265,7 @@ class RolloutWorker:
         return observe(self.env.seen(state)).astype(self._dtype)
 
     def _observe_all(self, state: EnvState) -> Array | None:
-        """(B, E) what a policy sees that sees all, if that is wanted."""
+        """(B, P) what a policy sees that sees all, if that is wanted."""
         return observe(self.env.privileged(state)).astype(self._dtype) if self._taught else None
 
     def _decide(self, parameters: Any, settings: Settings, state: EnvState, key: Array) -> _Decision:

@@ -34,7 +34,7 @@ class Ranges(NamedTuple):
     episodes: dict[str, tuple[float, float]]
     """Least and largest value of each metric of an episode, by its name on the wire: no others are known."""
     teacher_observation: np.ndarray = np.zeros(0)
-    """(E,)."""
+    """(P,)."""
 
 
 class Admission:

@@ -68,7 +68,7 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
 def _evaluate(
     hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal, readings: Readings
 ) -> tuple[Any, Any, Any]:
-    """Observations (B, D), those (B, E) that see all, and the terms (B,) of the reward, each under a weight of one."""
+    """Observations (B, D), those (B, P) that see all, and the terms (B,) of the reward, each under a weight of one."""
     full = dataclasses.replace(task, observation="full")
     scene = scene_of(hand, full, state, surface, goal)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}

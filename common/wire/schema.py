@@ -33,7 +33,7 @@ class ArraySpec:
 
 
 Schema = Mapping[str, ArraySpec]
-"""Arrays by name; their shapes are made of T control steps, B worlds, D observation and A action sizes, and E of the
+"""Arrays by name; their shapes are made of T control steps, B worlds, D observation and A action sizes, and P of the
 observation of a policy that sees all."""
 
 F32 = ("float32",)
@@ -48,7 +48,7 @@ RECORDED: Schema = {
     "last_observation": ArraySpec(_OBSERVATION, ("B", "D")),
 }
 """What actors record of any rollout (`actors.rollout.Rollout`)."""
-TAUGHT: Schema = {"teacher_observation": ArraySpec(_OBSERVATION, ("T", "B", "E"))}
+TAUGHT: Schema = {"teacher_observation": ArraySpec(_OBSERVATION, ("T", "B", "P"))}
 """What they record beside it where a teacher is to say what it would have done: what a policy sees that sees all."""
 RECORDABLE: Schema = {**RECORDED, **TAUGHT}
 """Both."""
@@ -69,14 +69,14 @@ class RolloutForm:
     half: bool
     """Observations are float16, or else float32."""
     teacher: int = 0
-    """E."""
+    """P."""
     arrays: Schema = dataclasses.field(default_factory=lambda: RECORDED)
     """The arrays that the run's algorithm learns from."""
 
     @property
     def sizes(self) -> dict[str, int]:
         """Values of the symbols."""
-        return {"T": self.steps, WORLDS: self.worlds, "D": self.observation, "A": self.action, "E": self.teacher}
+        return {"T": self.steps, WORLDS: self.worlds, "D": self.observation, "A": self.action, "P": self.teacher}
 
     @property
     def specs(self) -> dict[str, ArraySpec]:
