@@ -49,6 +49,7 @@ LEARNING = (
     Panel("Throughput", "control steps/s", ("steps_per_second",)),
     Panel("Policy lag", "versions", ("staleness_mean", "staleness_max")),
     Panel("KL of an update", "nats", ("kl",)),
+    Panel("KL of student and teacher", "nats", ("imitation_kl",)),
     Panel("Policy loss", "", ("policy_loss",)),
     Panel("Value loss", "", ("value_loss",)),
     Panel("Explained variance of the critic", "share", ("explained_variance",)),
