@@ -159,7 +159,7 @@ class TaskConfig(_Shares):
     targets, the wrist, and the object's pose from a tracker; no forces and no velocities, but the last `history`
     steps."""
     history: int = 8
-    """Control steps that a tracked observation shows, the present one among them."""
+    """Control steps that a tracked observation shows, the present one among them: 2 to 64."""
     sensing: SensingConfig = SensingConfig()
     """The tracker. A policy that sees all gets the object's pose from it, too, where it is not perfect."""
     drop_height: float = 0.05

@@ -25,7 +25,7 @@ _TASK: dict[str, tuple[float, float]] = {
     "hold_steps_max": (1, 10_000),
     "surface_points": (1, SURFACE_POINTS),
     "trajectory_points": (2, 1000),
-    "history": (1, 64),
+    "history": (2, 64),
 }
 _SENSING = {"period": 10.0, "delay": 1.0, "position_noise": 1.0, "rotation_noise": 3.2, "dropout": 1.0}
 """Upper ends of the ranges of a task's tracker."""

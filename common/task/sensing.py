@@ -167,7 +167,5 @@ def seen_by(task: TaskConfig, state: SceneState, readings: Readings) -> SceneSta
         return state
     blind = ("q_velocity", "object_velocity", "object_angular_velocity", "contact_force", "contact_position")
     state = state._replace(**{name: jnp.zeros_like(getattr(state, name)) for name in blind})
-    before = readings.u[:, min(1, readings.u.shape[1] - 1)]
-    return state._replace(
-        contact_found=jnp.zeros_like(state.contact_found), u_velocity=(readings.u[:, 0] - before) / task.control_dt
-    )
+    moved = readings.u[:, 0] - readings.u[:, 1]
+    return state._replace(contact_found=jnp.zeros_like(state.contact_found), u_velocity=moved / task.control_dt)

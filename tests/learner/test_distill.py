@@ -62,7 +62,7 @@ def algorithm(run):
 
 
 def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher):
-    """Of a student whose mean is zero: half the sum of (mean / deviation)^2 over the action, averaged over the batch."""
+    """Of a student whose mean is zero: half the sum of (mean / deviation)^2 over the action, averaged over all."""
     run = run_of(teacher, epochs=1, learning_rate=0.0)
     student, rows = algorithm(run), batch(run, 0)
     state = student.init(0)
