@@ -4,6 +4,10 @@ A query names its constraints in the metadata and carries, without batch axis, t
 `common.task.types.SceneState`, the object's surface points and the goal fields of its constraints. The whole query
 travels to the device as one float32 vector, since one transfer costs as much as thirty times its size.
 
+For a policy that looks back (`TaskConfig.observation` "tracked") it also carries `past_q`, `past_u`, `past_q_target`,
+`past_u_target`, `past_object_position` and `past_object_quaternion` of the control steps before, newest first; without
+them, those of the present one are repeated.
+
 A query may also be packed: the vector itself as its one array, and in the metadata the digest of the layout that it
 follows. Whoever asks a query of names for the `layout` gets it with the answer. Packed queries cost both ends a fourth.
 They may hold several states, a row each, all with the same constraints; the answer then has as many rows.
