@@ -4,6 +4,8 @@ A step is `targets`, what physics makes of them, and `advance`. Engines that JAX
 compiled halves (`actors.rollout`); `step` puts them together for those that it can.
 """
 
+import dataclasses
+import itertools
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -17,13 +19,14 @@ from actors.success import Success
 from common.config import ControlConfig, RewardWeights, TaskConfig
 from common.hands.motors import motor_positions
 from common.hands.spec import Hand
-from common.task import metrics
+from common.task import metrics, sensing
 from common.task.constraints import blocks
 from common.task.constraints.base import Scene
 from common.task.control import decode
 from common.task.features import features
 from common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
 from common.task.reward import reward_terms, terms
+from common.task.sensing import Readings, Tracker
 from common.task.types import Action, Array, Goal, SceneState, Surface
 
 
@@ -44,7 +47,8 @@ class EnvState(NamedTuple):
     physics: Any
     """The engine's state; None where the engine keeps it in place."""
     scene: tuple[Any, ...]
-    """`SceneState` and `Features` after the step; empty inside of a loop around an engine that is not compiled."""
+    """`SceneState` and `Features` after the step, and as the policy sees them where that differs; empty inside of a
+    loop around an engine that is not compiled."""
     reset_state: ResetState
     """What the present episodes started from."""
     goal: Goal
@@ -65,6 +69,10 @@ class EnvState(NamedTuple):
     """(B, F) targets of the previous step."""
     u_target: Array
     """(B, 6)."""
+    tracker: Tracker | None
+    """What shows the objects' poses; None where the policy sees the true ones."""
+    readings: Readings | None
+    """What the sensors said last, likewise."""
     success: Success
     """What is known of the episodes' success."""
     sums: dict[str, Array]
@@ -131,6 +139,7 @@ class GraspEnv:
             time=index,
             q_target=reset_state.q,
             u_target=jnp.zeros((batch, 6)),
+            **self._first_readings(initial),
             success=success.begin(reset_state.object_position[:, 2]),
             sums=sums,
             terms=jnp.zeros((batch, len(terms(self.task)))),
@@ -168,7 +177,7 @@ class GraspEnv:
 
     def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, tuple[Array, ...]]:
         """Joint targets of an action, and what the engine's step takes (`Physics.step`)."""
-        target, table = decode(self.scene_of(state), settings.control, action), self.table_present(state)
+        target, table = decode(self.seen(state), settings.control, action), self.table_present(state)
         motors = motor_positions(self.hand, target.q_target)
         if settings.protocol is None:
             return target, (jnp.concatenate([target.u_target, motors], -1), table)
@@ -198,7 +207,7 @@ class GraspEnv:
         )
         if settings.protocol is not None:
             state = state._replace(frame=protocols.frame(settings.protocol, task, state.time))
-        state = self.with_scene(state, physics_state)
+        state = self.with_scene(self._sense(state, physics_state), physics_state)
         scene = self.scene_of(state)
         tracked, up = success.track(task, state.success, scene, physics_state.diverged)
         found = reward_terms(scene, settings.weights)
@@ -255,12 +264,51 @@ class GraspEnv:
             time=state.time.astype(jnp.float32),
             table=self.table_present(state),
         )
-        return state._replace(scene=(scene, features(self.hand, self.task, scene, state.surface, state.goal)))
+        scenes = [scene]
+        if state.tracker is not None and state.readings is not None:
+            first = state.tracker.first
+            begun = scene._replace(object_position_initial=first[:, :3], object_quaternion_initial=first[:, 3:])
+            scenes.append(sensing.seen_by(self.task, begun, state.readings))
+        found = [(each, features(self.hand, self.task, each, state.surface, state.goal)) for each in scenes]
+        return state._replace(scene=tuple(itertools.chain(*found)))
 
     def scene_of(self, state: EnvState) -> Scene:
         """The present control step as the task's terms see it."""
-        scene, features = state.scene
+        scene, features, *_ = state.scene
         return Scene(self.hand, self.task, scene, features, state.goal)
+
+    def seen(self, state: EnvState) -> Scene:
+        """The present control step as the policy sees it."""
+        *_, scene, features = state.scene
+        return Scene(self.hand, self.task, scene, features, state.goal, state.readings)
+
+    def privileged(self, state: EnvState) -> Scene:
+        """The present control step as a policy sees it that sees all."""
+        return self.scene_of(state)._replace(task=dataclasses.replace(self.task, observation="full"))
+
+    def _first_readings(self, initial: InitialConditions) -> dict[str, Any]:
+        """Tracker and readings of episodes that begin; None where the policy needs none."""
+        if not self.task.sensed:
+            return {"tracker": None, "readings": None}
+        start, task = initial.reset_state, self.task
+        steps = sensing.longest(task.sensing, task.control_dt)
+        tracker = sensing.begin(initial.sensors, steps, start.object_position, start.object_quaternion)
+        wrist = jnp.zeros((len(start.q), 6))
+        first = Readings(start.q, wrist, start.q, wrist, tracker.shown[:, :3], tracker.shown[:, 3:])
+        return {"tracker": tracker, "readings": sensing.still(first, task.history)}
+
+    def _sense(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
+        """The environments with what the sensors say after a control step, in the carried frame."""
+        if state.tracker is None or state.readings is None:
+            return state
+        position, quaternion = physics_state.object_position, physics_state.object_quaternion
+        tracker = sensing.track(state.tracker, state.time, position, quaternion)
+        shown = physics_state._replace(object_position=tracker.shown[:, :3], object_quaternion=tracker.shown[:, 3:])
+        shown = protocols.carried(shown, state.reset_state.base_quaternion, state.frame)
+        newest = Readings(
+            shown.q, shown.u, state.q_target, state.u_target, shown.object_position, shown.object_quaternion
+        )
+        return state._replace(tracker=tracker, readings=sensing.push(state.readings, newest))
 
     def table_present(self, state: EnvState) -> Array:
         """(B,) bool: whether the table stands in the coming control step."""

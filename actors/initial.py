@@ -11,11 +11,12 @@ import numpy as np
 
 from actors.physics.engine import ResetState
 from common import rotations
-from common.config import TaskConfig
+from common.config import SensingConfig, TaskConfig
 from common.hands.spec import Hand
 from common.task.bank import ConstraintBank, Draw
 from common.task.constraints import known, optional
 from common.task.constraints.priority import Resolution, resolve
+from common.task.sensing import Sensors, draw_sensors
 from common.task.types import Array, Goal, Surface
 
 
@@ -32,6 +33,8 @@ class InitialConditions(NamedTuple):
     """(B,) int: the region of the constraint bank that they were drawn from."""
     hold: Array
     """(B,) int: control steps without the table before the episode ends."""
+    sensors: Sensors
+    """What shows the objects' poses to policies that do not see the true ones."""
 
 
 class RequestedEpisodes(NamedTuple):
@@ -159,6 +162,7 @@ def _drawn(
     goal = resolve(hand, surface, Goal(values, {}), asked).goal
     low, high = task.mass_range
     friction_low, friction_high = task.friction_range
+    gain_low, gain_high = task.gain_range
     reset_state = start(
         hand,
         task,
@@ -167,12 +171,14 @@ def _drawn(
         objects=draw.objects,
         mass_scale=low + (high - low) * mass,
         friction=friction_low + (friction_high - friction_low) * friction,
+        gain_scale=gain_low + (gain_high - gain_low) * jax.random.uniform(own_key(key, "gains", 0), batch),
         stationary=jnp.broadcast_to(stationary, batch),
     )
     # Squared, so that short holds, whose beginning every episode shares, stay the rule.
     longer = jnp.floor(length**2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
     hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
-    return InitialConditions(reset_state, goal, surface, draw.region, hold)
+    sensors = draw_sensors(task.sensing, task.control_dt, own_key(key, "sensing", 0), len(hold))
+    return InitialConditions(reset_state, goal, surface, draw.region, hold, sensors)
 
 
 def _references(task: TaskConfig, draw: Draw, asked: Mapping[str, Array], key: Array) -> dict[str, Array]:
@@ -212,6 +218,8 @@ def own_key(key: Array, name: str, stage: int) -> Array:
 def given(hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int) -> tuple[InitialConditions, Resolution]:
     """Episodes as they are asked for, of one object of nominal mass and friction, and what the priority rules did.
 
+    The object's pose is shown as it is, whatever tracker the policy was trained with.
+
     Args:
       hand: the hand.
       task: geometry of the approach.
@@ -229,10 +237,12 @@ def given(hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int) -
         objects=index,
         mass_scale=nominal,
         friction=nominal,
+        gain_scale=nominal,
         stationary=jnp.zeros(batch, bool),
     )
-    initial = InitialConditions(reset_state, resolution.goal, request.surface, index, jnp.full(batch, hold, jnp.int32))
-    return initial, resolution
+    holds = jnp.full(batch, hold, jnp.int32)
+    sensors = draw_sensors(SensingConfig(), task.control_dt, jax.random.key(0), batch)
+    return InitialConditions(reset_state, resolution.goal, request.surface, index, holds, sensors), resolution
 
 
 def start(
@@ -244,6 +254,7 @@ def start(
     objects: Array,
     mass_scale: Array,
     friction: Array,
+    gain_scale: Array,
     stationary: Array,
 ) -> ResetState:
     """The hand where its constraints let it begin, beside the objects in their resting poses (B, 7)."""
@@ -252,6 +263,7 @@ def start(
         object_index=objects,
         mass_scale=mass_scale,
         friction=friction,
+        gain_scale=gain_scale,
         base_position=base_position,
         base_quaternion=base_quaternion,
         q=q,

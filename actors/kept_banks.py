@@ -23,7 +23,10 @@ LEAST_OBJECTS = 64
 """Pools from this size on are worth a file."""
 MOST_FILES = 8
 """Banks that are kept; that of 800 objects has some 50 MB."""
-_IRRELEVANT = ("reward", "control", "mass_range", "friction_range", "hold_steps", "drop_height", "disturbed", "p_")
+_IRRELEVANT = (
+    *("reward", "control", "mass_range", "friction_range", "gain_range", "hold_steps", "drop_height", "disturbed"),
+    *("p_", "observation", "history", "sensing"),
+)
 """Beginnings of the names of settings that no bank depends on."""
 
 

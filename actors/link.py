@@ -41,7 +41,7 @@ class RunInfo(NamedTuple):
     schema: str
     """Policy schema that rollouts must have."""
     arrays: tuple[str, ...]
-    """Names of the arrays that rollouts must have (`common.wire.schema.RECORDED`)."""
+    """Names of the arrays that rollouts must have (`common.wire.schema.RECORDABLE`)."""
 
 
 class Ticket(NamedTuple):

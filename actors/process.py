@@ -29,7 +29,7 @@ from common.task.bank import ConstraintBank
 from common.task.types import Array
 from common.transport.base import Transport
 from common.wire.codec import Message, finite
-from common.wire.schema import RECORDED
+from common.wire.schema import RECORDABLE, TAUGHT
 
 _TICKET_SECONDS = 1.0
 _FLUSH_SECONDS = 2.0
@@ -81,7 +81,7 @@ def run_actor(
 def first_environments(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:
     """The arrays of the first `count` environments of a rollout."""
     return {
-        name: np.asarray(array[(slice(None),) * RECORDED[name].worlds_axis + (slice(count),)])
+        name: np.asarray(array[(slice(None),) * RECORDABLE[name].worlds_axis + (slice(count),)])
         for name, array in arrays.items()
     }
 
@@ -99,7 +99,7 @@ class _Actor:
         threads: int,
         on_rollout: Callable[[dict[str, float]], None],
     ):
-        if unknown := set(arrays) - RECORDED.keys():
+        if unknown := set(arrays) - RECORDABLE.keys():
             raise CongraspError(
                 f"The learner's algorithm needs arrays that actors do not record: {', '.join(sorted(unknown))}.",
                 "Start the actor with the version of congrasp that the learner has.",
@@ -123,6 +123,7 @@ class _Actor:
                 seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
                 half_precision=config.half_observations,
                 staggered=True,
+                taught=not TAUGHT.keys().isdisjoint(arrays),
             )
         self._failures = self._failure_weights(bank)
         self._on_rollout = on_rollout

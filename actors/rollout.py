@@ -82,12 +82,15 @@ class Rollout(NamedTuple):
     trace: Trace
     probed: Any
     """What the probe returned, with leading axis T; None without a probe."""
+    teacher_observation: Array | None = None
+    """(T, B, P) what a policy sees that sees all, where a teacher is to say what it would do."""
 
 
 class _Decision(NamedTuple):
     """What the policy wants of the coming control step."""
 
     observation: Array
+    teacher_observation: Array | None
     action: Array
     log_probability: Array
     target: Action
@@ -112,6 +115,7 @@ class RolloutWorker:
         probe: Probe = lambda scene, index, data: None,
         traced: int | slice = 0,
         staggered: bool = False,
+        taught: bool = False,
     ):
         """Starts fresh episodes, if there is a bank.
 
@@ -128,10 +132,12 @@ class RolloutWorker:
           traced: of which environments a trace is kept.
           staggered: the first episodes end early, each at a time of its own, so that short rollouts show all phases of
             the task from then on.
+          taught: `Rollout.teacher_observation` is recorded.
         """
         self.physics, self.env = physics, GraspEnv(hand, task, physics)
         self._hand, self._task, self._bank, self._policy = hand, task, _on_device(bank), policy
         self._probe, self._traced, self._staggered, self.batch = probe, traced, staggered, batch
+        self._taught = taught
         self._dtype = jnp.float16 if half_precision else jnp.float32
         self._settings, self._stationary = self.env.settings, np.array(False)
         self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
@@ -256,13 +262,18 @@ class RolloutWorker:
 
     def _observe(self, state: EnvState) -> Array:
         """(B, D) observation, in the precision that the learner gets."""
-        return observe(self.env.scene_of(state)).astype(self._dtype)
+        return observe(self.env.seen(state)).astype(self._dtype)
+
+    def _observe_all(self, state: EnvState) -> Array | None:
+        """(B, P) what a policy sees that sees all, if that is wanted."""
+        return observe(self.env.privileged(state)).astype(self._dtype) if self._taught else None
 
     def _decide(self, parameters: Any, settings: Settings, state: EnvState, key: Array) -> _Decision:
         """Observation, action and joint targets of the coming step."""
         observation = self._observe(state)
         action, log_probability = self._policy(parameters, observation.astype(jnp.float32), key)
-        return _Decision(observation, action, log_probability, *self.env.targets(state, action, settings))
+        targets = self.env.targets(state, action, settings)
+        return _Decision(observation, self._observe_all(state), action, log_probability, *targets)
 
     def _kept(self, state: EnvState, action: Array, transition: Transition, settings: Settings) -> tuple[Trace, Any]:
         """What trace and probe keep of a step."""
@@ -302,7 +313,7 @@ class RolloutWorker:
         rows, extras = [], []
         for step in range(1, steps + 1):
             _, physics_state = self.physics.step(None, *map(np.asarray, decision.command))
-            row = decision[:3]
+            row = decision[:4]
             changed, transition, kept, decision = self._advance_jit(
                 parameters, settings, state, physics_state, decision, key_data, step
             )
@@ -320,10 +331,13 @@ class RolloutWorker:
                 )
             progress(step)
         self.state = self._with_scene_jit(state, physics_state)
-        columns = [np.stack(column) for column in zip(*rows, strict=True)]
+        observation, teacher_observation, *columns = (
+            None if column[0] is None else np.stack(column) for column in zip(*rows, strict=True)
+        )
         trace, probed = jax.tree.map(lambda *x: np.stack(x), *extras)
         finished = self.state.finished, self.state.has_finished
-        return Rollout(*(*columns, decision.observation, *finished, trace, probed))
+        last = decision.observation
+        return Rollout(*(observation, *columns, last, *finished, trace, probed, teacher_observation))
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         """A rollout as one program; see `collect`."""
@@ -355,7 +369,7 @@ class RolloutWorker:
 
         def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
             state, episode_key = carry
-            observation = self._observe(state)
+            observation, teacher_observation = self._observe(state), self._observe_all(state)
             action, log_probability = self._policy(parameters, observation.astype(jnp.float32), step_key)
             state, transition = self.env.step(state, action, settings)
             kept = self._kept(state, action, transition, settings)
@@ -364,12 +378,15 @@ class RolloutWorker:
                 ended = jnp.any(transition.terminal)
                 carry = jax.lax.cond(ended, renew, lambda x: x[:2], (*carry, transition.terminal))
             row = (observation, action, log_probability, transition.reward, transition.terminal, transition.occupancy)
-            return carry, (*row, kept)
+            return carry, (*row, teacher_observation, kept)
 
-        carry, (*columns, (trace, probed)) = jax.lax.scan(body, carry, jax.random.split(key, steps))
+        carry, (*columns, teacher_observation, (trace, probed)) = jax.lax.scan(
+            body, carry, jax.random.split(key, steps)
+        )
         state, _ = carry
         finished = state.finished, state.has_finished
-        return carry, Rollout(*(*columns, self._observe(state), *finished, trace, probed))
+        last = self._observe(state)
+        return carry, Rollout(*(*columns, last, *finished, trace, probed, teacher_observation))
 
 
 def _on_device(tree: Any) -> Any:
@@ -383,7 +400,7 @@ _split = jax.jit(lambda key: tuple(jax.random.split(key)))
 
 def _traced(state: EnvState, action: Array, transition: Transition, task: TaskConfig, where: int | slice) -> Trace:
     """What is kept of a step of one environment, or of several."""
-    scene, features = state.scene
+    scene, features, *_ = state.scene
     force = jnp.sum(jnp.where(scene.contact_found[where][..., None], scene.contact_force[where], 0.0), -2)
     errors = [
         a[where] / jnp.maximum(b[where], 1.0) for a, b in (transition.errors[s.name] for s in metrics.specs(task))

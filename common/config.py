@@ -80,6 +80,25 @@ class ControlConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class SensingConfig:
+    """The tracker that shows the object's pose (`common.task.sensing`): ranges, uniform at every reset.
+
+    With zeros, the default, it shows the true pose with every control step.
+    """
+
+    period: tuple[float, float] = (0.0, 0.0)
+    """Seconds between two samples: 0.033 at 30 Hz. Up to a control step: one with each."""
+    delay: tuple[float, float] = (0.0, 0.0)
+    """Seconds between a sample and its arrival, to the nearest control step; at most 1."""
+    position_noise: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of each coordinate of a sample, m."""
+    rotation_noise: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of a sample's turn about each axis, rad."""
+    dropout: tuple[float, float] = (0.0, 0.0)
+    """Probability that a sample never arrives."""
+
+
+@dataclasses.dataclass(frozen=True)
 class TaskConfig(_Shares):
     """The task: hand, timing, observation, control, reward and constraint sampling."""
 
@@ -133,12 +152,27 @@ class TaskConfig(_Shares):
     """Factors of the object's mass, uniform at every reset."""
     friction_range: tuple[float, float] = (1.0, 1.0)
     """Sliding friction between the hand and the object, uniform at every reset."""
+    gain_range: tuple[float, float] = (1.0, 1.0)
+    """Factors of the finger servos' gains, uniform at every reset."""
+    observation: Literal["full", "tracked"] = "full"
+    """What the policy sees: all of the simulator, or what a robot has (`common.task.sensing`): joint angles and
+    targets, the wrist, and the object's pose from a tracker; no forces and no velocities, but the last `history`
+    steps."""
+    history: int = 8
+    """Control steps that a tracked observation shows, the present one among them: 2 to 64."""
+    sensing: SensingConfig = SensingConfig()
+    """The tracker. A policy that sees all gets the object's pose from it, too, where it is not perfect."""
     drop_height: float = 0.05
     """The object has fallen when it is this far (m) below its height at the table's removal."""
     control: ControlConfig = ControlConfig()
     """How actions become joint targets."""
     reward: RewardWeights = RewardWeights()
     """The reward's weights."""
+
+    @property
+    def sensed(self) -> bool:
+        """Whether the policy sees anything else than the true state of the simulation."""
+        return self.observation == "tracked" or self.sensing != SensingConfig()
 
 
 Split = Literal["all", "training", "held-out"]
@@ -234,6 +268,22 @@ class PPOConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class DistillConfig:
+    """Distillation of a policy into another one (`learner.algorithms.distill`)."""
+
+    teacher: str = ""
+    """The policy that teaches: its file, or the hand of a pretrained one."""
+    epochs: int = 2
+    """Passes over the batch."""
+    minibatches: int = 16
+    """Minibatches in one pass."""
+    learning_rate: float = 1e-3
+    """Adam's rate at the start; it falls linearly to a fiftieth over the run's updates."""
+    max_grad_norm: float = 1.0
+    """Global norm at which gradients are clipped."""
+
+
+@dataclasses.dataclass(frozen=True)
 class CurriculumConfig:
     """The paper's two phases: first stationary objects, then free ones with larger constraint weights."""
 
@@ -311,6 +361,8 @@ class RunConfig:
     """Name of the learner's algorithm."""
     ppo: PPOConfig = PPOConfig()
     """The algorithm's hyperparameters."""
+    distill: DistillConfig = DistillConfig()
+    """Those of distillation."""
 
 
 def to_json(config: Any) -> str:

@@ -25,7 +25,10 @@ _TASK: dict[str, tuple[float, float]] = {
     "hold_steps_max": (1, 10_000),
     "surface_points": (1, SURFACE_POINTS),
     "trajectory_points": (2, 1000),
+    "history": (2, 64),
 }
+_SENSING = {"period": 10.0, "delay": 1.0, "position_noise": 1.0, "rotation_noise": 3.2, "dropout": 1.0}
+"""Upper ends of the ranges of a task's tracker."""
 _LAYERS, _UNITS = 16, 8192
 
 
@@ -36,10 +39,14 @@ def task_faults(task: TaskConfig) -> Iterator[str]:
         value = getattr(task, name)
         if not low <= value <= high:
             yield f"{name} is {value:g}, not {low:g} to {high:g}"
-    for name in ("mass_range", "friction_range"):
+    for name in ("mass_range", "friction_range", "gain_range"):
         low, high = getattr(task, name)
         if not 0 <= low <= high:
             yield f"{name} is {low:g} to {high:g}"
+    for name, most in _SENSING.items():
+        low, high = getattr(task.sensing, name)
+        if not 0 <= low <= high <= most:
+            yield f"{name} is {low:g} to {high:g}, not within 0 and {most:g}"
 
 
 def network_faults(network: NetworkConfig, layout: Sequence[tuple[str, int]], action_size: int) -> Iterator[str]:

@@ -37,6 +37,13 @@ def shorten(vector, length):
     return vector * min(1.0, length / max(np.linalg.norm(vector), 1e-9))
 
 
+def turned(start, end):
+    """Twice the vector part of the rotation from one matrix to another, as a quaternion whose w is positive."""
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, (end @ start.T).ravel())
+    return 2.0 * quaternion[1:] * (1.0 if quaternion[0] >= 0 else -1.0)
+
+
 class Grasp:
     """The scene of the file's hand with a cylinder on the table, and the policy's view of it."""
 
@@ -105,6 +112,7 @@ class Grasp:
         base.pos = self.base_position
         mujoco.mju_mat2Quat(base.quat, turn.ravel())
         self.q_target, self.u_target, self.time = data.qpos[self.fingers].copy(), np.zeros(6), 0
+        self.readings = []  # of the control steps before this one, newest first
         mujoco.mj_forward(model, data)
 
     def guidance(self, center):
@@ -147,6 +155,29 @@ class Grasp:
                 touching[self.links.index(other)] = 1.0
         return force, touching
 
+    def read(self):
+        """What sensors and controller say now: fingers, wrist, the targets of both, and the object's pose."""
+        data = self.data
+        position, matrix = data.xpos[self.object].copy(), data.xmat[self.object].reshape(3, 3).copy()
+        return data.qpos[self.fingers], data.qpos[self.wrist], self.q_target, self.u_target, position, matrix
+
+    def past(self, wrist):
+        """Fields of a policy that looks back instead of seeing forces and velocities, turned to the wrist frame."""
+        q, u, _, _, position, matrix = self.read()
+        steps = self.task.get("history", 2) - 1
+        rows = (self.readings or [self.read()])[:steps]
+        past_q, past_u, q_target, u_target, positions, matrices = map(
+            np.array, zip(*(rows + rows[-1:] * (steps - len(rows))), strict=True)
+        )
+        return {
+            "past q - q": past_q - q,
+            "past u - u": past_u - u,
+            "past q_target - past q": q_target - past_q,
+            "past u_target - past u": u_target - past_u,
+            "past object_position": (positions - position) @ wrist,
+            "past object_rotation": np.array([turned(old, matrix) for old in matrices]) @ wrist,
+        }
+
     def observe(self):
         """(D,) the observation, as the file's "observation" lists it."""
         data, seen, task = self.data, self.seen(), self.task
@@ -156,9 +187,6 @@ class Grasp:
         points = self.points @ local.T + seen["object_position"]
         nearest = np.linalg.norm(seen["keypoints"][:, None] - points, axis=-1).argmin(1)
         now = data.xmat[self.object].reshape(3, 3)
-        turned = np.zeros(4)
-        mujoco.mju_mat2Quat(turned, (now @ self.object_matrix.T).ravel())
-        turned *= 1.0 if turned[0] >= 0 else -1.0
         q, u = data.qpos[self.fingers], data.qpos[self.wrist]
         position = local @ self.heading_position + seen["object_position"]
         fields = {
@@ -174,7 +202,7 @@ class Grasp:
             "object_velocity": data.qvel[self.free : self.free + 3] @ wrist,
             "object_angular_velocity": now @ data.qvel[self.free + 3 : self.free + 6] @ wrist,
             "object_displacement": (data.xpos[self.object] - self.object_position) @ wrist,
-            "object_rotation": 2.0 * turned[1:] @ wrist,
+            "object_rotation": turned(self.object_matrix, now) @ wrist,
             "time": min(self.time / (task["approach_steps"] + task["hold_steps"]), 1.0),
             "table": float(self.time < task["approach_steps"]),
             "center": seen["center"],
@@ -182,6 +210,7 @@ class Grasp:
             "heading_position - center": position - seen["center"],
             "heading_direction": local @ HEADING,
             "object_matrix": local,
+            **self.past(wrist),
         }
         numbers = [np.ravel(fields.get(f["field"], np.zeros(f["size"]))) for f in self.meta["observation"]]
         return np.concatenate(numbers).astype(np.float32)
@@ -200,6 +229,7 @@ class Grasp:
     def step(self):
         """Asks the policy, turns its action into joint targets, and steps the physics."""
         (action,) = self.session.run(["action"], {"observation": self.observe()[None]})
+        self.readings = [self.read(), *self.readings]
         scale = np.array([entry["scale"] for entry in self.meta["action"]])
         motors = self.meta["motors"]
         fingers, wrist = np.split(scale * action[0], [len(motors)])

@@ -33,6 +33,8 @@ class Ranges(NamedTuple):
     """In units of action: targets are clipped long before."""
     episodes: dict[str, tuple[float, float]]
     """Least and largest value of each metric of an episode, by its name on the wire: no others are known."""
+    teacher_observation: np.ndarray = np.zeros(0)
+    """(P,)."""
 
 
 class Admission:
@@ -64,6 +66,8 @@ class Admission:
                 _within(name, array, *ranges.episodes[name])
             elif name in ("observation", "last_observation"):
                 _check_observations(name, array, ranges.observation)
+            elif name == "teacher_observation":
+                _check_observations(name, array, ranges.teacher_observation)
             elif name == "reward":
                 _within(name, array, -ranges.reward, ranges.reward)
             elif name == "action":

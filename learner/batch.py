@@ -8,9 +8,9 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from common.config import RunConfig
-from common.policy.bundle import PolicySpec
+from common.policy.bundle import PolicySpec, full_layout
 from common.task.types import Array
-from common.wire.schema import WORLDS, RolloutForm, Schema
+from common.wire.schema import TAUGHT, WORLDS, RolloutForm, Schema
 from learner.collectives import AXIS
 
 
@@ -22,6 +22,7 @@ def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> Rollout
         sum(size for _, size in spec.layout),
         spec.action_size,
         config.half_observations,
+        0 if TAUGHT.keys().isdisjoint(schema) else sum(size for _, size in full_layout(config.task)),
         schema,
     )
 

@@ -23,6 +23,7 @@ from common.task.features import scene_of
 from common.task.metrics import DIVERGED, FORCES, episode_fields
 from common.task.observation import observe
 from common.task.reward import reward_terms
+from common.task.sensing import Readings
 from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from learner.admission import Ranges
 
@@ -41,7 +42,8 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
     """The ranges of a task under every weight that its curriculum gives the rewards."""
     hand = get_hand(task.hand)
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        found, terms = jax.device_get(jax.jit(functools.partial(_evaluate, hand, task))(*_extremes(hand, task)))
+        evaluate = jax.jit(functools.partial(_evaluate, hand, task))
+        *observed, terms = jax.device_get(evaluate(*_extremes(hand, task)))
     weights = [task.reward, curriculum.reward] if curriculum.ramp[1] > curriculum.ramp[0] else [task.reward]
     most = {
         name: _SLACK * float(np.abs(values).max()) * max(abs(getattr(each, name)) for each in weights)
@@ -59,18 +61,26 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
         if name.startswith("episode/mask_") or name in {f"episode/{flag}" for flag in _FLAGS}
     }
     # Some observations are zero in every state here, and nothing is refused for a rounding error.
-    return Ranges(_SLACK * np.abs(found).max(0) + 1.0, reward, _ACTION, episodes)
+    own, teacher = (_SLACK * np.abs(found).max(0) + 1.0 for found in observed)
+    return Ranges(own, reward, _ACTION, episodes, teacher)
 
 
-def _evaluate(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal) -> tuple[Any, Any]:
-    """Observations (B, D), and the terms (B,) of the reward by name, each under a weight of one."""
-    scene = scene_of(hand, task, state, surface, goal)
+def _evaluate(
+    hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal, readings: Readings
+) -> tuple[Any, Any, Any]:
+    """Observations (B, D), those (B, P) that see all, and the terms (B,) of the reward, each under a weight of one."""
+    full = dataclasses.replace(task, observation="full")
+    scene = scene_of(hand, full, state, surface, goal)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
-    return observe(scene), reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
+    terms = reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
+    return observe(scene._replace(task=task, readings=readings)), observe(scene), terms
 
 
-def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal]:
-    """Random states out to what engines let pass, with random surfaces and goals in which everything is active."""
+def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, Readings]:
+    """Random states out to what engines let pass, with random surfaces and goals in which everything is active.
+
+    The readings before a state are those of other ones.
+    """
     rng = np.random.default_rng(0)
     fingers, contacts = len(hand.joints), (_STATES, len(hand.links), CONTACTS_PER_LINK)
 
@@ -124,4 +134,7 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal]:
                 made[name] = within(*shape, most=0.3) if array.kind == "real" else unit(*shape)
         values[constraint.name] = constraint.goal(**made)
     everything = {block: np.ones(_STATES, bool) for constraint in known(task) for block in constraint.blocks}
-    return jax.tree.map(jnp.asarray, (state, surface, Goal(values, everything)))
+    others = rng.integers(0, _STATES, (_STATES, task.history))
+    others[:, 0] = np.arange(_STATES)
+    readings = Readings(*(getattr(state, name)[others] for name in Readings._fields))
+    return jax.tree.map(jnp.asarray, (state, surface, Goal(values, everything), readings))

@@ -33,7 +33,7 @@ _ENDPOINT_FILE = "endpoint"
 _MAX_VERSION = 1 << 53
 _MAX_CONFIG = 1 << 20
 _MAX_ENDPOINT = 1 << 10
-CHANGEABLE = ("updates", "checkpoint_every", "write_ahead", "collapse_patience", "physics", "ppo")
+CHANGEABLE = ("updates", "checkpoint_every", "write_ahead", "collapse_patience", "physics", "ppo", "distill")
 """Fields of the configuration that a run may go on with other values of; actors that are there do not use them."""
 
 

@@ -23,6 +23,8 @@ class ResetState(NamedTuple):
     """(B,) factor of the object's mass and inertia."""
     friction: Array
     """(B,) sliding friction of the object's geoms."""
+    gain_scale: Array
+    """(B,) factor of both gains of the finger motors' servos; their torque limits stay."""
     base_position: Array
     """(B, 3) initial wrist position: the wrist joints are zero there."""
     base_quaternion: Array

@@ -15,7 +15,7 @@ from mujoco import mjx
 
 from actors.physics.engine import PhysicsState, ResetState, where_environments
 from actors.physics.physics_state import has_diverged, initial_qpos, physics_state
-from actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, addresses
+from actors.physics.scene import GAINS, SENSOR_WIDTH, TABLE_AWAY, addresses
 from actors.physics.slots import Pool
 from common.config import TaskConfig
 from common.errors import CongraspError
@@ -78,7 +78,7 @@ class MjxPhysics:
         self._geoms = np.flatnonzero(pool.model.geom_bodyid == self._where.object_body)
         self._shared = {
             name: jnp.asarray(getattr(pool.model, name), jnp.float32)
-            for name in ("body_pos", "body_quat", "geom_friction")
+            for name in ("body_pos", "body_quat", "geom_friction", *GAINS)
         }
         axes = dict.fromkeys([*self._objects, *self._shared], 0)
         self._axes = jax.tree.map(lambda _: None, self._model).replace(**axes)
@@ -161,6 +161,8 @@ class MjxPhysics:
         leaves["body_pos"] = tiled["body_pos"].at[:, where.base_body].set(reset_state.base_position)
         leaves["body_quat"] = tiled["body_quat"].at[:, where.base_body].set(reset_state.base_quaternion)
         leaves["geom_friction"] = tiled["geom_friction"].at[:, self._geoms, 0].set(reset_state.friction[:, None])
+        for name in GAINS:
+            leaves[name] = tiled[name].at[:, where.motors].multiply(reset_state.gain_scale[:, None, None])
         qpos = initial_qpos(where, self._nq, reset_state)
         data = data.replace(
             qpos=qpos,

@@ -14,7 +14,7 @@ import psutil
 
 from actors.physics.engine import PhysicsState, ResetState
 from actors.physics.physics_state import has_diverged, physics_state
-from actors.physics.scene import TABLE_AWAY, addresses, compile_scene
+from actors.physics.scene import GAINS, TABLE_AWAY, addresses, compile_scene
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands.spec import Hand
@@ -43,7 +43,7 @@ class Scene:
 
 
 class EnvInstance:
-    """One environment: its own model (base pose, mass and friction differ) and data, with views that stay valid."""
+    """One environment: its own model (base pose, mass, friction, gains differ) and data, with views that stay valid."""
 
     def __init__(self, model: mujoco.MjModel):
         """A copy of a scene's model."""
@@ -165,6 +165,8 @@ class NativePhysics:
         model.body_inertia[where.object_body] = scene.model.body_inertia[where.object_body] * reset_state.mass_scale[i]
         geoms = model.geom_bodyid == where.object_body
         model.geom_friction[geoms, 0] = reset_state.friction[i]
+        for name in GAINS:
+            getattr(model, name)[where.motors] = getattr(scene.model, name)[where.motors] * reset_state.gain_scale[i]
         data.qpos[where.finger_qpos] = reset_state.q[i]
         data.qpos[where.object_qpos] = np.concatenate(
             [reset_state.object_position[i], reset_state.object_quaternion[i]]

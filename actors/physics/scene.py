@@ -16,6 +16,8 @@ OBJECT_CONTYPE = 2
 """Collision bit of the object; the table answers to it."""
 TABLE_AWAY = (0.0, 0.0, -1000.0)
 """Where the table is when it is removed: a kilometre down, so that nothing reaches it again."""
+GAINS = ("actuator_gainprm", "actuator_biasprm")
+"""Fields of a model that hold a position servo's gains, and nothing else but zeros."""
 SENSOR_WIDTH = 13
 """Numbers of one contact: found, force (3, contact frame), position (3), normal (3), tangent (3)."""
 _CONTACT_FIELDS = (
@@ -43,6 +45,8 @@ class Addresses:
     table_mocap: int
     anchor_mocap: int
     weld: int
+    motors: np.ndarray
+    """Actuators of the fingers: gainprm[0] * target + biasprm[1] * angle + biasprm[2] * speed is a servo's torque."""
 
 
 def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
@@ -133,4 +137,5 @@ def addresses(model: mujoco.MjModel, hand: Hand) -> Addresses:
         table_mocap=int(model.body("table").mocapid[0]),
         anchor_mocap=int(model.body("anchor").mocapid[0]),
         weld=model.equality("hold").id,
+        motors=np.array([model.actuator(motor.name).id for motor in hand.motors]),
     )

@@ -113,6 +113,7 @@ class WarpPhysics:
             reset_state.object_index,
             reset_state.mass_scale,
             reset_state.friction,
+            reset_state.gain_scale,
             reset_state.base_position,
             reset_state.base_quaternion,
             reset_state.object_position,

@@ -65,6 +65,11 @@ class WarpBuffers:
             for name in DATA_LEAVES:
                 setattr(leaves, name, getattr(self._data, name))
             leaves.geoms = wp.array(geoms, dtype=int)
+            leaves.motors = wp.array(where.motors, dtype=int)
+            leaves.gains = wp.array(
+                np.stack([model.actuator_gainprm[where.motors, 0], *model.actuator_biasprm[where.motors, 1:3].T], -1),
+                dtype=wp.vec3,
+            )
         wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
         leaves.object_body, leaves.object_dof = where.object_body, where.object_qvel[0]
         leaves.base_body, leaves.table, leaves.anchor = where.base_body, where.table_mocap, where.anchor_mocap
@@ -174,6 +179,7 @@ def _control_step(
     row: wp.array[int],
     mass_scale: wp.array[float],
     friction: wp.array[float],
+    gain_scale: wp.array[float],
     base_position: wp.array[wp.vec3],
     base_quaternion: wp.array[wp.quat],
     anchor_position: wp.array[wp.vec3],
@@ -183,7 +189,7 @@ def _control_step(
     occupancy: wp.array[int],
 ) -> None:
     """What JAX calls: finds the buffers by their handle and steps them; arrays as in `WarpPhysics.step`."""
-    placed = [table, force, row, mass_scale, friction, base_position, base_quaternion]
+    placed = [table, force, row, mass_scale, friction, gain_scale, base_position, base_quaternion]
     placed += [anchor_position, anchor_quaternion, stationary]
     _buffers[handle].control_step(qpos, qvel, qacc_warmstart, ctrl, placed, sensordata, occupancy)
 

@@ -4,6 +4,7 @@
 # (Kernels are a language of their own in Python's syntax, which Warp's compiler checks.)
 
 import warp as wp
+from mujoco.mjx.third_party.mujoco_warp._src.types import vec10f
 
 
 @wp.struct
@@ -47,7 +48,11 @@ class Leaves:
     mocap_quat: wp.array2d[wp.quat]
     eq_active: wp.array2d[bool]
     xfrc_applied: wp.array2d[wp.spatial_vector]
+    actuator_gainprm: wp.array2d[vec10f]
+    actuator_biasprm: wp.array2d[vec10f]
     geoms: wp.array[int]
+    motors: wp.array[int]
+    gains: wp.array[wp.vec3]
     object_body: int
     object_dof: int
     base_body: int
@@ -59,7 +64,7 @@ class Leaves:
 
 OBJECT_FIELDS = {name: field.type.dtype for name, field in Objects.vars.items()}
 """Fields of `Objects` and the types of their elements."""
-MODEL_LEAVES = [name for name in Leaves.vars if name.startswith(("geom_", "body_", "dof_"))]
+MODEL_LEAVES = [name for name in Leaves.vars if name.startswith(("geom_", "body_", "dof_", "actuator_"))]
 DATA_LEAVES = [name for name in Leaves.vars if name.startswith(("mocap_", "eq_", "xfrc_"))]
 
 
@@ -70,6 +75,7 @@ def place(
     row: wp.array[int],
     mass_scale: wp.array[float],
     friction: wp.array[float],
+    gain_scale: wp.array[float],
     base_position: wp.array[wp.vec3],
     base_quaternion: wp.array[wp.quat],
     anchor_position: wp.array[wp.vec3],
@@ -103,6 +109,16 @@ def place(
     leaves.body_invweight0[env, body] = objects.body_invweight0[r]
     for i in range(6):
         leaves.dof_invweight0[env, leaves.object_dof + i] = objects.dof_invweight0[r, i]
+    for i in range(leaves.motors.shape[0]):
+        motor = leaves.motors[i]
+        gains = gain_scale[env] * leaves.gains[i]
+        gain = leaves.actuator_gainprm[env, motor]
+        bias = leaves.actuator_biasprm[env, motor]
+        gain[0] = gains[0]
+        bias[1] = gains[1]
+        bias[2] = gains[2]
+        leaves.actuator_gainprm[env, motor] = gain
+        leaves.actuator_biasprm[env, motor] = bias
     leaves.body_pos[env, leaves.base_body] = base_position[env]
     leaves.body_quat[env, leaves.base_body] = base_quaternion[env]
     leaves.mocap_pos[env, leaves.anchor] = anchor_position[env]

@@ -77,6 +77,11 @@ def policy_spec(task: TaskConfig, sizes: NetworkConfig) -> PolicySpec:
     return PolicySpec(hand.reference, task_observation.layout(hand, task), len(hand.motors) + 6, sizes)
 
 
+def full_layout(task: TaskConfig) -> Layout:
+    """The layout of a policy's observation that sees all of the task, whatever this one's sees."""
+    return task_observation.layout(get_hand(task.hand), dataclasses.replace(task, observation="full"))
+
+
 class InferenceParameters(NamedTuple):
     """The part of a bundle that inference needs; the first argument of `mean_action` and `sample_action`."""
 

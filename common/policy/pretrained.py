@@ -1,5 +1,6 @@
 """Trained policies by their hands: those that come with the package, and the user's own beside the own hands' files."""
 
+import os
 import pathlib
 
 from common.errors import CongraspError
@@ -23,6 +24,17 @@ def pretrained_file(hand: str) -> pathlib.Path | None:
 def own_policy_file(name: str) -> pathlib.Path:
     """Where the user's own policy for the hand of this name is, or would be."""
     return hands_folder() / f"{name}{SUFFIX}"
+
+
+def named_policy(name: str | os.PathLike[str]) -> pathlib.Path:
+    """The policy file of this path, or the pretrained one of the hand of this name.
+
+    Raises:
+      CongraspError: there is no such hand, or no policy for it.
+    """
+    path = pathlib.Path(name)
+    by_hand = str(name) in HANDS or not (path.suffix or path.exists())
+    return policy_file(None, str(name)) if by_hand else path
 
 
 def reference_file(hand: str) -> pathlib.Path | None:

@@ -14,6 +14,7 @@ from common.hands.spec import Hand
 from common.task.constraints import known
 from common.task.constraints.base import Scene
 from common.task.geometry import nearest_index, squared_distances, wrist_pose
+from common.task.sensing import Readings
 from common.task.types import Array, Goal, SceneState, Surface
 
 
@@ -103,6 +104,8 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
     return common._replace(of={c.name: c.features(hand, made, common, goal) for c in known(task)})
 
 
-def scene_of(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal) -> Scene:
+def scene_of(
+    hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal, readings: Readings | None = None
+) -> Scene:
     """One control step as constraints see it."""
-    return Scene(hand, task, state, features(hand, task, state, surface, goal), goal)
+    return Scene(hand, task, state, features(hand, task, state, surface, goal), goal, readings)

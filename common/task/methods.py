@@ -13,6 +13,8 @@ from common.config import CurriculumConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
+STUDENT = "student"
+"""The method of policies that see what a robot has; `congrasp train --teacher` distils them."""
 STATIONARY_SHARE = 0.6
 """Of the updates of two phases, those with stationary objects: the paper's 15 of 25 hours."""
 
@@ -81,6 +83,10 @@ METHODS = {
     "single-stage": Method(
         "free objects and the last weights from the start, no ramp",
         schedule=_single_stage,
+    ),
+    STUDENT: Method(
+        "no privileges: joints, wrist and a tracker's object poses over some steps, no forces and no velocities",
+        task={"observation": "tracked"},
     ),
 }
 

@@ -1,5 +1,8 @@
 """The observation: state and constraint features relative to the hand (paper, section Observation Space)."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 
 from common import rotations
@@ -8,6 +11,7 @@ from common.hands.spec import Hand
 from common.task.constraints import blocks, known
 from common.task.constraints.base import ObservationField, Scene
 from common.task.geometry import flat, squash
+from common.task.sensing import Readings
 from common.task.types import Array
 
 
@@ -17,30 +21,13 @@ def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
 
 
 def fields(hand: Hand, task: TaskConfig) -> dict[str, tuple[ObservationField, ...]]:
-    """What every block holds, in order."""
-    f, n, p = len(hand.joints), len(hand.links), len(hand.keypoints)
-    state = (
-        ("q", f, "rad, finger joints in the order of 'joints'"),
-        ("u", 6, "m and rad, wrist joints in the order of 'wrist_joints', from the wrist's pose at the start"),
-        ("q_target - q", f, "rad, by what the last action's finger targets are ahead"),
-        ("u_target - u", 6, "m and rad, the same for the wrist"),
-        ("q_velocity", f, "rad/s"),
-        ("u_velocity", 6, "m/s and rad/s"),
-        ("touching", n, "1 where a link, in the order of 'links', touches the object, else 0"),
-        ("force", 3 * n, "f / (|f| + force_scale) of the object's net force f on each link, N, wrist frame"),
-        ("nearest", 3 * p, "m, from each keypoint to the nearest surface point, wrist frame"),
-        ("object_velocity", 3, "m/s of the centre of mass, wrist frame"),
-        ("object_angular_velocity", 3, "rad/s, wrist frame"),
-        ("object_displacement", 3, "m since the start, wrist frame"),
-        ("object_rotation", 3, "twice the vector part of the rotation since the start (w >= 0), wrist frame"),
-        ("time", 1, "control steps over (approach_steps + hold_steps), at most 1"),
-        ("table", 1, "1 while the table is there"),
-    )
+    """What every block holds, in order; those fields that the task's policy sees."""
     mask = "1 for each active constraint in the order of 'masks'; else its block is zero"
+    past = _past_fields(hand, task) if task.observation == "tracked" else ()
     return {
-        "state": tuple(ObservationField(*field) for field in state),
+        "state": (*(field for field in _state_fields(hand) if _is_seen(task, field)), *past),
         **{
-            block: content
+            block: tuple(field for field in content if _is_seen(task, field))
             for constraint in known(task)
             for block, content in zip(
                 constraint.blocks or (constraint.name,), constraint.fields(hand, task), strict=True
@@ -50,14 +37,78 @@ def fields(hand: Hand, task: TaskConfig) -> dict[str, tuple[ObservationField, ..
     }
 
 
+def _is_seen(task: TaskConfig, field: ObservationField) -> bool:
+    """Whether a field is part of the task's observation."""
+    return task.observation == "full" or not field.privileged
+
+
+def _state_fields(hand: Hand) -> tuple[ObservationField, ...]:
+    """The state of hand and object in the present control step."""
+    f, n, p = len(hand.joints), len(hand.links), len(hand.keypoints)
+    state: tuple[tuple[Any, ...], ...] = (
+        ("q", f, "rad, finger joints in the order of 'joints'"),
+        ("u", 6, "m and rad, wrist joints in the order of 'wrist_joints', from the wrist's pose at the start"),
+        ("q_target - q", f, "rad, by what the last action's finger targets are ahead"),
+        ("u_target - u", 6, "m and rad, the same for the wrist"),
+        ("q_velocity", f, "rad/s", True),
+        ("u_velocity", 6, "m/s and rad/s", True),
+        ("touching", n, "1 where a link, in the order of 'links', touches the object, else 0", True),
+        ("force", 3 * n, "f / (|f| + force_scale) of the object's net force f on each link, N, wrist frame", True),
+        ("nearest", 3 * p, "m, from each keypoint to the nearest surface point, wrist frame"),
+        ("object_velocity", 3, "m/s of the centre of mass, wrist frame", True),
+        ("object_angular_velocity", 3, "rad/s, wrist frame", True),
+        ("object_displacement", 3, "m since the start, wrist frame"),
+        ("object_rotation", 3, "twice the vector part of the rotation since the start (w >= 0), wrist frame"),
+        ("time", 1, "control steps over (approach_steps + hold_steps), at most 1"),
+        ("table", 1, "1 while the table is there"),
+    )
+    return tuple(ObservationField(*field) for field in state)
+
+
+def _past_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
+    """What a tracked observation holds of the control steps before the present one."""
+    f, past = len(hand.joints), task.history - 1
+    order = f"of each of the last {past} control steps, newest first"
+    return (
+        ObservationField("past q - q", past * f, f"rad, {order}, less the present angles"),
+        ObservationField("past u - u", past * 6, f"m and rad, {order}, less the present wrist joints"),
+        ObservationField("past q_target - past q", past * f, f"rad, {order}"),
+        ObservationField("past u_target - past u", past * 6, f"m and rad, {order}"),
+        ObservationField("past object_position", past * 3, f"m, {order}, less the present one, present wrist frame"),
+        ObservationField(
+            "past object_rotation", past * 3, f"{order}: twice the vector part of the rotation since then (w >= 0)"
+        ),
+    )
+
+
+def _past(scene: Scene) -> list[Array]:
+    """The arrays (B, ...) of `_past_fields`."""
+    assert scene.readings is not None, "a tracked observation is of readings"
+    now = Readings(*(field[:, :1] for field in scene.readings))
+    past = Readings(*(field[:, 1:] for field in scene.readings))
+    to_wrist = rotations.conjugate(scene.features.wrist_quaternion)[:, None]
+    return [
+        flat(past.q - now.q),
+        flat(past.u - now.u),
+        flat(past.q_target - past.q),
+        flat(past.u_target - past.u),
+        flat(rotations.rotate(to_wrist, past.object_position - now.object_position)),
+        flat(rotations.rotate(to_wrist, _turn(past.object_quaternion, now.object_quaternion))),
+    ]
+
+
+def _turn(start: Array, end: Array) -> Array:
+    """Twice the vector part (..., 3) of the rotation from one quaternion to another, whose w is positive."""
+    turned = rotations.multiply(end, rotations.conjugate(start))
+    return 2.0 * turned[..., 1:] * jnp.where(turned[..., :1] < 0, -1.0, 1.0)
+
+
 def observe(scene: Scene) -> Array:
     """(B, D) observation, laid out as `fields` says; blocks of inactive constraints are zero."""
-    task, state, features = scene.task, scene.state, scene.features
+    hand, task, state, features = scene.hand, scene.task, scene.state, scene.features
     to_wrist = rotations.conjugate(features.wrist_quaternion)
-    turned = rotations.multiply(state.object_quaternion, rotations.conjugate(state.object_quaternion_initial))
-    turned = turned * jnp.where(turned[..., :1] < 0, -1.0, 1.0)
     horizon = task.approach_steps + task.hold_steps
-    parts = [
+    values = [
         state.q,
         state.u,
         state.q_target - state.q,
@@ -70,11 +121,16 @@ def observe(scene: Scene) -> Array:
         rotations.rotate(to_wrist, state.object_velocity),
         rotations.rotate(to_wrist, state.object_angular_velocity),
         rotations.rotate(to_wrist, state.object_position - state.object_position_initial),
-        rotations.rotate(to_wrist, 2.0 * turned[..., 1:]),
-        jnp.stack([jnp.minimum(state.time / horizon, 1.0), state.table.astype(jnp.float32)], -1),
+        rotations.rotate(to_wrist, _turn(state.object_quaternion_initial, state.object_quaternion)),
+        jnp.minimum(state.time / horizon, 1.0)[:, None],
+        state.table.astype(jnp.float32)[:, None],
     ]
+    parts = _seen(task, values, _state_fields(hand))
+    if task.observation == "tracked":
+        parts += _past(scene)
     for constraint in known(task):
-        observed = constraint.observe(scene)
+        described = constraint.fields(hand, task)
+        observed = [_seen(task, *block) for block in zip(constraint.observe(scene), described, strict=True)]
         if not constraint.optional:
             parts += observed[0]
             continue
@@ -82,3 +138,8 @@ def observe(scene: Scene) -> Array:
             parts.append(jnp.where(scene.goal.active[block][:, None], jnp.concatenate(values, -1), 0.0))
     mask = [scene.gate(block) for block in blocks(task)]
     return jnp.concatenate([*parts, *([jnp.stack(mask, -1)] if mask else [])], -1)
+
+
+def _seen(task: TaskConfig, values: Sequence[Array], content: Sequence[ObservationField]) -> list[Array]:
+    """Of the values (B, ...) of fields those that are part of the task's observation."""
+    return [value for value, field in zip(values, content, strict=True) if _is_seen(task, field)]

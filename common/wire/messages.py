@@ -13,7 +13,7 @@ import numpy as np
 from common.errors import CongraspError
 from common.transport.keys import check_name
 from common.wire.codec import Message
-from common.wire.schema import F32, RECORDED, ArraySpec, RolloutForm
+from common.wire.schema import F32, RECORDABLE, ArraySpec, RolloutForm
 
 LONGEST_TEXT = 4096
 """Characters of a text in the meta data; a hand's own text has its own limit (`common.hands.files`)."""
@@ -41,7 +41,7 @@ _EPISODES = {"episode/*": ArraySpec(F32, ("E",)), "term/*": ArraySpec(F32, ("E",
 
 ROLLOUT = MessageSpec(
     "rollout",
-    {**RECORDED, **_EPISODES},
+    {**RECORDABLE, **_EPISODES},
     {
         "actor": str,
         "incarnation": str,

@@ -1,6 +1,6 @@
 """The arrays of a rollout: names, dtypes and shapes in symbols, spelled once for everyone who makes or takes them.
 
-Actors record `RECORDED`; the learner's algorithm names those that it learns from, and the learner tells its actors.
+Actors can record `RECORDABLE`; the learner's algorithm names those that it learns from, and the learner tells them.
 From these specs and a run's sizes (`RolloutForm`) follow what is sent, what is admitted, what a batch looks like, and
 along which axis it is divided among ranks.
 """
@@ -33,7 +33,8 @@ class ArraySpec:
 
 
 Schema = Mapping[str, ArraySpec]
-"""Arrays by name; their shapes are made of T control steps, B worlds, D observation and A action sizes."""
+"""Arrays by name; their shapes are made of T control steps, B worlds, D observation and A action sizes, and P of the
+observation of a policy that sees all."""
 
 F32 = ("float32",)
 _OBSERVATION = ("float16", "float32")
@@ -46,7 +47,11 @@ RECORDED: Schema = {
     "terminal": ArraySpec(("bool",), ("T", "B")),
     "last_observation": ArraySpec(_OBSERVATION, ("B", "D")),
 }
-"""What actors can record of a rollout (`actors.rollout.Rollout`)."""
+"""What actors record of any rollout (`actors.rollout.Rollout`)."""
+TAUGHT: Schema = {"teacher_observation": ArraySpec(_OBSERVATION, ("T", "B", "P"))}
+"""What they record beside it where a teacher is to say what it would have done: what a policy sees that sees all."""
+RECORDABLE: Schema = {**RECORDED, **TAUGHT}
+"""Both."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,13 +68,15 @@ class RolloutForm:
     """A."""
     half: bool
     """Observations are float16, or else float32."""
+    teacher: int = 0
+    """P."""
     arrays: Schema = dataclasses.field(default_factory=lambda: RECORDED)
     """The arrays that the run's algorithm learns from."""
 
     @property
     def sizes(self) -> dict[str, int]:
         """Values of the symbols."""
-        return {"T": self.steps, WORLDS: self.worlds, "D": self.observation, "A": self.action}
+        return {"T": self.steps, WORLDS: self.worlds, "D": self.observation, "A": self.action, "P": self.teacher}
 
     @property
     def specs(self) -> dict[str, ArraySpec]:

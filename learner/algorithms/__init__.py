@@ -5,11 +5,13 @@ from collections.abc import Callable
 from common.config import RunConfig
 from common.errors import CongraspError
 from common.policy.bundle import PolicySpec
+from learner.algorithms.distill import Distillation
 from learner.algorithms.ppo import PPO
 from learner.algorithms.protocol import Algorithm
 
 ALGORITHMS: dict[str, Callable[[PolicySpec, RunConfig], Algorithm]] = {
     "ppo": lambda spec, config: PPO(spec, config.ppo),
+    "distill": Distillation,
 }
 """Factories by name: of the policy's spec and the run's configuration."""
 

@@ -58,7 +58,7 @@ class Algorithm(Protocol):
 
     @property
     def batch_schema(self) -> Schema:
-        """The arrays of a rollout that it learns from, some of `common.wire.schema.RECORDED`.
+        """The arrays of a rollout that it learns from, some of `common.wire.schema.RECORDABLE`.
 
         From them follow what actors send, what the hub admits, warm-up batches, and how a batch is divided among ranks.
         """

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from services.evaluate.lineup import Entrant, Lineup
     from services.evaluate.tables import Found
 
-Table = Literal["single", "composed", "cross", "hands", "ablation", "objects", "noise", "all"]
+Table = Literal["single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "all"]
 _PICTURED = 4
 
 
@@ -56,7 +56,9 @@ def evaluate(
         single constraints for all hands with a pretrained policy, or those of --policy; ablation: for the full system
         and what it is without one of its parts, where --policy names policies of them; objects: the heading alone on
         any number of objects, by size, mass and family; noise: poses and trajectories with errors, as captured ones
-        have; all: every table of one policy. Several may be named.
+        have; sensing: the heading alone with a tracker's object poses, by their noise, delay, rate and losses, by
+        friction and by errors of gains, a student beside the pretrained policy; all: every table of one policy.
+        Several may be named.
       objects: Objects to grasp: a folder as 'congrasp objects import' takes it, or one that it made. By default
         procedural objects of seeds that training never uses.
       constraints: Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import'; its
@@ -71,7 +73,7 @@ def evaluate(
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
       hand: Whose pretrained policy.
       method: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center,
-        no-feedforward, two-phase or single-stage. A policy of another is refused; by default the policy says.
+        no-feedforward, two-phase, single-stage or student. A policy of another is refused; by default the policy says.
       by: object: also print the rates of each object; --json always has them.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.

@@ -28,6 +28,7 @@ def learner(
     certs: pathlib.Path | None = None,
     insecure: bool = False,
     initial: pathlib.Path | None = None,
+    teacher: str | None = None,
     resume: bool = False,
     or_resume: bool = False,
     rank: int = 0,
@@ -51,6 +52,7 @@ def learner(
       certs: Folder of a learner's certificate (congrasp certs): mutual TLS, and each role may do only what is its own.
       insecure: Listen beyond loopback without certificates.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
+      teacher: A policy file, or the hand of a pretrained policy, to distil, as for `congrasp train`; ranks read it.
       resume: Resume the run in --run-dir from its newest intact checkpoint; a run that has not come to one
         begins anew.
       or_resume: Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command

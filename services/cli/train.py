@@ -13,6 +13,7 @@ from common.inputs import file_name
 from common.task.methods import with_method
 from learner.run_directory import CONFIG_FILE, open_run
 from services.train.presets import get_preset, with_hand
+from services.train.student import student_of
 
 
 def train(
@@ -24,6 +25,7 @@ def train(
     actors: int | None = None,
     ranks: int = 1,
     initial: pathlib.Path | None = None,
+    teacher: str | None = None,
     constraints: pathlib.Path | None = None,
     split: Split | None = None,
     resume: bool = False,
@@ -42,8 +44,9 @@ def train(
     Args:
       config: The run.
       preset: Named configuration to start from: quickstart, full, human, allegro or sharpa.
-      method: What of it is trained: ours, or a baseline or ablation of the paper (graspxl, dgrasp, no-dynamic-center,
-        no-feedforward, two-phase, single-stage), whose settings then hold. By default the preset's, ours.
+      method: What of it is trained: ours, a baseline or ablation of the paper (graspxl, dgrasp, no-dynamic-center,
+        no-feedforward, two-phase, single-stage), or what a robot can use (student), whose settings then hold. By
+        default the preset's, ours.
       hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by default the
         preset's.
       run_dir: Where the run is kept; runs/NAME-DATE by default.
@@ -52,6 +55,9 @@ def train(
       ranks: Learners that train together, data parallel; each has a GPU of its own where there are GPUs, and --actors
         actors. The batch grows with them.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
+      teacher: A policy file, or the hand of a pretrained policy, to distil into a policy for robots, which sees the
+        joints, the wrist and a tracker's object poses, no forces and no velocities (docs/robots.md). The task is the
+        teacher's, the algorithm `distill`.
       constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp constraints import'); their
         objects are those of --objects.folder, and --objects.procedural puts others beside them.
       split: Of these sets the part for training (the default), what is held out, or all.
@@ -97,7 +103,8 @@ def train(
 
 
 def defaults(arguments: list[str]) -> dict[str, Any]:
-    """What a command line decides about the other options' defaults: the preset, and the configuration that it names.
+    """What a command line decides about the other options' defaults: the preset, and the configuration that it names
+    together with hand and teacher.
 
     With --resume the configuration is the run's own.
     """
@@ -105,7 +112,10 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
     run_dir = _value("--run-dir", arguments)
     if {"--resume", "--or-resume"} & set(arguments) and run_dir and (pathlib.Path(run_dir) / CONFIG_FILE).exists():
         return {"preset": preset, "config": open_run(pathlib.Path(run_dir))}
-    return {"preset": preset, "config": get_preset(preset, _value("--hand", arguments) or None)}
+    config = get_preset(preset, _value("--hand", arguments) or None)
+    if teacher := _value("--teacher", arguments):
+        config = student_of(config, teacher)
+    return {"preset": preset, "config": config}
 
 
 def _value(option: str, arguments: list[str]) -> str:

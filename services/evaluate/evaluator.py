@@ -20,7 +20,7 @@ from common.objects.spec import GraspObject
 from common.policy.bundle import PolicyBundle
 from common.task.bank import ConstraintBank
 from common.wire.codec import Message
-from services.evaluate import references
+from services.evaluate import references, sensing
 from services.evaluate.episodes import Batch, Episodes
 from services.evaluate.noise import LEVELS, Noise, with_noise
 from services.evaluate.plan import RowPlan, batches, from_references, plan_row
@@ -183,6 +183,25 @@ class Evaluator:
                     rows.append(self.row(constraint, self._run(running, "", plan, noisy, advance), noise.label))
         return rows
 
+    def rows_under_sensing(self, progress: Callable[[int], None], episodes: int) -> list[Row]:
+        """A row for each of `services.evaluate.sensing.LEVELS`; see there. All of them have the same episodes.
+
+        Args:
+          progress: is told how many episodes of all rows there are.
+          episodes: for each row, at least.
+        """
+        rows: list[Row] = []
+        task, plan = sensing.sensing_task(self.task), self.plan(sensing.CONSTRAINT, episodes)
+        bank = self.bank_for(sensing.CONSTRAINT)
+        with self._episodes(episodes, task=task) as running:
+            for level in sensing.LEVELS:
+                drawn = batches(self._hand, task, bank, plan, self._seed, running.batch)
+                conditions = ((sensing.at_level(begun, level, task.control_dt), count) for begun, count in drawn)
+                advance = functools.partial(lambda done, n: progress(done + n), sum(row.episodes for row in rows))
+                sample = simulate(running, conditions, plan.total, advance)
+                rows.append(self.row(sensing.CONSTRAINT, sample, level.label))
+        return rows
+
     def noisy_example(self, noise: Noise) -> Message | None:
         """An episode under a noisy reference in which the object is held to the end, if there is one."""
         plan = self.plan(noise.constraint, self._batch)
@@ -253,13 +272,13 @@ class Evaluator:
                     break
             return batch.message(0)
 
-    def _episodes(self, episodes: int, traced: bool = False) -> Episodes:
+    def _episodes(self, episodes: int, traced: bool = False, task: TaskConfig | None = None) -> Episodes:
         """What simulates rows of so many episodes; its batch depends on nothing else, so that rows do not either."""
         if self._field is None and len(self.objects) <= MEASURED:
             self._field = distance_field(self.objects)
         return Episodes(
             self.bundle,
-            self.task,
+            task or self.task,
             self.objects,
             hold=self._hold,
             batch=batch_of(max(episodes, len(self.objects)), self._batch),  # rows have an episode of every object

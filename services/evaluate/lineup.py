@@ -9,9 +9,9 @@ from common.errors import CongraspError
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
 from common.policy.pretrained import policy_file, pretrained_hands
-from common.task.methods import evaluated_as
+from common.task.methods import STUDENT, evaluated_as
 
-Table = Literal["single", "composed", "cross", "hands", "ablation", "objects", "noise", "all"]
+Table = Literal["single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "all"]
 ABLATION = ("ours", "no-dynamic-center", "no-feedforward", "single-stage", "two-phase")
 """Methods of the table `ablation`."""
 _POLICY = "policy.safetensors"
@@ -96,7 +96,8 @@ def line_up(tables: Sequence[Table], given: Sequence[Entrant], hand: str, method
 
     `hands` compares full systems: those given, or else the pretrained ones. `ablation` compares the methods of
     `ABLATION` for the hand of the first policy; where none is given for the full system the pretrained one stands in.
-    Every other table is of each policy given, or else of the pretrained one of a hand.
+    `sensing` has beside a student the full system, likewise. Every other table is of each policy given, or else of the
+    pretrained one of a hand.
 
     Args:
       tables: what is wanted.
@@ -116,12 +117,15 @@ def line_up(tables: Sequence[Table], given: Sequence[Entrant], hand: str, method
         if table == "hands" and not given:
             for name in pretrained_hands():
                 known.setdefault((name, "ours"), read_entrant(policy_file(None, name)))
-        if table == "ablation" and (own, "ours") not in known and own in pretrained_hands():
+        taught = table == "sensing" and any(one.method == STUDENT for one in first)
+        if (taught or table == "ablation") and (own, "ours") not in known and own in pretrained_hands():
             known[own, "ours"] = read_entrant(policy_file(None, own))
         chosen = {
             "hands": [key for key in known if key[1] == "ours"],
             "ablation": [(own, name) for name in ABLATION],
         }.get(table, [(one.hand, one.method) for one in first])
+        if taught and (own, "ours") in known:
+            chosen = list(dict.fromkeys([(own, "ours"), *chosen]))
         for key in chosen:
             if key in known:
                 tables_of.setdefault(key, []).append("single" if table in ("hands", "ablation") else table)

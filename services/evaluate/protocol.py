@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 
-from common.config import TaskConfig
+from common.config import SensingConfig, TaskConfig
 from common.hands import get_hand
 from common.objects.mjcf import CONTACT
 from common.objects.pool import object_scale
@@ -21,7 +21,8 @@ def two_seconds(task: TaskConfig) -> int:
 
 
 def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) -> TaskConfig:
-    """The task with `hold` control steps without the table, and objects of their own mass and of one sliding friction.
+    """The task with `hold` control steps without the table, objects of their own mass and of one sliding friction,
+    nominal gains, and a perfect tracker.
 
     So rates compare between policies, whatever ranges they were trained with.
     """
@@ -32,6 +33,8 @@ def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) ->
         end_when_fallen=False,
         mass_range=(1.0, 1.0),
         friction_range=(friction, friction),
+        gain_range=(1.0, 1.0),
+        sensing=SensingConfig(),
     )
 
 

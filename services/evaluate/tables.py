@@ -17,6 +17,7 @@ from common.policy.bundle import PolicyBundle
 from common.task.bank import ConstraintBank
 from common.task.constraint_sets import bank_of, load_for
 from common.task.methods import takes
+from services.evaluate import sensing
 from services.evaluate.evaluator import Evaluator
 from services.evaluate.noise import LEVELS
 from services.evaluate.paper import CAPTURED_SETS
@@ -30,6 +31,7 @@ POOL = 64
 """Procedural objects of rows."""
 MANY = 50_000
 """Most procedural objects of the table `objects`, where their number is not given."""
+_OTHERS = {"noise", "sensing", "objects"}  # tables whose rows are no constraints
 Track = Callable[[str, int | None], Callable[[int], None]]
 """(what is done, its total if known) -> what to call with the amount done."""
 
@@ -70,7 +72,7 @@ class Found(NamedTuple):
     left_out: list[CongraspError]
     """Why others were not."""
     noisy: list[Row]
-    """Rows under noise."""
+    """Rows under noise of references."""
     rows: list[Row]
     """All rows."""
     references: str
@@ -84,7 +86,7 @@ def evaluate_tables(
 
     Args:
       policy: as the method that its task names.
-      tables: keys of `TABLES`, `objects`, `noise`, or `all` for all of these.
+      tables: keys of `TABLES`, `objects`, `noise`, `sensing`, or `all` for all of these.
       setup: objects, engine and numbers.
       track: shows progress.
       keep: keep episodes for `Evaluator.examples`.
@@ -92,19 +94,20 @@ def evaluate_tables(
     Raises:
       CongraspError: the policy's method has no row in these tables, or no object allows one.
     """
-    method, wanted = policy.task.method, {*TABLES, "noise", "objects"} if "all" in tables else set(tables)
+    method, wanted = policy.task.method, {*TABLES, *_OTHERS} if "all" in tables else set(tables)
     names = [name for name in known_rows((key for key in TABLES if key in wanted), policy.task) if takes(method, name)]
     if not takes(method, "heading"):
-        wanted -= {"objects"}
-    if not names and not wanted & {"noise", "objects"}:
+        wanted -= {"objects", "sensing"}
+    if not names and not wanted & _OTHERS:
         raise CongraspError(f"The method '{method}' has no row in these tables.", "Name another --table.")
     rows: list[Row] = []
     noisy: list[Row] = []
+    sensed: list[Row] = []
     many: list[Row] = []
     left_out: list[CongraspError] = []
     evaluator: Evaluator | None = None
     source = ""
-    if names or "noise" in wanted:
+    if names or wanted & {"noise", "sensing"}:
         evaluator = _evaluator(policy, setup, track)
         if "noise" in wanted or any(from_references(name) for name in names):
             source = _references(evaluator, track)
@@ -115,9 +118,12 @@ def evaluate_tables(
         if "noise" in wanted:
             advance = track("Episodes under noise", len(LEVELS) * setup.episodes)
             noisy = evaluator.rows_under_noise(advance, setup.episodes)
+        if "sensing" in wanted:
+            advance = track("Episodes with a robot's sensors", len(sensing.LEVELS) * setup.episodes)
+            sensed = evaluator.rows_under_sensing(advance, setup.episodes)
     if "objects" in wanted:
         many = _object_rows(policy, setup, track)
-    return Found(evaluator, names, left_out, noisy, [*rows, *noisy, *many], source)
+    return Found(evaluator, names, left_out, noisy, [*rows, *noisy, *sensed, *many], source)
 
 
 def _evaluator(policy: PolicyBundle, setup: Setup, track: Track) -> Evaluator:

@@ -4,9 +4,9 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from common.task.methods import METHODS
+from common.task.methods import METHODS, STUDENT
 
-BASELINES = tuple(name for name in METHODS if name != "ours")
+BASELINES = tuple(name for name in METHODS if name not in ("ours", STUDENT))
 """Methods beside the full system, all of one hand."""
 _ON_MANY_OBJECTS = ("ours", "graspxl", "no-dynamic-center")
 """Methods that the paper tests on large-scale objects."""

@@ -14,6 +14,8 @@ from services.serve.policy import Answer, Policy, State
 
 _REQUIRED = ("surface", "q", "wrist", "object_pose")
 _MEASURED = ("q", "u", "object_position", "object_quaternion")
+_READ = (*_MEASURED, "q_target", "u_target")
+_LONGEST = 64  # control steps that a policy may look back
 
 
 class EpisodePolicy(Policy):
@@ -24,6 +26,7 @@ class EpisodePolicy(Policy):
         self._constraints: list[str] = []
         self._time = 0
         self._packer: _Packer | None = None
+        self._past: list[Mapping[str, np.ndarray]] = []  # readings of the control steps before this one, newest first
 
     def _query(self, query: Message) -> Message:
         """The reply to a query.
@@ -36,11 +39,14 @@ class EpisodePolicy(Policy):
     def reset(self, request: GraspRequest) -> None:
         """See `Policy.reset`."""
         self._episode, self._packer = _episode_fields(request), None
-        self._constraints, self._time = list(request.constraints), 0
+        self._constraints, self._time, self._past = list(request.constraints), 0, []
 
     def act(self, state: State) -> Answer:
         """See `Policy.act`."""
         (answer,) = self._ask(self._begun(), [state])
+        known = {**self._begun(), **state}
+        reading = {name: _numbers(name, known[name]) for name in _READ}
+        self._past = [reading, *self._past[: _LONGEST - 1]]
         self._begun().update(q_target=answer.q_target, u_target=answer.u_target)
         self._time += 1
         return answer
@@ -103,7 +109,7 @@ class EpisodePolicy(Policy):
             if len(states) == 1:
                 return reply, [[reply.arrays[name]] for name in ("action", "q_target", "u_target")]
         now |= {name: episode[name] for name in ("q_target", "u_target")}
-        reply = self._query(self._packer.pack([{**now, **state} for state in states], meta))
+        reply = self._query(self._packer.pack([{**now, **state} for state in states], self._past, meta))
         return reply, self._packer.unpack(reply)
 
 
@@ -117,6 +123,7 @@ class _Packer:
     def __init__(self, layout: Mapping[str, Any], episode: Mapping[str, np.ndarray], fingers: int):
         self._digest, self._fields, self._fingers = layout["layout"], layout["fields"], fingers
         self.most = int(layout.get("states", 1))
+        self._past = {name: self._fields[f"past_{name}"][1] for name in _READ if f"past_{name}" in self._fields}
         self._episode = np.zeros(layout["size"], np.float32)
         points = self._fields["surface_points"][1]
         for name, value in episode.items():
@@ -124,14 +131,20 @@ class _Packer:
                 value = value[np.arange(points) * len(value) // points]
             self._write(self._episode, name, value)
 
-    def pack(self, states: Sequence[State], meta: Mapping[str, Any]) -> Message:
-        """The episode's query in each of several states."""
+    def pack(self, states: Sequence[State], past: Sequence[State], meta: Mapping[str, Any]) -> Message:
+        """The episode's query in each of several states, after the control steps of `past`, newest first.
+
+        Where a policy looks back beyond the episode's begin, all was as at the begin.
+        """
         vectors = np.tile(self._episode, (len(states), 1))
         for vector, state in zip(vectors, states, strict=True):
             if lacking := [name for name in _MEASURED if name not in state]:
                 raise RefusedError(f"The query lacks the field '{lacking[0]}'.")
             for name, value in state.items():
                 self._write(vector, name, _numbers(name, value))
+            for name, steps in self._past.items():
+                rows = [_numbers(name, reading[name]) for reading in (past or [state])[:steps]]
+                self._write(vector, f"past_{name}", np.stack(rows + rows[-1:] * (steps - len(rows))))
         return Message({"packed": vectors}, {**meta, "layout": self._digest})
 
     def unpack(self, reply: Message) -> list[np.ndarray]:

@@ -15,6 +15,7 @@ from common.policy.bundle import InferenceParameters, mean_action
 from common.task import control, observation
 from common.task.constraints.priority import explain, resolve
 from common.task.features import scene_of
+from common.task.sensing import seen_by
 from common.task.types import SceneState, Surface
 from common.wire.codec import Message
 from services.serve.requests import PACKED, STATES_LIMIT, Layout, Query
@@ -84,7 +85,9 @@ class PolicyFunction:
         surface = Surface(fields["surface_points"], fields["surface_minus"])
         resolution = resolve(hand, surface, self.layout.goal(fields), asked)
         state = SceneState(**{name: fields[name] for name in SceneState._fields})
-        scene = scene_of(hand, task, state, surface, resolution.goal)
+        if (readings := self.layout.readings(fields)) is not None:
+            state = seen_by(task, state, readings)
+        scene = scene_of(hand, task, state, surface, resolution.goal, readings)
         mean = mean_action(observation.layout(hand, task), weights, observation.observe(scene))
         action = control.decode(scene, task.control, mean)
         notes = jnp.stack([resolution.redirected, resolution.aligned], -1)

@@ -1,14 +1,13 @@
 """The policy in this process: what a server answers, without one."""
 
 import os
-import pathlib
 import time
 
 from common.errors import CongraspError, error_of
-from common.hands import HANDS, get_hand
+from common.hands import get_hand
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
-from common.policy.pretrained import policy_file
+from common.policy.pretrained import named_policy
 from common.wire.codec import Message
 from services.serve.episode import EpisodePolicy
 from services.serve.inference import BATCH_SIZES, PolicyFunction
@@ -52,7 +51,4 @@ def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:
     Raises:
       CongraspError: there is no such file or hand, or the file is damaged.
     """
-    path = pathlib.Path(policy)
-    if str(policy) in HANDS or not (path.suffix or path.exists()):
-        path = policy_file(None, str(policy))
-    return LocalPolicy(bundles.load(path))
+    return LocalPolicy(bundles.load(named_policy(policy)))

@@ -4,6 +4,10 @@ A query names its constraints in the metadata and carries, without batch axis, t
 `common.task.types.SceneState`, the object's surface points and the goal fields of its constraints. The whole query
 travels to the device as one float32 vector, since one transfer costs as much as thirty times its size.
 
+For a policy that looks back (`TaskConfig.observation` "tracked") it also carries `past_q`, `past_u`, `past_q_target`,
+`past_u_target`, `past_object_position` and `past_object_quaternion` of the control steps before, newest first; without
+them, those of the present one are repeated.
+
 A query may also be packed: the vector itself as its one array, and in the metadata the digest of the layout that it
 follows. Whoever asks a query of names for the `layout` gets it with the answer. Packed queries cost both ends a fourth.
 They may hold several states, a row each, all with the same constraints; the answer then has as many rows.
@@ -24,6 +28,7 @@ from common.errors import CongraspError, LayoutError
 from common.hands.spec import Hand
 from common.inputs import LONGEST_NAME
 from common.task.constraints import known, require_known
+from common.task.sensing import Readings
 from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from common.wire.codec import Message
 
@@ -58,7 +63,8 @@ class Layout:
     """Names, shapes and places of a query's fields for one hand and task.
 
     Attributes:
-      shapes: field name to shape; the fields of the state, then of the goal, then the surface and the asked bits.
+      shapes: field name to shape; the fields of the state, of the control steps before it if the policy sees them, then
+        of the goal, then the surface and the asked bits.
       size: S, length of the flat vector.
       digest: identifies the layout.
     """
@@ -81,6 +87,9 @@ class Layout:
             f"{c.name}_{name}": value for c in self.known for name, value in c.neutral(hand, task)._asdict().items()
         }
         self.shapes = {name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in SceneState._fields}
+        self._past = [f"past_{name}" for name in Readings._fields] if task.observation == "tracked" else []
+        steps = (task.history - 1,)
+        self.shapes |= {name: (*steps, *self.shapes[name.removeprefix("past_")]) for name in self._past}
         self.shapes |= {name: np.shape(value) for name, value in self._neutral.items()}
         self.shapes |= {"surface_points": (points, 3), "surface_minus": (points,), "asked": (len(self.known),)}
         self.offsets = {}
@@ -90,7 +99,8 @@ class Layout:
             self.size += math.prod(shape)
         own = [name for name, (_, _, array) in self._arrays.items() if array.kind in ("direction", "quaternion")]
         self._flags = [name for name, (_, _, array) in self._arrays.items() if array.kind == "flag"]
-        self._directions = [*(name for name in SceneState._fields if "quaternion" in name), *own]
+        past = [name for name in self._past if "quaternion" in name]
+        self._directions = [*(name for name in SceneState._fields if "quaternion" in name), *past, *own]
         self.digest = hashlib.sha256(json.dumps(self.description()).encode()).hexdigest()[:16]
 
     def description(self) -> dict[str, Any]:
@@ -148,6 +158,8 @@ class Layout:
         vector = np.zeros(self.size, np.float32)
         given = dict(arrays)
         given["surface_points"], given["surface_minus"] = self._surface(given)
+        for name in self._past:  # who sends none has been where it is
+            given.setdefault(name, np.broadcast_to(given[name.removeprefix("past_")], self.shapes[name]))
         for name, value in given.items():
             shape = self.shapes[name]
             if np.shape(value) != shape:
@@ -185,6 +197,14 @@ class Layout:
     def goal(self, fields: Mapping[str, Any]) -> Goal:
         """The goal arrays of completed fields, before the priority rules."""
         return Goal({c.name: c.goal(**{name: fields[f"{c.name}_{name}"] for name in c.arrays}) for c in self.known}, {})
+
+    def readings(self, fields: Mapping[str, Any]) -> Readings | None:
+        """The last control steps of completed fields, if the policy sees them."""
+        if not self._past:
+            return None
+        return Readings(
+            *(jnp.concatenate([fields[name][:, None], fields[f"past_{name}"]], 1) for name in Readings._fields)
+        )
 
     def find_error(self, query: Query, checks: np.ndarray) -> CongraspError | None:
         """The error of a query's first bad state, by what `complete` found (n, C): see there; None if all are good."""

@@ -43,7 +43,7 @@ def _panel(metric: str) -> Panel:
 LEARNING = (
     *map(_panel, ("episode/return", "episode/success", "episode/links_at_removal", "steps_per_second")),
     Panel("Policy lag", "versions", ("staleness_mean", "staleness_max")),
-    *map(_panel, ("kl", "policy_loss", "value_loss", "explained_variance")),
+    *map(_panel, ("kl", "imitation_kl", "policy_loss", "value_loss", "explained_variance")),
     *map(_panel, ("action_std", "learning_rate", "clip_fraction")),
 )
 """Panels of the first figure; those without data are left out."""

@@ -61,6 +61,30 @@ def grasp(start: ResetState, step: int) -> np.ndarray:
     return target
 
 
+def servoed(start: ResetState) -> tuple[ResetState, np.ndarray]:
+    """A start in the air with half the fingers' gains to one and a half times, and targets ahead of all joints."""
+    start = above(start, 0.3)
+    batch = len(start.q)
+    start = start._replace(gain_scale=np.linspace(0.5, 1.5, batch).astype(np.float32))
+    return start, np.concatenate([np.full((batch, 6), 0.01), np.asarray(start.q) + 0.1], 1).astype(np.float32)
+
+
+def test_gains_scale_the_finger_servos_alone(env):
+    """After one substep a joint at rest has the speed that the torque kp * ahead gave it: proportional to the gain."""
+    physics = NativePhysics(HAND, dataclasses.replace(TASK, control_dt=0.0005, substeps=1), [OBJECTS[0]] * 3, 1)
+    start, target = servoed(env.reset_state._replace(object_index=np.zeros(ENVIRONMENTS, int)))
+    state = physics.start(start)
+    _, after = physics.step(state, target, np.ones(ENVIRONMENTS, bool))
+    speed = np.abs(np.asarray(after.q_velocity)).max(1)
+    np.testing.assert_allclose(speed / speed[1], [0.5, 1.0, 1.5], rtol=0.1)  # damping takes its part
+    physics.reset(state, np.array([True, False, False]), start._replace(gain_scale=np.ones(3)))
+    gains = np.array([instance.model.actuator_gainprm[:, 0] for instance in physics.instances])
+    np.testing.assert_allclose(gains[:, 6:], gains[1, 6:] * np.array([[1.0], [1.0], [1.5]]))
+    np.testing.assert_array_equal(gains[:, :6], gains[[1, 1, 1], :6])  # of the wrist
+    np.testing.assert_array_equal(*(physics.instances[i].model.actuator_forcerange for i in (0, 2)))
+    physics.close()
+
+
 def test_objects_rest_and_the_hand_stays_without_commands(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     state = physics.start(above(env.reset_state, 0.3))
@@ -109,6 +133,7 @@ def test_contact_force_is_that_of_the_object_on_the_link(env):
         object_index=np.zeros(1, int),
         mass_scale=np.ones(1),
         friction=np.ones(1),
+        gain_scale=np.ones(1),
         base_position=np.array([[0.0, -0.05, 0.5]]),
         base_quaternion=upturned,
         q=np.zeros((1, len(HAND.joints))),
@@ -138,6 +163,7 @@ def test_gains_hold_half_a_kilogram_without_shaking():
         object_index=np.zeros(1, int),
         mass_scale=np.full(1, scale),
         friction=np.ones(1),
+        gain_scale=np.ones(1),
         base_position=np.array([[0.0, 0.0, 1.0]]),
         base_quaternion=np.array([[1.0, 0.0, 0.0, 0.0]]),
         q=HAND.q_open[None],
@@ -265,6 +291,11 @@ def test_jax_agrees_with_native(env):
     again = other.read(other.reset(b, mask, jax.tree.map(jnp.asarray, start)))
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(again.u[1:], y.u[1:], atol=1e-6)
+    start, target = servoed(env.reset_state)
+    a, b = native.start(start), other.start(jax.tree.map(jnp.asarray, start))
+    for _ in range(5):
+        (a, x), (b, y) = native.step(a, target, table), step(b, jnp.asarray(target), jnp.asarray(table))
+    np.testing.assert_allclose(x.q, y.q, atol=2e-4)
     native.close()
 
 

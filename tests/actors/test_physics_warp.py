@@ -23,7 +23,7 @@ from common.errors import CongraspError
 from common.objects import procedural
 from common.objects.spec import GraspObject, Piece
 from common.transport.ports import free_port
-from tests.actors.test_physics import HAND, TASK, above, grasp, one_each
+from tests.actors.test_physics import HAND, TASK, above, grasp, one_each, servoed
 from tests.solids import mujoco_mass_properties
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -85,6 +85,20 @@ def _agrees_with_native(objects: Sequence[GraspObject], start: ResetState) -> No
 @pytest.mark.timeout(400)
 def test_primitives_and_meshes_of_one_pool_agree_with_native(start):
     _agrees_with_native(OBJECTS, start)
+
+
+def test_gains_of_each_environment_agree_with_native():
+    start, target = servoed(one_each(OBJECTS).reset_state)
+    native, warp = NativePhysics(HAND, TASK, OBJECTS, 1), WarpPhysics(HAND, TASK, OBJECTS)
+    step, table = jax.jit(warp.step), np.ones(len(OBJECTS), bool)
+    a, b = native.start(start), warp.start(jax.tree.map(jnp.asarray, start))
+    for _ in range(5):
+        (a, x), (b, y) = native.step(a, target, table), step(b, jnp.asarray(target), jnp.asarray(table))
+    np.testing.assert_allclose(x.q, y.q, atol=2e-4)
+    away = np.abs(target[:, 6:] - np.asarray(x.q)).mean(1)
+    assert (np.diff(away) < -1e-3).all(), "stronger servos come nearer"
+    native.close()
+    warp.close()
 
 
 def _scanned(folder: pathlib.Path) -> GraspObject:

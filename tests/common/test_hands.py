@@ -171,6 +171,7 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
         object_index=np.zeros(1, int),
         mass_scale=np.full(1, 0.4 / cylinder.mass),
         friction=np.ones(1),
+        gain_scale=np.ones(1),
         base_position=np.array([[0.0, 0.0, 1.0]]),
         base_quaternion=down.as_quat(scalar_first=True)[None],
         q=hand.q_open[None],

@@ -79,7 +79,7 @@ class Affordance(Constraint):
             ObservationField(
                 "nearest_minus", vectors, "m, from each keypoint to the nearest point that must not be touched"
             ),
-            ObservationField("force_minus", forces, "as force, of contacts that must not be"),
+            ObservationField("force_minus", forces, "as force, of contacts that must not be", privileged=True),
         )
         return (block,)
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from common.config import TaskConfig
     from common.task.bank import Draw
     from common.task.features import Contacts, Features
+    from common.task.sensing import Readings
 
 Window = Literal["approach", "hold"]
 """Over which steps an error is averaged: before the table's removal, or in the `hold_steps` after it."""
@@ -79,6 +80,8 @@ class ObservationField(NamedTuple):
     size: int
     meaning: str
     """Unit and frame; "wrist" is the wrist frame."""
+    privileged: bool = False
+    """Whether only a simulator knows them: a tracked observation lacks them."""
 
 
 class Relation(NamedTuple):
@@ -104,6 +107,8 @@ class Scene(NamedTuple):
     state: SceneState
     features: "Features"
     goal: Goal
+    readings: "Readings | None" = None
+    """The last control steps, where the policy's observation shows them."""
 
     def gate(self, block: str) -> Array:
         """(B,) 1 where a block is active, else 0."""
@@ -218,7 +223,7 @@ class Constraint:
         raise NotImplementedError
 
     def observe(self, scene: Scene) -> tuple[Sequence[Array], ...]:
-        """For each block the parts (B, ...) that are laid side by side; they are gated afterwards."""
+        """For each block its `fields` (B, ...), which are laid side by side; they are gated afterwards."""
         return ()
 
     def forbidden(self, scene: Scene) -> Array | None:

@@ -50,7 +50,7 @@ class Fingers(Constraint):
         block = (
             ObservationField("fingers_allowed", fingers, "1 for each finger that may touch the object, thumb first"),
             ObservationField("fingers_room", fingers, "m, between the object and each other finger, at most 0.1"),
-            ObservationField("force_other", 3 * links, "as force, on links of the other fingers"),
+            ObservationField("force_other", 3 * links, "as force, on links of the other fingers", privileged=True),
         )
         return (block,)
 

@@ -120,6 +120,7 @@ def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
         object_index=index,
         mass_scale=ones,
         friction=ones,
+        gain_scale=ones,
         base_position=-(frame.center - depth[:, None] * frame.heading) @ own.T,
         base_quaternion=np.tile(turn, (count, 1)),
         q=np.tile(hand.q_open, (count, 1)),

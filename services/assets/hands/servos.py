@@ -73,6 +73,7 @@ def _states(hand: Hand, task: TaskConfig, targets: np.ndarray, threads: int) -> 
         object_index=np.zeros(count, int),
         mass_scale=ones,
         friction=ones,
+        gain_scale=ones,
         base_position=np.zeros((count, 3)),
         base_quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
         q=np.tile(hand.q_open, (count, 1)),

@@ -22,6 +22,7 @@ def test_replays_end_in_the_very_states_of_the_recording():
         object_index=np.arange(WORLDS) % 2,
         mass_scale=np.linspace(0.5, 1.5, WORLDS),
         friction=np.ones(WORLDS),
+        gain_scale=np.ones(WORLDS),
         base_position=one * [0.0, -0.05, 0.5],
         base_quaternion=one * [0.0, 1.0, 0.0, 0.0],  # palm up, under the object
         q=np.zeros((WORLDS, len(HAND.joints))),

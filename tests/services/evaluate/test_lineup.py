@@ -52,6 +52,18 @@ def test_a_method_without_a_policy_is_named_and_no_error(saved):
     assert absent == [("human", name, "not trained") for name in ABLATION if name not in ("ours", "no-feedforward")]
 
 
+def test_a_student_stands_beside_the_pretrained_policy_of_its_hand(saved):
+    student = read_entrants([str(saved("student"))])
+    both = [("human", "ours", ("sensing",)), ("human", "student", ("sensing",))]
+    assert who(line_up(["sensing"], student, "human")) == both
+    assert who(line_up(["sensing"], [], "allegro")) == [("allegro", "ours", ("sensing",))]
+    found = line_up(["single", "sensing"], student, "human")
+    assert dict((name, tables) for _, name, tables in who(found)) == {
+        "student": ("single", "sensing"),
+        "ours": ("sensing",),
+    }
+
+
 def test_a_policy_is_evaluated_once_for_all_its_tables(saved):
     given = read_entrants([str(saved("ours"))])
     found = line_up(["single", "composed", "hands", "ablation", "single"], given, "human")

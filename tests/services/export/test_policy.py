@@ -16,7 +16,7 @@ import onnxruntime
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.config import NetworkConfig, TaskConfig
+from common.config import NetworkConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.policy import bundle as bundles
@@ -28,9 +28,11 @@ from common.request import GraspRequest
 from common.task import observation
 from common.task.constraints import blocks, goal_of
 from common.task.features import scene_of
+from common.task.sensing import Readings
 from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from services.export import policy as exports
 from services.serve.limits import JointLimits, Limiter
+from services.train.command import untrained
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "examples" / "onnx_grasp.py"
@@ -119,16 +121,18 @@ def test_the_example_grasps_with_onnxruntime_alone(pretrained_onnx: pathlib.Path
     assert "the cylinder is held" in done.stdout
 
 
-def test_the_example_observes_what_the_policy_was_trained_on(pretrained_onnx: pathlib.Path) -> None:
+def example_grasp(path: pathlib.Path) -> tuple[Any, Any]:
+    """The example as a module, and its grasp with a policy's file."""
     spec: Any = importlib.util.spec_from_file_location("onnx_grasp", EXAMPLE)
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    grasp = example.Grasp(onnxruntime.InferenceSession(pretrained_onnx))
-    for _ in range(57):  # the hand holds the object, and the table is gone
-        grasp.step()
-    hand, data, task = get_hand("human"), grasp.data, bundles.load(policy_file(None)).task
+    return example, example.Grasp(onnxruntime.InferenceSession(path))
+
+
+def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
+    """(D,) what the policy of a task is to observe in the state of the example's grasp."""
+    hand, data = get_hand("human"), grasp.data
     force, touching = grasp.forces()
-    assert touching.sum() >= 2
     contacts = np.zeros((1, len(hand.links), CONTACTS_PER_LINK, 3))
     contacts[0, :, 0] = force  # one contact a link that carries its whole force
     found = np.zeros(contacts.shape[:-1], bool)
@@ -158,8 +162,11 @@ def test_the_example_observes_what_the_policy_was_trained_on(pretrained_onnx: pa
         object_position_initial=grasp.object_position,
         object_quaternion_initial=turn(grasp.object_matrix),
         time=np.float32(grasp.time),
-        table=np.bool_(False),
+        table=np.bool_(grasp.time < task.approach_steps),
     )
+    rows = [grasp.read(), *grasp.readings][: task.history]
+    *read, matrices = (np.array(field) for field in zip(*rows, strict=True))
+    readings = Readings(*read, np.array([turn(m) for m in matrices]))
     heading = {"position": grasp.heading_position, "direction": example.HEADING, "cross": np.zeros(3)}
     goal = goal_of(hand, task, GraspRequest({"heading": heading}))
     goal = dataclasses.replace(goal, active=dict.fromkeys(blocks(task), np.bool_(False)))
@@ -167,9 +174,34 @@ def test_the_example_observes_what_the_policy_was_trained_on(pretrained_onnx: pa
     def batch(tree: Any) -> Any:
         return jax.tree.map(lambda x: np.asarray(x)[None].astype(bool if np.asarray(x).dtype == bool else "f4"), tree)
 
-    def observe(state: SceneState, surface: Surface, goal: Goal) -> Any:
-        return observation.observe(scene_of(hand, task, state, surface, goal))
+    def observe(state: SceneState, surface: Surface, goal: Goal, readings: Readings) -> Any:
+        return observation.observe(scene_of(hand, task, state, surface, goal, readings))
 
     surface = Surface(grasp.points, np.zeros(len(grasp.points), bool))
-    expected = np.asarray(jax.jit(observe)(batch(state), batch(surface), batch(goal)))[0]
+    return np.asarray(jax.jit(observe)(batch(state), batch(surface), batch(goal), batch(readings)))[0]
+
+
+def test_the_example_observes_what_the_policy_was_trained_on(pretrained_onnx: pathlib.Path) -> None:
+    example, grasp = example_grasp(pretrained_onnx)
+    for _ in range(57):  # the hand holds the object, and the table is gone
+        grasp.step()
+    assert grasp.forces()[1].sum() >= 2
+    expected = observed(example, grasp, bundles.load(policy_file(None)).task)
     np.testing.assert_allclose(grasp.observe(), expected, atol=2e-5)
+
+
+def test_the_example_looks_back_as_a_student_does(tmp_path: pathlib.Path) -> None:
+    """Its file says what the policy sees of the past, which is no force and no velocity."""
+    task = TaskConfig(constraints=("heading",), observation="tracked", history=4)
+    config = RunConfig(task=task, network=NetworkConfig(hidden=(16,), encoder=4))
+    path = tmp_path / "student.onnx"
+    exports.export_policy(untrained(config), "onnx", path)
+    example, grasp = example_grasp(path)
+    assert not {"force", "q_velocity"} & {field["field"] for field in grasp.meta["observation"]}
+    for _ in range(8):
+        grasp.step()
+        grasp.data.qvel[grasp.free : grasp.free + 6] += [0.1, 0.0, 0.2, 0.5, 0.0, 1.0]  # so that the object moves
+    names = np.repeat(*zip(*((field["field"], field["size"]) for field in grasp.meta["observation"]), strict=True))
+    assert (names == "past object_rotation").sum() == 9
+    one = names != "nearest"  # of two surface points that are as near as each other either will do
+    np.testing.assert_allclose(grasp.observe()[one], observed(example, grasp, task)[one], atol=2e-5)

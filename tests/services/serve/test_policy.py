@@ -14,7 +14,7 @@ from common.transport.ports import free_port
 from services.serve.client import PolicyClient
 from services.serve.episode import EpisodePolicy
 from services.serve.load import example_episode
-from services.serve.local import load_policy
+from services.serve.local import LocalPolicy, load_policy
 from services.serve.policy import Policy
 from services.serve.server import PolicyServer, follow_file
 from services.train.command import untrained
@@ -169,3 +169,40 @@ def test_policies_are_loaded_by_hand_and_by_file(tmp_path, episode):
         load_policy("paw")
     with pytest.raises(CongraspError, match=r"none\.safetensors cannot be read"):
         load_policy(tmp_path / "none.safetensors")
+
+
+STUDENT = RunConfig(
+    task=TaskConfig(constraints=("heading",), observation="tracked", history=4),
+    network=NetworkConfig(hidden=(16,), encoder=4),
+)
+
+
+def test_a_policy_that_looks_back_is_told_what_was_before(episode):
+    """The vector that is inferred from holds the control steps before this one, newest first, and at the begin its
+    first reading; velocities and forces that a client sends change nothing."""
+    policy = LocalPolicy(untrained(STUDENT))
+    layout, sent = policy._function.layout, []
+    parse = layout.parse
+
+    def spy(query):
+        sent.append(layout.unpack(parse(query).vectors))
+        return parse(query)
+
+    layout.parse = spy
+    policy.reset(dataclasses.replace(episode.request, constraints={"heading": episode.request.constraints["heading"]}))
+    states = [
+        {**episode.state, "q": episode.state["q"] + 0.01 * i, "object_position": np.full(3, 0.1 * i)} for i in range(6)
+    ]
+    answers = [policy.act(state) for state in states]
+    q = np.float32([state["q"] for state in states])
+    np.testing.assert_array_equal(sent[0]["past_q"][0], q[[0, 0, 0]])
+    np.testing.assert_array_equal(sent[1]["past_q"][0], q[[0, 0, 0]])
+    np.testing.assert_array_equal(sent[2]["past_q"][0], q[[1, 0, 0]])
+    np.testing.assert_array_equal(sent[5]["past_q"][0], q[[4, 3, 2]])
+    np.testing.assert_allclose(sent[5]["past_object_position"][0], [[0.4] * 3, [0.3] * 3, [0.2] * 3], rtol=1e-6)
+    targets = np.float32([answers[i].q_target for i in (3, 2, 1)])
+    np.testing.assert_array_equal(sent[5]["past_q_target"][0], targets)
+    np.testing.assert_array_equal(sent[5]["q_target"][0], answers[4].q_target)
+    same(policy.act_each([states[0]])[0], policy.act_each([{**states[0], "object_velocity": np.ones(3)}])[0])
+    moved = {**states[0], "u": states[0]["u"] + np.array([0.01, 0, 0, 0, 0, 0])}
+    assert not np.array_equal(policy.act_each([moved])[0].u_target, policy.act_each([states[0]])[0].u_target)

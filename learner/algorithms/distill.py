@@ -1,0 +1,234 @@
+"""Distillation of a policy into one that sees other things, on the states that the student comes to.
+
+The student acts, and the teacher, which sees all of the simulation, says what it would have done in each state (DAgger:
+Ross et al. 2011, arXiv 1011.0686, without its mixture of the two and without keeping old states). The student's mean is
+regressed on the teacher's, in units of the teacher's standard deviation: up to a constant the KL divergence from the
+student to the teacher, whose standard deviation the student keeps. The critic learns nothing.
+"""
+
+import functools
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.sharding import Mesh
+
+from common.config import DistillConfig, RunConfig, TaskConfig
+from common.errors import CongraspError
+from common.policy import bundle as bundles
+from common.policy import network, normalizer
+from common.policy.bundle import InferenceParameters, PolicyBundle, PolicySpec, full_layout
+from common.policy.network import Layout, Params
+from common.policy.normalizer import Affine, Statistics
+from common.policy.pretrained import named_policy
+from common.task.types import Array
+from common.wire.schema import RECORDABLE, Schema
+from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from learner.batch import partition_specs
+from learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+
+_SCHEMA = {name: RECORDABLE[name] for name in ("observation", "teacher_observation")}
+_SPECS = partition_specs(_SCHEMA)
+_LAST_RATE = 0.02
+"""Share of the learning rate that is left at the run's end."""
+_CHECKED = {"imitation_kl": "rollouts", "actor_grad_norm": "optimisation"}
+"""Metrics that must be finite, and what is to blame where they are not."""
+
+Learnt = tuple[Params, Any, Array]
+"""The actor's parameters, the optimiser's state and the random key."""
+
+
+class _Given(NamedTuple):
+    """What an update learns with, beside state and batch."""
+
+    observations: Affine
+    """Normalisation of the student's observations, frozen."""
+    teacher: InferenceParameters
+    rate: Array
+    """Learning rate."""
+
+
+class Distillation:
+    """Distillation, an `Algorithm`."""
+
+    batch_schema: Schema = _SCHEMA
+
+    def __init__(self, spec: PolicySpec, config: RunConfig):
+        """For a student's networks.
+
+        Args:
+          spec: the student's.
+          config: the run, whose `distill` names the teacher.
+
+        Raises:
+          CongraspError: no teacher is named, its file cannot be read, or it does not see and act as this task has it.
+        """
+        teacher = read_teacher(config.distill.teacher)
+        _check(teacher, spec, config.task)
+        self._spec, self._config, self._updates = spec, config.distill, config.updates
+        self._layouts = (spec.layout, teacher.spec.layout)
+        self._teacher = teacher.inference_parameters
+
+    def init(self, seed: int, initial: Policy | None = None) -> TrainState:
+        """The state before the first update; actions spread as the teacher's do."""
+        initial = initial or random_policy(seed, self._spec)
+        params = jax.tree.map(jnp.asarray, initial.params)
+        params["actor"] = {**params["actor"], "log_std": self._teacher.params["actor"]["log_std"]}
+        optimizer = _transform(self._config.max_grad_norm).init(params["actor"])
+        return TrainState(params, optimizer, jax.random.PRNGKey(seed), initial.observation, initial.value, 0, 0)
+
+    def policy(self, state: TrainState) -> Policy:
+        """Parameters and normalisers."""
+        return Policy(state.params, state.observation, state.value)
+
+    def update(
+        self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None
+    ) -> tuple[TrainState, dict[str, float]]:
+        """Epochs of minibatches over a batch; see `Algorithm.update`.
+
+        The normaliser is frozen during the update and takes the batch in afterwards; only the first batch is also what
+        the first update normalises by.
+
+        Raises:
+          NonFiniteUpdate: naming the first term that was not finite; the state is that before the update.
+          CongraspError: if there are more minibatches than transitions.
+        """
+        config = self._config
+        transitions = batch["observation"].shape[0] * batch["observation"].shape[1]
+        if transitions < config.minibatches:
+            raise CongraspError(
+                f"A batch of {transitions} transitions does not make {config.minibatches} minibatches.",
+                "Use fewer --distill.minibatches, more environments or longer rollouts.",
+            )
+        arrays = shard({name: batch[name] for name in _SCHEMA}, mesh, _SPECS)
+        gathered = jax.device_get(unreplicate(_moments(arrays["observation"], mesh=mesh), mesh))
+        moments = [Statistics(*parts) for parts in zip(*gathered, strict=True)]
+        frozen = state.observation if state.observation.count else normalizer.merge(*moments)
+        rate = config.learning_rate * max(1.0 - state.version / max(self._updates, 1), _LAST_RATE)
+        given = _Given(normalizer.observation_affine(frozen, self._spec.layout), self._teacher, jnp.float32(rate))
+        learnt, given = shard(((state.params["actor"], state.optimizer, state.key), given), mesh)
+        learnt, metrics = unreplicate(
+            _optimise(learnt, arrays, given, layouts=self._layouts, config=config, mesh=mesh), mesh
+        )
+        metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        for name, source in _CHECKED.items():
+            if not math.isfinite(metrics[name]):
+                raise NonFiniteUpdate(name, source, state)
+        actor, optimizer, key = learnt
+        state = state._replace(
+            params={**state.params, "actor": actor},
+            optimizer=optimizer,
+            key=key,
+            observation=normalizer.merge(state.observation, *moments),
+            version=state.version + 1,
+            transitions=state.transitions + int(sum(part.count for part in moments)),
+        )
+        return state, {**metrics, "learning_rate": rate}
+
+
+def read_teacher(named: str) -> PolicyBundle:
+    """The policy that a run names as its teacher.
+
+    Raises:
+      CongraspError: none is named, or there is no such policy.
+    """
+    if not named:
+        raise CongraspError("Distillation needs a teacher.", "Name a hand or a policy file with --teacher.")
+    return bundles.load(named_policy(named))
+
+
+def _check(teacher: PolicyBundle, spec: PolicySpec, task: TaskConfig) -> None:
+    """Raises `CongraspError` unless the teacher's observations and actions are those of this task."""
+    what = f"The teacher, a policy for the hand '{teacher.spec.hand_name}',"
+    if teacher.spec.hand != spec.hand:
+        raise CongraspError(
+            f"{what} cannot teach the hand '{spec.hand_name}'.", "Name a teacher of the same hand with --teacher."
+        )
+    if teacher.task.observation != "full" or teacher.spec.layout != full_layout(task):
+        raise CongraspError(
+            f"{what} does not observe what this task shows.",
+            "Take the task from the teacher: 'congrasp train --teacher', without other --task.… settings of its own.",
+        )
+    for name in ("control", "control_dt", "approach_steps", "dynamic_center"):
+        if getattr(teacher.task, name) != getattr(task, name):
+            raise CongraspError(
+                f"{what} learnt with another '{name}' than this task's.", f"Leave out --task.{name.replace('_', '-')}."
+            )
+
+
+def _transform(max_grad_norm: float) -> optax.GradientTransformation:
+    """Adam's steps on clipped gradients, before the learning rate."""
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam())
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def _moments(observation: Array, *, mesh: Mesh | None) -> Statistics:
+    """Moments of each rank's observations, stacked."""
+
+    def program(observation: Array) -> Statistics:
+        return Collectives(mesh).gather(normalizer.moments(observation, event_axes=1))
+
+    return shard_map(mesh, program, _SPECS["observation"])(observation)
+
+
+@functools.partial(jax.jit, static_argnames=("layouts", "config", "mesh"))
+def _optimise(
+    learnt: Learnt,
+    batch: dict[str, Array],
+    given: _Given,
+    *,
+    layouts: tuple[Layout, Layout],
+    config: DistillConfig,
+    mesh: Mesh | None,
+) -> tuple[Learnt, dict[str, Array]]:
+    """Epochs over the batch for a student and a teacher of these layouts; what was learnt, and metrics."""
+    program = functools.partial(_program, collectives=Collectives(mesh), layouts=layouts, config=config)
+    return shard_map(mesh, program, (REPLICATED, _SPECS, REPLICATED))(learnt, batch, given)
+
+
+def _program(
+    learnt: Learnt,
+    batch: dict[str, Array],
+    given: _Given,
+    *,
+    collectives: Collectives,
+    layouts: tuple[Layout, Layout],
+    config: DistillConfig,
+) -> tuple[Learnt, dict[str, Array]]:
+    """What `_optimise` compiles, for one rank: shuffled minibatches, each sample at most once an epoch."""
+    actor, optimizer, key = learnt
+    transform = _transform(config.max_grad_norm)
+    labels = bundles.mean_action(layouts[1], given.teacher, batch["teacher_observation"])
+    labels = labels.reshape(-1, labels.shape[-1])
+    observation = batch["observation"].reshape(len(labels), -1)
+    size = len(labels) // config.minibatches
+
+    def loss(actor: Params, rows: Array) -> Array:
+        seen = normalizer.apply(given.observations, observation[rows])
+        mean, log_std = network.policy({"actor": actor}, layouts[0], seen, exact=False)
+        return jnp.mean(network.kl_divergence(mean, log_std, labels[rows], log_std))
+
+    def step(carry: tuple[Params, Any], rows: Array) -> tuple[tuple[Params, Any], tuple[Array, Array]]:
+        actor, optimizer = carry
+        found, gradient = collectives.mean(jax.value_and_grad(loss)(actor, rows))
+        gradient = {**gradient, "log_std": jnp.zeros_like(actor["log_std"])}
+        steps, optimizer = transform.update(gradient, optimizer)
+        actor = optax.apply_updates(actor, jax.tree.map(lambda x: -given.rate * x, steps))
+        return (actor, optimizer), (found, optax.tree.norm(gradient))
+
+    def epoch(carry: tuple[Params, Any], key: Array) -> tuple[tuple[Params, Any], tuple[Array, Array]]:
+        order = jax.random.permutation(key, len(labels))[: size * config.minibatches]
+        return jax.lax.scan(step, carry, order.reshape(config.minibatches, size))
+
+    key, epochs_key = jax.random.split(key)
+    keys = jax.random.split(collectives.own_key(epochs_key), config.epochs)
+    (actor, optimizer), (found, norms) = jax.lax.scan(epoch, (actor, optimizer), keys)
+    metrics = {
+        "imitation_kl": jnp.mean(found[0]),  # of the first pass: later ones have seen these states
+        "actor_grad_norm": jnp.mean(norms),
+        "action_std": jnp.mean(jnp.exp(actor["log_std"])),
+    }
+    return (actor, optimizer, key), metrics

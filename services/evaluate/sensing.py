@@ -1,0 +1,82 @@
+"""Levels of what a robot's sensors and servos do to a policy: one thing at a time beside a tracker as they are sold.
+
+The same episodes are evaluated at every level, under the heading constraint. A policy that sees all of the simulation
+gets the tracker's pose in the place of the true one, and keeps its contact forces and velocities.
+"""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+
+from actors.initial import InitialConditions
+from common.config import SensingConfig, TaskConfig
+
+CONSTRAINT = "heading"
+"""The row that is evaluated at every level."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Level:
+    """A tracker, a friction and an error of the gains; by default a tracker of 30 Hz with 5 mm, 3 degrees and 60 ms."""
+
+    label: str
+    """What is another than that."""
+    position_noise: float = 0.005
+    """m, standard deviation of each coordinate."""
+    rotation_noise: float = math.radians(3.0)
+    """rad, about each axis."""
+    delay: float = 0.06
+    """s."""
+    rate: float = 30.0
+    """Hz."""
+    dropout: float = 0.0
+    """Share of the samples that never arrive."""
+    friction: float | None = None
+    """Sliding friction between hand and object; None: the evaluation's."""
+    gains: float = 1.0
+    """Factor of the finger servos' gains."""
+
+
+LEVELS = (
+    Level("the true pose", position_noise=0.0, rotation_noise=0.0, delay=0.0, rate=math.inf),
+    Level("5 mm 3°, 30 Hz, 60 ms"),
+    Level("no noise", position_noise=0.0, rotation_noise=0.0),
+    Level("10 mm 6°", position_noise=0.01, rotation_noise=math.radians(6.0)),
+    Level("no delay", delay=0.0),
+    Level("100 ms", delay=0.1),
+    Level("10 Hz", rate=10.0),
+    Level("10 % dropped", dropout=0.1),
+    Level("30 % dropped", dropout=0.3),
+    Level("friction 0.5", friction=0.5),
+    Level("gains -20 %", gains=0.8),
+    Level("gains +20 %", gains=1.2),
+)
+"""Rows of the table; every one but the first is the second with one thing changed."""
+
+
+def sensing_task(task: TaskConfig) -> TaskConfig:
+    """The task in which a policy sees what trackers show, with room for the longest delay."""
+    return dataclasses.replace(task, sensing=SensingConfig(delay=(0.0, max(level.delay for level in LEVELS))))
+
+
+def at_level(conditions: InitialConditions, level: Level, control_dt: float) -> InitialConditions:
+    """The episodes at a level; errors and losses are drawn alike at all of them.
+
+    Args:
+      conditions: episodes of `sensing_task`.
+      level: the level.
+      control_dt: seconds of a control step.
+    """
+    sensors, start = conditions.sensors, conditions.reset_state
+    friction = start.friction if level.friction is None else jnp.full_like(start.friction, level.friction)
+    return conditions._replace(
+        sensors=sensors._replace(
+            period=jnp.full_like(sensors.period, max(1.0 / (level.rate * control_dt), 1.0)),
+            delay=jnp.full_like(sensors.delay, round(level.delay / control_dt)),
+            position_noise=jnp.full_like(sensors.position_noise, level.position_noise),
+            rotation_noise=jnp.full_like(sensors.rotation_noise, level.rotation_noise),
+            dropout=jnp.full_like(sensors.dropout, level.dropout),
+        ),
+        reset_state=start._replace(friction=friction, gain_scale=jnp.full_like(start.gain_scale, level.gains)),
+    )

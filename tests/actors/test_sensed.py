@@ -1,0 +1,100 @@
+"""Environments whose policy sees what a robot's sensors show, beside what a teacher sees."""
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from actors.bank import build_bank
+from actors.physics.native import NativePhysics
+from actors.rollout import RolloutWorker
+from common.config import SensingConfig, TaskConfig
+from common.hands import get_hand
+from common.objects import procedural
+from common.policy.bundle import full_layout
+from common.task import observation
+
+HAND = get_hand("human")
+OBJECTS = [procedural.generate(0, "cylinder")]
+TASK = TaskConfig(
+    constraints=("heading",), surface_points=64, approach_steps=16, hold_steps=4, hold_steps_max=4, history=4
+)
+BATCH, DELAY = 2, 3
+
+
+@functools.cache
+def bank():
+    return build_bank(HAND, TASK, OBJECTS, 0)
+
+
+def worker(task):
+    """Environments whose wrist follows its guidance while the fingers close."""
+
+    def close(parameters, seen, key):
+        action = jnp.zeros((len(seen), len(HAND.motors) + 6)).at[:, : len(HAND.motors)].set(0.8)
+        return action, jnp.zeros(len(seen))
+
+    physics = NativePhysics(HAND, task, OBJECTS, 1)
+    return RolloutWorker(
+        HAND, task, physics, bank(), close, batch=BATCH, seed=0, half_precision=False, traced=slice(None), taught=True
+    )
+
+
+@pytest.fixture(scope="module")
+def late():
+    """Environments with a tracker that is late, and 18 of an episode's 20 control steps."""
+    sensing = SensingConfig(delay=(DELAY * 0.01, DELAY * 0.01))
+    running = worker(dataclasses.replace(TASK, observation="tracked", sensing=sensing))
+    return running, running.collect(None, 18)
+
+
+def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
+    running, rollout = late
+    readings, trace = running.state.readings, rollout.trace
+    for age in range(TASK.history):
+        now = 17 - age
+        np.testing.assert_allclose(readings.q[:, age], trace.q[now], atol=1e-6)
+        np.testing.assert_allclose(readings.u_target[:, age], trace.u_target[now], atol=1e-6)
+        np.testing.assert_allclose(readings.object_position[:, age], trace.object_position[now - DELAY], atol=1e-6)
+        np.testing.assert_allclose(readings.object_quaternion[:, age], trace.object_quaternion[now - DELAY], atol=1e-6)
+    seen, true = running.env.seen(running.state).state, running.env.scene_of(running.state).state
+    np.testing.assert_array_equal(true.object_position, trace.object_position[17])
+    np.testing.assert_array_equal(seen.object_position, readings.object_position[:, 0])
+    assert not np.array_equal(seen.object_position, true.object_position)
+    np.testing.assert_array_equal(seen.object_position_initial, true.object_position_initial)
+    assert not seen.contact_force.any()
+
+
+def test_a_teacher_sees_all_beside_a_student(late):
+    _, rollout = late
+    task = dataclasses.replace(TASK, observation="tracked")
+    sizes = [sum(size for _, size in layout) for layout in (observation.layout(HAND, task), full_layout(task))]
+    assert [rollout.observation.shape[-1], rollout.teacher_observation.shape[-1]] == sizes
+    start = 0
+    for field in observation.fields(HAND, TASK)["state"]:
+        part = rollout.teacher_observation[1:, :, start : start + field.size]
+        start += field.size
+        if field.name == "q":
+            np.testing.assert_allclose(part, rollout.trace.q[:-1], atol=1e-6)
+        elif field.name == "object_displacement":
+            away = np.linalg.norm(rollout.trace.object_position[:-1] - running_start(late), axis=-1)
+            np.testing.assert_allclose(np.linalg.norm(part, axis=-1), away, atol=1e-6)
+
+
+def running_start(late):
+    """(B, 3) where the objects began."""
+    return np.asarray(late[0].state.reset_state.object_position)
+
+
+def test_a_fresh_episode_begins_with_fresh_readings(late):
+    """The last test of `late`: its episodes end after two more control steps."""
+    running, _ = late
+    rollout = running.collect(None, 2)
+    assert rollout.terminal[-1].all()
+    readings, start = running.state.readings, running.state.reset_state
+    for age in range(TASK.history):
+        np.testing.assert_array_equal(readings.object_position[:, age], start.object_position)
+        np.testing.assert_array_equal(readings.q[:, age], start.q)
+    np.testing.assert_array_equal(readings.u, 0.0)

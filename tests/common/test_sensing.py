@@ -1,0 +1,224 @@
+"""The tracker: which pose it shows when, against numbers worked out by hand, and what policies see of it."""
+
+import dataclasses
+import functools
+
+import hypothesis.extra.numpy as npst
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common import rotations
+from common.config import SensingConfig, TaskConfig
+from common.task import observation, sensing
+from common.task.features import scene_of
+from common.task.sensing import Readings, Sensors
+from tests.scenes import HAND, F, L, N, scene
+
+TASK = TaskConfig(observation="tracked", surface_points=N, constraints=("heading", "affordance", "fingers"))
+FULL = dataclasses.replace(TASK, observation="full")
+STEPS = 40
+
+
+def sensors(**given):
+    """One tracker that shows each pose at once, without errors, but for what is given."""
+    fields = {"period": 1.0, "phase": 0.0, "delay": 0, "position_noise": 0.0, "rotation_noise": 0.0, "dropout": 0.0}
+    types = {"delay": np.int32}
+    arrays = {name: np.full(1, value, types.get(name, np.float32)) for name, value in {**fields, **given}.items()}
+    return Sensors(key=np.array([[3, 7]], np.uint32), **arrays)
+
+
+def truth(step):
+    """Position and quaternion of the object after a control step; it rests before the first."""
+    step = max(step, 0)
+    half = 0.01 * step
+    return np.array([step, 2.0 * step, -step], np.float32), np.array([np.cos(half), 0, 0, np.sin(half)], np.float32)
+
+
+@functools.partial(jax.jit, static_argnames="room")
+def shown(own, poses, room):
+    """(1 + T, 7) poses that a tracker with room for so many shows at the start and after T steps (1 + T, 7)."""
+    tracker = sensing.begin(own, room, poses[:1, :3], poses[:1, 3:])
+
+    def step(tracker, now):
+        time, pose = now
+        tracker = sensing.track(tracker, time[None], pose[None, :3], pose[None, 3:])
+        return tracker, tracker.shown[0]
+
+    _, rows = jax.lax.scan(step, tracker, (jnp.arange(1, len(poses)), poses[1:]))
+    return jnp.concatenate([tracker.shown, rows])
+
+
+PATH = np.array([np.concatenate(truth(step)) for step in range(STEPS)], np.float32)
+
+
+def test_a_perfect_tracker_shows_the_true_pose():
+    np.testing.assert_array_equal(shown(sensors(), PATH, 1), PATH)
+
+
+@settings(max_examples=25, deadline=None)
+@given(delay=st.integers(0, 12))
+def test_a_delay_of_k_steps_shows_the_pose_of_k_steps_ago(delay):
+    expected = [np.concatenate(truth(step - delay)) for step in range(STEPS)]
+    np.testing.assert_array_equal(shown(sensors(delay=delay), PATH, 13), expected)
+
+
+def test_samples_are_held_until_the_next_one_arrives():
+    """At one sample in 2.5 control steps, which begin 0.6 periods after the last: floor(n / 2.5 + 0.6) rises at n = 1
+    (1.0), 4 (2.2), 6 (3.0), 9 (4.2), 11 (5.0); each is shown three steps later."""
+    found = np.asarray(shown(sensors(period=2.5, phase=0.6, delay=3), PATH, 4))[:15, 0]
+    np.testing.assert_array_equal(found, [0, 0, 0, 0, 1, 1, 1, 4, 4, 6, 6, 6, 9, 9, 11])
+
+
+@settings(max_examples=25, deadline=None)
+@given(dropout=st.floats(0.0, 1.0), period=st.floats(1.0, 10.0))
+def test_what_is_lost_leaves_the_last_pose(dropout, period):
+    """Every step shows what the step before it showed, or the present pose; all are lost at 1, none at 0."""
+    found = np.asarray(shown(sensors(dropout=dropout, period=period), PATH, 1))[:, 0]
+    held = found[1:] == found[:-1]
+    np.testing.assert_array_equal(found[1:][~held], PATH[1:, 0][~held])
+    assert held.mean() >= 1 - 1 / period - 2 / STEPS
+    assert held.all() if dropout == 1.0 else dropout > 0 or held.mean() <= 1 - 1 / period + 2 / STEPS
+
+
+def test_errors_have_their_size_in_every_axis_and_are_those_of_a_seed():
+    still = np.broadcast_to(PATH[5], (4000, 7))
+    found = np.asarray(shown(sensors(position_noise=0.005, rotation_noise=0.05), still, 1))
+    away = found[:, :3] - still[:, :3]
+    np.testing.assert_allclose(away.std(0), 0.005, rtol=0.05)
+    np.testing.assert_allclose(away.mean(0), 0.0, atol=3e-4)
+    turn = rotations.multiply(found[:, 3:], rotations.conjugate(jnp.asarray(still[:, 3:])))
+    np.testing.assert_allclose(2.0 * np.std(turn[:, 1:], 0), 0.05, rtol=0.05)
+    np.testing.assert_allclose(np.linalg.norm(found[:, 3:], axis=1), 1.0, atol=1e-5)
+    assert not np.array_equal(found[0], found[1])
+    again = shown(sensors(position_noise=0.005, rotation_noise=0.05), still, 1)
+    np.testing.assert_array_equal(found, again)
+
+
+def test_trackers_are_drawn_from_their_ranges():
+    """60 ms are 6 control steps of 10 ms; a tracker that is faster than control samples once a step."""
+    config = SensingConfig((0.0, 0.1), (0.06, 0.1), (0.0, 0.01), (0.02, 0.1), (0.1, 0.3))
+    drawn = jax.device_get(sensing.draw_sensors(config, 0.01, jax.random.key(0), 500))
+    assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10} and sensing.longest(config, 0.01) == 11
+    assert drawn.period.min() == 1.0 and 9.9 < drawn.period.max() <= 10.0
+    assert 0.1 <= drawn.dropout.min() < 0.11 and 0.29 < drawn.dropout.max() <= 0.3
+    assert drawn.position_noise.max() <= 0.01 and drawn.rotation_noise.min() >= 0.02
+    assert len(np.unique(drawn.key, axis=0)) == 500
+    perfect = jax.device_get(sensing.draw_sensors(SensingConfig(), 0.01, jax.random.key(0), 3))
+    assert not any(np.any(field) for field in (*perfect[3:],)) and (perfect.period == 1.0).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(pushed=npst.arrays(np.float32, (7, 2, 3), elements=st.floats(-1, 1, width=32)), steps=st.integers(1, 5))
+def test_readings_are_the_last_ones_newest_first(pushed, steps):
+    def reading(row):
+        return Readings(*[row] * len(Readings._fields))
+
+    readings = sensing.still(reading(pushed[0]), steps)
+    for row in pushed[1:]:
+        readings = sensing.push(readings, reading(row))
+    for field in readings:
+        np.testing.assert_array_equal(field, np.stack(pushed[::-1][:steps], 1))
+
+
+def readings_of(seed, state):
+    """Random past readings behind the present ones of a state."""
+    rng = np.random.default_rng(seed)
+
+    def past(present, unit):
+        drawn = rng.normal(size=(len(present), TASK.history - 1, present.shape[-1])).astype(np.float32)
+        drawn = drawn / np.linalg.norm(drawn, axis=-1, keepdims=True) if unit else drawn
+        return np.concatenate([np.asarray(present)[:, None], drawn], 1)
+
+    return Readings(*(past(getattr(state, name), "quaternion" in name) for name in Readings._fields))
+
+
+@jax.jit
+def both(state, surface, goal, readings):
+    """The full observation of a state, and the tracked one."""
+    seen = sensing.seen_by(TASK, state, readings)
+    whole = observation.observe(scene_of(HAND, FULL, state, surface, goal))
+    return whole, observation.observe(scene_of(HAND, TASK, seen, surface, goal, readings))
+
+
+def tracked(*given):
+    return both(*given)[1]
+
+
+def named(row):
+    """Parts of an observation by block and field."""
+    found, start = {}, 0
+    for block, content in observation.fields(HAND, TASK).items():
+        for field in content:
+            found[block, field.name] = row[start : start + field.size]
+            start += field.size
+    assert start == len(row)
+    return found
+
+
+def test_a_tracked_observation_knows_no_force_and_no_velocity():
+    """Nothing that only a simulator knows changes a bit of it."""
+    state, surface, goal = scene(0)
+    readings = readings_of(0, state)
+    expected = np.asarray(tracked(state, surface, goal, readings))
+    other, _, _ = scene(1)
+    hidden = ("q_velocity", "u_velocity", "object_velocity", "object_angular_velocity")
+    hidden += ("contact_force", "contact_position", "contact_found", "object_position", "object_quaternion")
+    changed = state._replace(**{name: getattr(other, name) for name in hidden})
+    np.testing.assert_array_equal(tracked(changed, surface, goal, readings), expected)
+    assert not {"force", "touching", "q_velocity", "force_minus", "force_other"} & {
+        name for _, name in named(expected[0])
+    }
+
+
+def test_its_state_is_that_of_the_full_observation_through_the_tracked_pose():
+    state, surface, goal = scene(2)
+    readings = readings_of(2, state)
+    whole, own = (np.asarray(found)[1] for found in both(state, surface, goal, readings))
+    own, start = named(own), 0
+    for block, content in observation.fields(HAND, FULL).items():
+        for field in content:
+            if not field.privileged:
+                part = whole[start : start + field.size]
+                np.testing.assert_allclose(own.pop((block, field.name)), part, atol=1e-5, err_msg=field.name)
+            start += field.size
+    assert all(name.startswith("past") for _, name in own) and len(own) == 6
+
+
+def test_its_past_is_worked_out_by_hand():
+    state, surface, goal = scene(3)
+    state = state._replace(u=np.zeros_like(state.u), base_quaternion=np.tile([1, 0, 0, 0], (4, 1)).astype(np.float32))
+    present = Readings(*(jnp.asarray(getattr(state, name)) for name in Readings._fields))
+    readings = sensing.still(present, TASK.history)
+    quarter = np.array([np.cos(0.1), 0, 0, np.sin(0.1)], np.float32)  # 0.2 rad about z later
+    now = present._replace(
+        q=present.q + 0.1,
+        object_position=present.object_position + jnp.array([0.0, 0.0, 0.02]),
+        object_quaternion=rotations.multiply(jnp.asarray(quarter), present.object_quaternion),
+    )
+    state = state._replace(q=now.q)
+    found = named(np.asarray(tracked(state, surface, goal, sensing.push(readings, now)))[0])
+    past = {
+        name.removeprefix("past "): part.reshape(TASK.history - 1, -1)
+        for (_, name), part in found.items()
+        if "past" in name
+    }
+    np.testing.assert_allclose(past["q - q"], -0.1, atol=1e-6)
+    np.testing.assert_allclose(past["u - u"], 0.0)
+    np.testing.assert_allclose(past["q_target - past q"][3], (present.q_target - present.q)[0], atol=1e-6)
+    np.testing.assert_allclose(past["object_position"], np.tile([0.0, 0.0, -0.02], (7, 1)), atol=1e-6)
+    np.testing.assert_allclose(past["object_rotation"], np.tile([0.0, 0.0, 2 * np.sin(0.1)], (7, 1)), atol=1e-6)
+
+
+def test_the_wrist_s_velocity_is_its_way_in_the_last_step():
+    state, _, _ = scene(4)
+    readings = readings_of(4, state)
+    seen = sensing.seen_by(TASK, state, readings)
+    np.testing.assert_allclose(seen.u_velocity, (readings.u[:, 0] - readings.u[:, 1]) / 0.01, rtol=1e-5)
+    assert not seen.contact_found.any() and not seen.contact_force.any() and not seen.object_velocity.any()
+    full = sensing.seen_by(FULL, state, readings)
+    np.testing.assert_array_equal(full.u_velocity, state.u_velocity)
+    np.testing.assert_array_equal(full.contact_force, state.contact_force)
+    assert full.q_velocity.shape == (4, F) and full.contact_found.shape[1] == L

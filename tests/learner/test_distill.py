@@ -1,0 +1,169 @@
+"""Distillation: the loss against numbers worked out by hand, a student that comes to its teacher, bad teachers."""
+
+import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from common.config import DistillConfig, NetworkConfig, RunConfig, TaskConfig
+from common.errors import CongraspError
+from common.policy import bundle as bundles
+from common.policy.bundle import PolicyBundle, PolicySpec, mean_action, policy_spec
+from learner.algorithms.distill import Distillation
+from learner.algorithms.protocol import NonFiniteUpdate, random_policy
+from services.train.student import TRACKERS
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+NETWORK = NetworkConfig(hidden=(32,), encoder=4)
+TASK = TaskConfig(hand="allegro", constraints=("heading",), surface_points=64)
+WORLDS, STEPS = 32, 8
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory):
+    """A teacher's file; its actions depend on what it sees, and spread by 0.5 in one entry and 0.1 in the others."""
+    spec = policy_spec(TASK, NETWORK)
+    policy = random_policy(1, spec)
+    actor = jax.tree.map(np.array, policy.params["actor"])
+    actor["network"]["output"]["kernel"] *= 30.0
+    actor["log_std"] = np.log(np.where(np.arange(spec.action_size) == 0, 0.5, 0.1)).astype(np.float32)
+    params = {**policy.params, "actor": actor}
+    bundle = PolicyBundle(spec, TASK, params, policy.observation, policy.value, 1, "t", 0)
+    path = tmp_path_factory.mktemp("teacher") / "policy.safetensors"
+    bundles.save(bundle, path)
+    return path
+
+
+def run_of(teacher, **distill):
+    task = dataclasses.replace(TASK, observation="tracked", sensing=TRACKERS, history=3)
+    config = DistillConfig(teacher=str(teacher), minibatches=4, **distill)
+    return RunConfig(task=task, network=NETWORK, algorithm="distill", distill=config, updates=100)
+
+
+def batch(run, seed, worlds=WORLDS):
+    """Random observations of both, of which the teacher's first entries are the student's: what it can learn from."""
+    rng = np.random.default_rng(seed)
+    own, whole = (
+        sum(size for _, size in policy_spec(task, NETWORK).layout)
+        for task in (run.task, dataclasses.replace(run.task, observation="full"))
+    )
+    seen = rng.normal(size=(STEPS, worlds, max(own, whole))).astype(np.float32)
+    return {"observation": seen[..., :own].astype(np.float16), "teacher_observation": seen[..., :whole]}
+
+
+def algorithm(run):
+    return Distillation(policy_spec(run.task, NETWORK), run)
+
+
+def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher):
+    """Of a student whose mean is zero: half the sum of (mean / deviation)^2 over the action, averaged over all."""
+    run = run_of(teacher, epochs=1, learning_rate=0.0)
+    student, rows = algorithm(run), batch(run, 0)
+    state = student.init(0)
+    state.params["actor"]["network"]["output"] = jax.tree.map(
+        jnp.zeros_like, state.params["actor"]["network"]["output"]
+    )
+    bundle = bundles.load(teacher)
+    labels = np.asarray(mean_action(bundle.spec.layout, bundle.inference_parameters, rows["teacher_observation"]))
+    deviation = np.where(np.arange(labels.shape[-1]) == 0, 0.5, 0.1)
+    after, metrics = student.update(state, rows)
+    np.testing.assert_allclose(metrics["imitation_kl"], 0.5 * ((labels / deviation) ** 2).sum(-1).mean(), rtol=1e-4)
+    np.testing.assert_allclose(metrics["action_std"], deviation.mean(), rtol=1e-5)
+    assert after.version == 1 and after.transitions == STEPS * WORLDS and metrics["learning_rate"] == 0.0
+    jax.tree.map(np.testing.assert_array_equal, after.params["critic"], state.params["critic"])
+
+
+def test_a_student_comes_to_its_teacher_and_keeps_its_deviation(teacher):
+    run = run_of(teacher)
+    student = algorithm(run)
+    state, losses, rates = student.init(0), [], []
+    for seed in range(60):
+        state, metrics = student.update(state, batch(run, seed))
+        losses.append(metrics["imitation_kl"])
+        rates.append(metrics["learning_rate"])
+    assert np.mean(losses[-5:]) < 0.25 * losses[0]  # on states that it has not seen
+    np.testing.assert_allclose(rates, 1e-3 * (1.0 - np.arange(60) / 100))
+    log_std = bundles.load(teacher).params["actor"]["log_std"]
+    np.testing.assert_array_equal(student.policy(state).params["actor"]["log_std"], log_std)
+    assert state.observation.count == 60 * STEPS * WORLDS
+
+
+def test_a_batch_that_is_not_finite_changes_nothing(teacher):
+    run = run_of(teacher)
+    student, rows = algorithm(run), batch(run, 0)
+    state = student.init(0)
+    rows["teacher_observation"][3, 2] = np.nan
+    with pytest.raises(NonFiniteUpdate, match="Not finite in the rollouts of update 1: imitation_kl") as caught:
+        student.update(state, rows)
+    assert caught.value.state is state
+    with pytest.raises(CongraspError, match=r"8 transitions does not make 16 minibatches\. Use fewer --distill"):
+        algorithm(dataclasses.replace(run, distill=DistillConfig(teacher=str(teacher)))).update(
+            state, batch(run, 0, worlds=1)
+        )
+
+
+def test_a_teacher_that_does_not_fit_is_one_line(teacher):
+    run = run_of(teacher)
+    spec = policy_spec(run.task, NETWORK)
+
+    def refused(match, spec=spec, **changed):
+        with pytest.raises(CongraspError, match=match) as caught:
+            Distillation(spec, dataclasses.replace(run, **changed))
+        assert "\n" not in str(caught.value)
+
+    refused("Distillation needs a teacher. Name a hand or a policy file with --teacher", distill=DistillConfig())
+    refused("cannot be read", distill=DistillConfig(teacher="absent.safetensors"))
+    refused("cannot teach the hand 'human'", PolicySpec("human", spec.layout, spec.action_size, NETWORK))
+    refused("learnt with another 'control_dt'", task=dataclasses.replace(run.task, control_dt=0.02))
+    refused("does not observe what", task=dataclasses.replace(run.task, constraints=("heading", "pose")))
+
+
+def test_the_command_line_s_teacher_is_the_whole_task(teacher, monkeypatch):
+    """`--teacher FILE` takes its task, adds what a robot's sensors do, and names the file by its place."""
+    from services.cli.train import defaults
+
+    monkeypatch.chdir(teacher.parent)
+    config = defaults(["--preset", "quickstart", "--teacher", teacher.name, "--updates", "7"])["config"]
+    assert config.algorithm == "distill" and config.distill.teacher == str(teacher)
+    assert config.name == "quickstart-student" and config.task.method == "student"
+    assert (config.task.observation, config.task.sensing, config.task.hand) == ("tracked", TRACKERS, "allegro")
+    assert config.task.surface_points == TASK.surface_points
+    Distillation(policy_spec(config.task, config.network), config)
+
+
+TWO_DEVICES = """
+import sys, jax, numpy as np
+from jax.sharding import Mesh
+from learner.collectives import AXIS
+from tests.learner.test_distill import algorithm, batch, run_of
+
+mesh = Mesh(np.array(jax.devices()), (AXIS,))
+assert mesh.size == 2
+run = run_of(sys.argv[1], epochs=1)
+student = algorithm(run)
+one, two = student.init(0), student.init(0)
+one, expected = student.update(one, batch(run, 0))
+two, metrics = student.update(two, batch(run, 0), mesh)
+assert two.transitions == one.transitions
+np.testing.assert_allclose(metrics["imitation_kl"], expected["imitation_kl"], rtol=0.05)
+np.testing.assert_allclose(two.observation.mean, one.observation.mean, atol=1e-5)
+"""
+
+
+@pytest.mark.timeout(120)
+def test_its_batch_is_divided_between_two_devices(teacher):
+    environment = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": str(ROOT),
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+    }
+    command = [sys.executable, "-c", TWO_DEVICES, str(teacher)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100.0)
+    assert done.returncode == 0, done.stderr
