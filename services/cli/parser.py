@@ -87,11 +87,13 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
 
 def _described(hint: Any) -> Any:
     """A parameter's type, with how its values and its default are shown."""
-    kind = typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
+    kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
+    for mark in marks:  # a type that is known only when a command line is parsed, such as the engines' names
+        kind = made() if (made := getattr(mark, "constructor_factory", None)) else kind
     metavar = None
     if typing.get_origin(kind) is tuple and typing.get_args(kind)[-1] is Ellipsis:
         metavar = f"{_value(typing.get_args(kind)[0])} ..."
-    return Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint)]
+    return Annotated[(kind, *marks, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint))]
 
 
 def _value(kind: Any) -> str:
