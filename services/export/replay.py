@@ -123,6 +123,7 @@ def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:
             object_index=six(range(len(grasps))),
             mass_scale=six([MASS / grasp.obj.mass for grasp in grasps]),
             friction=six([FRICTION] * len(grasps)),
+            gain_scale=np.ones(6 * len(grasps)),
             base_position=six([state.position for state in states]),
             base_quaternion=six([state.rotation.as_quat(scalar_first=True) for state in states]),
             q=six([state.q for state in states]),

@@ -17,6 +17,7 @@ _TITLES = {
     "value_loss": ("Value loss", "squared scaled return"),
     "entropy": ("Entropy of the policy", "nats"),
     "kl": ("KL divergence of an update", "nats"),
+    "imitation_kl": ("KL divergence from student to teacher", "nats"),
     "learning_rate": ("Learning rate", "per step of Adam"),
     "clip_fraction": ("Clipped samples", "share"),
     "actor_grad_norm": ("Gradient norm of the actor", "before clipping"),

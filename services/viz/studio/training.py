@@ -279,7 +279,7 @@ def labels_of(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
     """Title, unit and group of each metric, as the figures of `congrasp plot` have them, in their order."""
     any_values = np.arange(2.0), np.arange(2.0)
     found = {}
-    for group, panels in figures({f"learner/0/{name}": any_values for name in metrics}).values():
+    for group, panels in figures({"": {f"learner/0/{name}": any_values for name in metrics}}).values():
         for panel in panels:
             for name in panel.metrics:
                 title = panel.title if len(panel.metrics) == 1 else f"{panel.title}: {name.rpartition('_')[2]}"
