@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from common.hands.skin import Skin
 from common.parallel import cores
 from services.export.frames import skin_of_motion
 from services.export.motion_file import GraspMotion
@@ -31,8 +32,9 @@ def camera_for(motions: Sequence[GraspMotion]) -> Camera:
 def _extent(motion: GraspMotion) -> np.ndarray:
     """(n, 3) points of the hand's skin and of the object at some frames of a motion."""
     found = []
-    for shapes in (_shapes(motion, frame) for frame in {*range(0, len(motion.time), _STEP), len(motion.time) - 1}):
-        hand, thing = shapes[:2]
+    skin = skin_of_motion(motion)
+    for frame in {*range(0, len(motion.time), _STEP), len(motion.time) - 1}:
+        hand, thing = _shapes(motion, skin, frame)[:2]
         found += [hand.vertices, Rotation.from_quat(thing.quaternion, scalar_first=True).apply(thing.vertices)]
         found[-1] = found[-1] + thing.position
     return np.concatenate(found)
@@ -40,8 +42,10 @@ def _extent(motion: GraspMotion) -> np.ndarray:
 
 def pictures(motion: GraspMotion, camera: Camera) -> Iterator[np.ndarray]:
     """(height, width, 3) uint8 of every frame of a motion."""
+    skin = skin_of_motion(motion)
     with ThreadPoolExecutor(cores()) as pool:
-        yield from pool.map(lambda frame: render_scene(_shapes(motion, frame), camera, SIZE), range(len(motion.time)))
+        frames = range(len(motion.time))
+        yield from pool.map(lambda frame: render_scene(_shapes(motion, skin, frame), camera, SIZE), frames)
 
 
 def calibration(camera: Camera) -> dict[str, Any]:
@@ -57,9 +61,9 @@ def calibration(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _shapes(motion: GraspMotion, frame: int) -> list[Shape]:
+def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
     """The hand, the object, and the table while it stands."""
-    hand = skin_shape(skin_of_motion(motion), motion.link_position[frame], motion.link_quaternion[frame])
+    hand = skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
     colours = motion.colours
     thing = Shape(
         "mesh",

@@ -172,8 +172,10 @@ def error_mm(motion: GraspMotion, track: Track) -> float:
     distances = [np.linalg.norm(((expected[name] - track.poses[name]) @ points)[:, :3], axis=1) for name in expected]
     worst = max(float(distance.max()) for distance in distances)
     if track.triangles is not None:
-        vertices, faces, _ = object_mesh(motion)
-        corners = vertices[faces]
+        corners = motion.object_vertices[motion.object_faces]
+        if motion.colours and track.triangles.shape != corners.shape:
+            vertices, faces, _ = object_mesh(motion)
+            corners = vertices[faces]
         if track.triangles.shape != corners.shape:
             raise CongraspError("The file's mesh has other triangles than the object.")
         worst = max(worst, float(np.linalg.norm(track.triangles - corners, axis=-1).max()))

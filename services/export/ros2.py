@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
-from services.export.frames import COLOURS, OBJECT, Body, Track, bodies, facts, object_mesh, pose_matrices
+from common.objects.painting import nearest
+from services.export.frames import COLOURS, OBJECT, Body, Track, bodies, facts, pose_matrices
 from services.export.motion_file import GraspMotion
 from services.export.urdf import forward_kinematics, hand_urdf
 
@@ -162,8 +163,8 @@ def _transforms(make: _Messages, found: Sequence[Body], t: int, stamp: int) -> A
 
 def _marker(make: _Messages, motion: GraspMotion) -> Any:
     """The object's mesh as a marker."""
-    vertices, faces, own = object_mesh(motion)
-    corners, colours = vertices[faces.ravel()], [] if own is None else own[faces.ravel()].tolist()
+    corners = motion.object_vertices[motion.object_faces.ravel()]
+    colours = nearest(corners, motion.colours).tolist() if motion.colours else []
     image = make("sensor_msgs/CompressedImage", header=make.header(0, ""), format="", data=np.zeros(0, np.uint8))
     return make(
         "visualization_msgs/Marker",
