@@ -1,4 +1,4 @@
-"""Makes the mug of the README and the tutorials: `mug.obj`, and its handle alone, `mug-handle.obj`.
+"""Makes the mug of the README and the tutorials: `mug.obj`, and its handle alone, `handle.obj`.
 
     python examples/make_mug.py
 
@@ -74,7 +74,7 @@ def handle() -> trimesh.Trimesh:
 
 def main(folder: pathlib.Path = pathlib.Path(__file__).parent) -> None:
     """Writes both files."""
-    for name, mesh in (("mug", trimesh.util.concatenate([body(), handle()])), ("mug-handle", handle())):
+    for name, mesh in (("mug", trimesh.util.concatenate([body(), handle()])), ("handle", handle())):
         text = trimesh.exchange.obj.export_obj(
             mesh, include_normals=False, header="Made by examples/make_mug.py", digits=5
         )

@@ -273,7 +273,7 @@ def set_affordance(
       folder: Folder of objects, to which the new one goes.
 
     Examples:
-      congrasp objects affordance examples/mug.obj --part-mesh examples/mug-handle.obj
+      congrasp objects affordance examples/mug.obj --part-mesh examples/handle.obj --invert
       congrasp objects affordance mug_7 --half-space 0 0 1 0.02 --name upper-mug
     """
     from common.objects.store import Catalogue

@@ -39,9 +39,9 @@ def turntable(episode: Message) -> Mapping[str, Any]:
     frames, bones = _frames(episode, steps), len(hand.links)
     skin, table = skin_of(hand), table_shape(arrays["object_position"][0])
     links, weights = skin.influences()
-    thing = Shape("mesh", (0, 0), OBJECT, vertices=arrays["visual_vertices"], faces=arrays["visual_faces"])
+    body = Shape("mesh", (0, 0), OBJECT, vertices=arrays["visual_vertices"], faces=arrays["visual_faces"])
     parts = [(skin.points, skin.normals, skin_colours(skin), skin.faces, links, weights)]
-    for bone, shape in ((bones, thing), (bones + 1, table)):
+    for bone, shape in ((bones, body), (bones + 1, table)):
         found = triangles_of([shape], fine=False)
         count = len(found.points)
         moved = np.tile([bone, 0, 0, 0], (count, 1)), np.tile([1.0, 0, 0, 0], (count, 1))
