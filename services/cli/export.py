@@ -98,14 +98,16 @@ def grasp(
     gets NPZ files with its names, of which examples/dexgraspbench.py makes its pickles. Each is read back and placed
     by the benchmark's kinematics; the largest error in millimetres is printed.
 
-    Examples: congrasp export grasp grasps; congrasp export grasp grasps/mug/grasp.npz --replay
-
     Args:
       paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); what is not held is left out.
       to: The project.
       out: The folder to write.
       replay: Also hold the exam here, by MuJoCo C: six pushes of 1 N without gravity, from the grasp and from the
         pregrasp; writes replay.json.
+
+    Examples:
+      congrasp export grasp grasps
+      congrasp export grasp grasps/mug/grasp.npz --replay
     """
     from services.cli.console import tracked
     from services.export.dexgraspbench import export_grasps
