@@ -26,11 +26,11 @@ def finer(
 
 
 def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh (V, 3), (F, 3) cut finer, and (V', 3) sRGB in [0, 1] of its points: of each the nearest known one's."""
+    """A mesh (V, 3), (F, 3) cut finer, and (V', 3) uint8 sRGB of its points: of each the nearest known one's."""
     vertices, faces = finer(vertices, faces, _OWN_EDGE, _OWN_MOST_FACES)
     return vertices, faces, nearest(vertices, colours)
 
 
 def nearest(points: np.ndarray, colours: Colours) -> np.ndarray:
-    """(n, 3) sRGB in [0, 1] at points (n, 3) of a surface."""
-    return colours.values[cKDTree(colours.points).query(points)[1]].astype(np.float32) / 255
+    """(n, 3) uint8 sRGB at points (n, 3) of a surface."""
+    return colours.values[cKDTree(colours.points).query(points)[1]]

@@ -87,7 +87,8 @@ def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray
     """The object's mesh (V, 3), (F, 3) and the sRGB (V, 3) in [0, 1] of its points; it is cut finer for these."""
     if motion.colours is None:
         return motion.object_vertices, motion.object_faces, None
-    return painted(motion.object_vertices, motion.object_faces, motion.colours)
+    vertices, faces, colours = painted(motion.object_vertices, motion.object_faces, motion.colours)
+    return vertices, faces, colours.astype(np.float32) / 255
 
 
 def skin_of_motion(motion: GraspMotion) -> Skin:

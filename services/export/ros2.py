@@ -164,7 +164,7 @@ def _transforms(make: _Messages, found: Sequence[Body], t: int, stamp: int) -> A
 def _marker(make: _Messages, motion: GraspMotion) -> Any:
     """The object's mesh as a marker."""
     corners = motion.object_vertices[motion.object_faces.ravel()]
-    colours = nearest(corners, motion.colours).tolist() if motion.colours else []
+    colours = (nearest(corners, motion.colours) / 255).tolist() if motion.colours else []
     image = make("sensor_msgs/CompressedImage", header=make.header(0, ""), format="", data=np.zeros(0, np.uint8))
     return make(
         "visualization_msgs/Marker",

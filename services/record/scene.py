@@ -147,7 +147,7 @@ def _static_scene(
     body.indices.extend(arrays["visual_faces"].ravel().tolist())
     if "colour_values" in arrays:
         own = Colours(arrays["colour_points"], arrays["colour_values"])
-        for colour in nearest(arrays["visual_vertices"], own).tolist():
+        for colour in (nearest(arrays["visual_vertices"], own) / 255).tolist():
             _set_colour(body.colors.add(), (*colour, 1.0))
     _set_colour(body.color, _OBJECT)
     text = _entity(update, "label", frame, now).texts.add(billboard=True, font_size=0.015, text=_label(meta))

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from common.errors import CongraspError
-from common.objects.painting import finer
+from common.objects.painting import finer, painted
 from common.objects.spec import GraspObject
 
 _versions = itertools.count(1)
@@ -29,13 +29,18 @@ class Canvas:
 
     Attributes:
       vertices, faces: (V, 3), (E, 3) of the mesh that is painted on.
+      colours: (V, 3) uint8 sRGB of the object's own; None if it has none.
       paint: what is painted.
     """
 
     def __init__(self, obj: GraspObject):
         """Cuts the object's mesh finer."""
         self._obj = obj
-        self.vertices, self.faces = finer(obj.visual_vertices, obj.visual_faces)
+        self.colours: np.ndarray | None = None
+        if obj.colours:
+            self.vertices, self.faces, self.colours = painted(obj.visual_vertices, obj.visual_faces, obj.colours)
+        else:
+            self.vertices, self.faces = finer(obj.visual_vertices, obj.visual_faces)
         self._set(np.zeros(len(obj.points), bool), np.zeros(len(self.vertices), bool))
 
     @property

@@ -7,6 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.hands import known_hand
+from common.objects.painting import painted
+from common.objects.spec import Colours
 from common.task.constraints import CONSTRAINTS
 from common.task.constraints.base import ErrorSpec
 from common.task.reward import GRASP
@@ -80,6 +82,10 @@ def for_page(episode: Message) -> Message:
     )
     keep += ("visual_vertices", "visual_faces", "surface_points", "surface_minus")
     arrays: dict[str, Any] = {name: episode.arrays[name] for name in keep}
+    if "colour_values" in episode.arrays:
+        own = Colours(episode.arrays["colour_points"], episode.arrays["colour_values"])
+        mesh = painted(arrays["visual_vertices"], arrays["visual_faces"], own)
+        arrays |= dict(zip(("visual_vertices", "visual_faces", "visual_colours"), mesh, strict=True))
     arrays |= {name: value for name, value in episode.arrays.items() if name.startswith(("reward/", "goal/"))}
     arrays |= {f"active/{block}": np.array(on) for block, on in active_blocks(episode.arrays).items()}
     for name, lane in found.items():

@@ -127,8 +127,9 @@ class Session:
     def mesh(self) -> Message:
         """The object's mesh that is painted on."""
         with self._lock:
-            vertices, faces = self._studio.canvas.vertices, self._studio.canvas.faces
-            return Message({"vertices": vertices, "faces": faces}, {"name": self._studio.obj.name})
+            canvas, name = self._studio.canvas, self._studio.obj.name
+        own = {} if canvas.colours is None else {"colours": canvas.colours}
+        return Message({"vertices": canvas.vertices, "faces": canvas.faces, **own}, {"name": name})
 
     def rest_picture(self, index: str) -> Picture:
         """The object in one of its resting poses, from 0."""

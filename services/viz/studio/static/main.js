@@ -70,7 +70,7 @@ class App {
 
   async #object({ studio, shown }) {
     const [mesh, paint] = await Promise.all([fetchMessage("/api/object"), fetchMessage("/api/paint")]);
-    this.scene.setObject(mesh.arrays.vertices.data, mesh.arrays.faces.data);
+    this.scene.setObject(mesh.arrays.vertices.data, mesh.arrays.faces.data, mesh.arrays.colours?.data);
     this.body.paint(paint.arrays.avoid.data);
     this.shownObject = shown;
     this.shownPaint = studio.painted;

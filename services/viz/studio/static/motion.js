@@ -18,6 +18,7 @@ export class Motion {
     this.dt = meta.control_dt;
     this.vertices = arrays.visual_vertices.data;
     this.faces = arrays.visual_faces.data;
+    this.colours = arrays.visual_colours?.data;
     this.positions = rows(arrays.link_position);
     this.quaternions = rows(arrays.link_quaternion);
     this.objects = rows(arrays.object_position);

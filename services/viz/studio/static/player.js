@@ -124,7 +124,7 @@ export class Player {
       const motion = new Motion(id, await fetchMessage("/api/motion", { id }));
       await this.app.hand(motion.hand);
       if (number !== this.wanted) return null;
-      const body = new Body(this.app.renderer, motion.vertices, motion.faces);
+      const body = new Body(this.app.renderer, motion.vertices, motion.faces, motion.colours);
       body.paint(motion.avoid);
       return { motion, body, name: name || motion.meta.object };
     } catch (error) {

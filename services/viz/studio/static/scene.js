@@ -30,9 +30,9 @@ function along(start, direction, stretch = 1) {
   return [...x, 0, ...y, 0, ...scale(direction, stretch), 0, ...start, 1];
 }
 
-// An object's mesh for drawing, painting and picking.
+// An object's mesh for drawing, painting and picking; `own` are three bytes of colour for each vertex, if it has any.
 export class Body {
-  constructor(renderer, vertices, faces) {
+  constructor(renderer, vertices, faces, own = null) {
     this.renderer = renderer;
     this.vertices = vertices;
     this.faces = faces;
@@ -40,6 +40,8 @@ export class Body {
     this.points = mesh.positions;
     this.vertex = mesh.vertex;
     this.colours = mesh.colours;
+    this.bare = new Float32Array(this.colours.length); // without paint
+    mesh.vertex.forEach((vertex, i) => this.bare.set(own ? [0, 1, 2].map((k) => own[3 * vertex + k] / 255) : OBJECT, 3 * i));
     this.normals = mesh.normals;
     this.mesh = renderer.mesh(mesh);
     this.paint(null);
@@ -49,7 +51,7 @@ export class Body {
 
   // Colours by a label for each vertex; all alike without labels.
   paint(avoid) {
-    this.vertex.forEach((vertex, i) => this.colours.set(avoid && avoid[vertex] ? AVOID : OBJECT, 3 * i));
+    this.vertex.forEach((vertex, i) => this.#colour(this.colours, 3 * i, Boolean(avoid?.[vertex])));
     this.renderer.recolour(this.mesh, this.colours);
   }
 
@@ -58,9 +60,13 @@ export class Body {
     if (!point && !this.previewed) return;
     this.previewed = Boolean(point);
     const colours = point ? this.colours.slice() : this.colours;
-    const colour = avoid ? AVOID : OBJECT;
-    if (point) this.#within(point, radius, (i) => { for (let k = 0; k < 3; k++) colours[i + k] += HINT * (colour[k] - colours[i + k]); });
+    if (point) this.#within(point, radius, (i) => this.#colour(colours, i, avoid, HINT));
     this.renderer.recolour(this.mesh, colours);
+  }
+
+  // Moves the colour at a place of an array by a share towards the paint, or what is below it.
+  #colour(colours, i, avoid, share = 1) {
+    for (let k = 0; k < 3; k++) colours[i + k] += share * ((avoid ? AVOID[k] : this.bare[i + k]) - colours[i + k]);
   }
 
   #within(point, radius, act) {
@@ -72,8 +78,7 @@ export class Body {
 
   // Colours what a brush at a point of the object frame touches, until the server's answer is there.
   brush(point, radius, avoid) {
-    const colour = avoid ? AVOID : OBJECT;
-    this.#within(point, radius, (i) => this.colours.set(colour, i));
+    this.#within(point, radius, (i) => this.#colour(this.colours, i, avoid));
     this.renderer.recolour(this.mesh, this.colours);
   }
 
@@ -129,9 +134,9 @@ export class Scene {
     this.hands.set(name, new Skin(this.renderer, message));
   }
 
-  setObject(vertices, faces) {
+  setObject(vertices, faces, own) {
     this.body?.release();
-    this.body = new Body(this.renderer, vertices, faces);
+    this.body = new Body(this.renderer, vertices, faces, own);
   }
 
   // The hand, with shares of a colour on its links.
