@@ -16,7 +16,7 @@ class Reader(html.parser.HTMLParser):
         attributes = dict(attributes)
         if tag == "img":
             self.sources.append(attributes["src"])
-        elif tag not in ("meta", "link", "br"):
+        elif tag not in ("meta", "link", "br", "input"):
             self.open.append(tag)
         self.links += [attributes[name] for name in ("href", "action") if name in attributes]
         if tag == "td":
