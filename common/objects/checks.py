@@ -7,7 +7,7 @@ import numpy as np
 
 from common.errors import CongraspError
 from common.inputs import LONGEST_NAME, file_name
-from common.objects.spec import SURFACE_POINTS, GraspObject, Piece
+from common.objects.spec import COLOUR_POINTS, SURFACE_POINTS, GraspObject, Piece
 
 LARGEST = 10.0
 """Metres from the object frame's origin to anything of the object."""
@@ -79,8 +79,10 @@ def _shapes(obj: GraspObject) -> Iterator[str]:
     arrays = {name: np.asarray(getattr(obj, name)) for name in wanted}
     if obj.colours:
         arrays |= {"colour_points": obj.colours.points, "colour_values": obj.colours.values}
-        count = max(len(obj.colours.points), 1)
+        count = min(max(obj.colours.points.size // 3, 1), COLOUR_POINTS)
         wanted |= {"colour_points": ("f", (count, 3)), "colour_values": ("u", (count, 3))}
+        if obj.colours.values.dtype != np.uint8:
+            yield f"its colour_values are {obj.colours.values.dtype}, not uint8"
     for name, (kinds, shape) in wanted.items():
         array = arrays[name]
         fits = len(array.shape) == len(shape) and all(w in (None, n) for w, n in zip(shape, array.shape, strict=True))

@@ -1,28 +1,47 @@
 """Meshes cut finely enough for colours of their points to show a picture."""
 
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
 from common.objects.spec import Colours
 
 _EDGE, _MOST_FACES = 0.006, 12_000
-"""m, that no edge need be shorter than; faces beyond which a mesh is not cut finer."""
+"""m, that no edge need be shorter than; most faces."""
 _OWN_EDGE, _OWN_MOST_FACES = 0.003, 40_000  # where a surface has colours of its own
 
 
 def finer(
     vertices: np.ndarray, faces: np.ndarray, edge: float = _EDGE, most: int = _MOST_FACES
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface (V, 3), (F, 3), cut until its edges are as short as `edge` (m) or it has `most` faces."""
+    """The same surface, its longest edges halved again and again.
+
+    Args:
+      vertices: (V, 3).
+      faces: (F, 3).
+      edge: how short edges need be, m; on a large surface they stay longer.
+      most: how many faces there may be; a mesh that has as many is left as it is.
+
+    Returns:
+      Vertices (V', 3) float32 and faces (F', 3) int32.
+    """
+    corners = np.asarray(vertices, float)[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum() / 2
+    longest = max(edge, 2.2 * float(np.sqrt(area / most)))
     if len(faces) >= most:
         return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
-    area = float(trimesh.Trimesh(vertices, faces, process=False).area)
-    longest = max(edge, 2.2 * float(np.sqrt(area / most)))
-    fine, cut = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=12)[:2]
-    merged = trimesh.Trimesh(fine, cut, process=False)
-    merged.merge_vertices()
-    return np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32)
+    while len(corners) < most:
+        sides = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=-1)
+        order = np.argsort(-sides.max(1))[: most - len(corners)]
+        order = order[sides[order].max(1) > longest]
+        if not len(order):
+            break
+        first = (sides[order].argmax(1)[:, None] + np.arange(3)) % 3
+        start, end, across = np.take_along_axis(corners[order], first[..., None], 1).swapaxes(0, 1)
+        middle = (start + end) / 2
+        corners[order] = np.stack([start, middle, across], 1)
+        corners = np.concatenate([corners, np.stack([middle, end, across], 1)])
+    points, found = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return points.astype(np.float32), found.reshape(-1, 3).astype(np.int32)
 
 
 def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -62,20 +62,21 @@ def free_port(count: int = len(FLOWS)) -> int:
     As long as this process lives, none of them is returned again: not here, and not to another process of this user.
 
     Raises:
-      OSError: there seems to be none.
+      OSError: there seems to be none, or reservations cannot be kept in the folder for temporary files.
     """
+    file = _reservations()
     for _ in range(_ATTEMPTS):
         ports = range(start := _LOWEST + secrets.randbelow(_COUNT - count), start + count)
         with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
             for port in ports:
                 stack.enter_context(socket.socket()).bind(("127.0.0.1", port))
-            _reserve(ports)
+            _reserve(file, ports)
             return start
     raise OSError(f"No {count} neighbouring TCP ports are free on the loopback interface.")
 
 
-def _reserve(ports: range) -> None:
-    """Locks a byte for each port in a file of this user's; the system takes the locks back when the process ends.
+def _reserve(file: int, ports: range) -> None:
+    """Locks a byte of the file for each port; the system takes the locks back when the process ends.
 
     Raises:
       OSError: one is reserved already.
@@ -83,12 +84,12 @@ def _reserve(ports: range) -> None:
     with _lock:
         if not _reserved.isdisjoint(ports):
             raise OSError("A port is reserved by this process.")
-        fcntl.lockf(_reservations(), fcntl.LOCK_EX | fcntl.LOCK_NB, len(ports), ports.start)
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, len(ports), ports.start)
         _reserved.update(ports)
 
 
 @functools.cache
 def _reservations() -> int:
-    """Descriptor of the file, open until the process ends: closing it would give up every lock."""
+    """Descriptor of this user's file of locks, open until the process ends: closing it would give up every lock."""
     path = pathlib.Path(tempfile.gettempdir()) / f"congrasp-ports-{os.getuid()}"
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)

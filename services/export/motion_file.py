@@ -99,9 +99,10 @@ _GOALS = {
 _HINTS = get_type_hints(GraspMotion, include_extras=True)
 _ARRAYS = {name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")}
 _FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name not in ("goal", "colours"))
+_POINTS, _VALUES = "object_colour_points", "object_colour_values"
 _COLOURS = {
-    "object_colour_points": "(P, 3) m, object frame, points of the surface whose colours are known",
-    "object_colour_values": "(P, 3) sRGB from 0 to 255 there",
+    _POINTS: "(P, 3) m, object frame, points of the surface whose colours are known",
+    _VALUES: "(P, 3) sRGB from 0 to 255 there",
 }
 
 
@@ -112,7 +113,7 @@ def motion_of_episode(episode: Message) -> GraspMotion:
     dt = float(meta.pop("control_dt"))
     return GraspMotion(
         hand=hand.name,
-        object=meta.pop("object"),
+        object=file_name(meta.pop("object"), "the object of a motion"),
         success=bool(meta.pop("success")),
         control_dt=dt,
         constraints=active_constraints(arrays),
@@ -201,7 +202,7 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
         goal = {name: array for name, array in named.items() if name in _GOALS}
         own = _COLOURS if _COLOURS.keys() & arrays.keys() else {}
         _check_arrays({**arrays, **goal}, {**_ARRAYS, **own, **{name: _GOALS[name] for name in goal}})
-        colours = Colours(*(arrays[name] for name in own)) if own else None
+        colours = Colours(arrays[_POINTS], arrays[_VALUES].astype(np.uint8)) if own else None
         return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise CongraspError(f"{path} is not a grasp motion ({str(error)[:200]}).", remedy) from None
@@ -232,6 +233,9 @@ def _check_arrays(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> No
     for name, below in (("link_parent", "L"), ("joint_link", "L"), ("capsule_link", "L")):
         if arrays[name].min() < -(name == "link_parent") or arrays[name].max() >= sizes[below]:
             raise ValueError(f"{name} names links that are not there")
+    colours = arrays.get(_VALUES, np.zeros(1))
+    if colours.min() < 0 or colours.max() > 255:
+        raise ValueError(f"{_VALUES} are not from 0 to 255")
     if not (arrays["joint_limits"][:, 0] <= arrays["joint_limits"][:, 1]).all():
         raise ValueError("joint_limits are in the wrong order")
     if not (arrays["capsule_radius"] > 0).all() or not 0 < arrays["object_file_scale"] < _LARGEST:

@@ -21,6 +21,7 @@ from common.errors import CongraspError
 from common.hands import known_hand
 from common.hands.mjcf import WRIST_JOINTS
 from common.hands.spec import Hand, Link, capsule_ends
+from common.objects.checks import LARGEST
 from common.objects.painting import nearest
 from common.objects.spec import Colours
 from common.wire.codec import Message, encode
@@ -65,6 +66,11 @@ def check_episode(episode: Message) -> None:
     faces = episode.arrays["visual_faces"]
     if faces.min() < 0 or faces.max() >= sizes["V"]:
         raise CongraspError("The episode's visual_faces name vertices that are not there.")
+    if ("colour_points" in episode.arrays) != ("colour_values" in episode.arrays):
+        raise CongraspError("The episode has colour_points or colour_values without the other.")
+    for name in ("visual_vertices", "colour_points"):
+        if np.abs(episode.arrays.get(name, 0.0)).max() > LARGEST:
+            raise CongraspError(f"The episode's {name} are more than {LARGEST:g} m from the object's middle.")
     if any(array.size > _GOAL for name, array in episode.arrays.items() if name.startswith("goal/")):
         raise CongraspError(f"The episode has a goal array of more than {_GOAL} values.")
     if sum(name.startswith(_OPEN) for name in episode.arrays) > _ARRAYS:

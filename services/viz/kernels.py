@@ -1,7 +1,12 @@
 """Compiled loops over triangles and over the samples of a picture, which Numba keeps between processes."""
 
+import contextlib
+import os
+
 import numba
 import numpy as np
+
+from common.files import cache_folder
 
 GAMMA = 2.2
 """sRGB is about linear light to the power of one over this."""
@@ -12,9 +17,19 @@ _HIGHLIGHT = 60  # exponent: how sharp the highlight is
 _ROUNDING = 1e-9  # of weights: a sample on an edge belongs to both sides
 _SMALL = 1e-6  # samples: a triangle of a smaller area covers nothing
 
+
+def _kept() -> bool:
+    """Whether machine code can be kept in the user's cache; a process that may write nowhere compiles for itself."""
+    folder = cache_folder("kernels")
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    setattr(numba.config, "CACHE_DIR", str(folder))  # noqa: B010  its stubs know of no settings
+    return os.access(folder, os.W_OK)
+
+
 _Weights = tuple[tuple[float, float, float], tuple[float, float, float]]
 _compiled = numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "afn", "reassoc"}
+    cache=_kept(), nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "afn", "reassoc"}
 )
 
 

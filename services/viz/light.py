@@ -54,7 +54,7 @@ def _add(
     sample = max(np.ptp(x), np.ptp(y)) / (_GRID - 3)
     # One empty sample on each side: what is beyond the picture is in the light.
     left, upper = x.min() - sample, y.max() + sample
-    top, owner = np.full((_GRID, _GRID), -np.inf), np.empty((_GRID, _GRID), np.int32)
+    top, owner = np.full((_GRID, _GRID), -np.inf, np.float32), np.empty((_GRID, _GRID), np.int32)
     corners = np.stack([x - left, upper - y], -1) / sample
     cover(corners, height, bodies.faces, bodies.closed, top, owner)
     lifted = points + np.float32(_SKIN * sample) * normals

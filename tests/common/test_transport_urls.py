@@ -1,6 +1,11 @@
 """URL and role are all that a process names: flows, ports and certificates follow, whatever carries the messages."""
 
+import contextlib
+import json
 import multiprocessing
+import os
+import subprocess
+import sys
 import threading
 import time
 
@@ -9,7 +14,7 @@ import pytest
 import tests.socket_transport  # noqa: F401  adds its scheme
 from actors.link import ActorLink
 from common.errors import CongraspError, TransportError
-from common.transport import ports, urls
+from common.transport import urls
 from common.transport.keys import FLOWS, Keys, flow
 from common.transport.ports import free_port, local_url, rank_url, reachable_url
 from common.transport.security import RIGHTS, Credentials
@@ -18,7 +23,7 @@ from common.wire.schema import RolloutForm
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 from services.ops.certificates import create_authority, issue
-from tests.cluster import A, B, D, T, bundle, rollout
+from tests.cluster import ROOT, A, B, D, T, bundle, rollout
 
 pytestmark = pytest.mark.timeout(60)
 KEYS = Keys("test")
@@ -159,27 +164,35 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
         hub.close()
 
 
-def _reserve_ports(number: int, ours) -> None:
-    ports._COUNT = FEW
-    ours.send([free_port(1) for _ in range(number)])
-    ours.recv()  # lives until told to end
+TAKER = """
+import json, sys
+from common.transport import ports
+ports._LOWEST, ports._COUNT = {lowest}, 61  # sixty to choose from, so that one would soon be chosen twice
+for line in sys.stdin:
+    print(json.dumps([ports.free_port(1) for _ in range(int(line))]), flush=True)
+"""
 
 
-FEW = 61
-"""Ports to choose from, less one: so few that one would be chosen twice."""
+def test_no_port_is_given_twice_while_its_process_lives(tmp_path):
+    script = TAKER.format(lowest=30_000 + 61 * (os.getpid() % 40))  # above those that other tests take
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}  # and locks of its own
 
+    def taker():
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        return stack.enter_context(subprocess.Popen([sys.executable, "-c", script], env=environment, **pipes))
 
-def test_no_port_is_given_twice_while_its_process_lives(monkeypatch):
-    monkeypatch.setattr(ports, "_COUNT", FEW)
-    context = multiprocessing.get_context("spawn")
-    theirs, ours = context.Pipe()
-    other = context.Process(target=_reserve_ports, args=(20, theirs))
-    other.start()
-    assert ours.poll(30)
-    taken = ours.recv()
-    mine = [free_port(1) for _ in range(20)]
-    assert len({*taken, *mine}) == 40
-    ours.send("end")
-    other.join(10)
-    assert other.exitcode == 0
-    assert len({free_port(1) for _ in range(30)}) == 30  # twenty were left: those of the ended process are free again
+    def take(process, count):
+        process.stdin.write(f"{count}\n")
+        process.stdin.flush()
+        return json.loads(process.stdout.readline())
+
+    with contextlib.ExitStack() as stack:
+        one, other = taker(), taker()
+        taken, given = take(one, 20), take(other, 20)
+        assert len({*taken, *given}) == 40
+        one.stdin.close()
+        assert one.wait(20) == 0
+        # Twenty were left: those of the process that ended are free again.
+        assert len({*given, *take(other, 30)}) == 50
+        other.stdin.close()
+        assert other.wait(20) == 0

@@ -28,13 +28,13 @@ def sample_colours(paths: Sequence[pathlib.Path], seed: int) -> Colours | None:
     Raises:
       CongraspError: a file cannot be read with its colours.
     """
-    meshes = [mesh for path in paths if kind_of(path) != ".stl" for mesh in _meshes(path)]  # STL has no colours
-    if not any(_has_colours(mesh.visual) for mesh in meshes):
-        return None
-    rng = np.random.default_rng(seed)
-    areas = np.array([mesh.area for mesh in meshes])
-    counts = rng.multinomial(COLOUR_POINTS, areas / areas.sum())
     try:
+        meshes = [mesh for path in paths if kind_of(path) != ".stl" for mesh in _meshes(path)]  # STL has no colours
+        if not any(_has_colours(mesh.visual) for mesh in meshes):
+            return None
+        rng = np.random.default_rng(seed)
+        areas = np.array([mesh.area for mesh in meshes])
+        counts = rng.multinomial(COLOUR_POINTS, areas / areas.sum())
         sampled = [_sampled(mesh, int(count), rng) for mesh, count in zip(meshes, counts, strict=True) if count]
     except Exception as error:  # pictures and texture coordinates of files raise whatever they hold
         reason = (str(error) or type(error).__name__).splitlines()[0][:100].rstrip(" .!")

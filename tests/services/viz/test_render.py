@@ -1,7 +1,10 @@
 """Pictures show what is there, where it is, and in the right colours."""
 
 import dataclasses
+import os
 import pathlib
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -37,6 +40,7 @@ from services.viz.scene import Camera, Shape, between
 from services.viz.shapes import arrow, beads, fit
 from services.viz.sheets import contact_sheet, save_png, save_video
 from services.viz.triangles import cut, smooth_corners
+from tests.cluster import ROOT
 from tests.episodes import CONTROL_DT, episode, older
 
 WHITE, RED, BLUE = (0.9, 0.9, 0.9), (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
@@ -296,3 +300,10 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
     frames = render_episode_frames(pick_episode(tmp_path / "run", 0), range(4), (64, 48))
     save_video(tmp_path / "film.mp4", frames, (64, 48), 0.5 / CONTROL_DT)
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 4
+
+
+def test_pictures_need_no_folder_that_can_be_written() -> None:
+    script = "from services.viz import kernels; import numpy as np; print(kernels.averaged(np.ones((2, 2, 3)), 2))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": "/proc/nowhere"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.stdout.split() == ["[[[255", "255", "255]]]"], done.stderr

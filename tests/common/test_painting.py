@@ -1,0 +1,43 @@
+"""A mesh that is cut finer is the same surface, and no larger than it may be."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from common.objects.painting import finer, nearest, painted
+from common.objects.spec import Colours
+
+
+@pytest.mark.parametrize("sections", [8, 512, 2048])
+def test_the_surface_stays_and_faces_are_bounded(sections):
+    mesh = trimesh.creation.cylinder(0.03, 0.15, sections=sections)  # slivers, where there are many sections
+    vertices, faces = finer(mesh.vertices, mesh.faces, 0.003, 9_000)
+    fine = trimesh.Trimesh(vertices, faces, process=False)
+    assert len(mesh.faces) < len(faces) <= 9_000
+    assert fine.area == pytest.approx(mesh.area, rel=1e-4) and fine.volume == pytest.approx(mesh.volume, rel=1e-4)
+    assert vertices.dtype == np.float32 and faces.dtype == np.int32
+
+
+def test_edges_become_short():
+    mesh = trimesh.creation.cylinder(0.03, 0.15, sections=8)
+    vertices, faces = finer(mesh.vertices, mesh.faces, 0.004, 100_000)
+    corners = vertices[faces]
+    assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max() <= 0.004 + 1e-6
+
+
+def test_a_mesh_of_many_faces_is_left_as_it_is():
+    mesh = trimesh.creation.icosphere(3)
+    vertices, faces = finer(mesh.vertices, mesh.faces, 0.001, 1_000)
+    np.testing.assert_array_equal(faces, mesh.faces)
+    np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-6)
+
+
+def test_points_take_the_colour_of_the_nearest():
+    colours = Colours(np.array([[0, 0, -1], [0, 0, 1]], np.float32), np.array([[255, 0, 0], [0, 0, 255]], np.uint8))
+    np.testing.assert_array_equal(
+        nearest(np.array([[0.3, 0, 0.2], [0.0, 0.9, -0.1]]), colours), [[0, 0, 255], [255, 0, 0]]
+    )
+    box = trimesh.creation.box((0.02, 0.02, 0.02))
+    vertices, _, found = painted(box.vertices, box.faces, colours)
+    above = vertices[:, 2] > 1e-6
+    assert (found[above] == [0, 0, 255]).all() and above.sum() > 8
