@@ -268,8 +268,14 @@ def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[j
 
 def _orthogonal(cross: jax.Array, direction: jax.Array) -> jax.Array:
     """(B, 3) unit cross-finger directions orthogonal to the heading; any such where one is absent or parallel to it."""
-    cross = cross - jnp.sum(cross * direction, -1, keepdims=True) * direction
-    axis = jnp.eye(3)[jnp.abs(direction).argmin(-1)]
-    other = axis - jnp.sum(axis * direction, -1, keepdims=True) * direction
-    cross = jnp.where(jnp.linalg.norm(cross, axis=-1, keepdims=True) < 1e-3, other, cross)
-    return cross / jnp.linalg.norm(cross, axis=-1, keepdims=True)
+
+    def across(vector: jax.Array) -> jax.Array:
+        """Its part that is orthogonal to the heading."""
+        return vector - jnp.sum(vector * direction, -1, keepdims=True) * direction
+
+    def unit(vector: jax.Array) -> jax.Array:
+        return vector / jnp.linalg.norm(vector, axis=-1, keepdims=True)
+
+    rest, other = across(cross), across(jnp.eye(3)[jnp.abs(direction).argmin(-1)])
+    rest = jnp.where(jnp.linalg.norm(rest, axis=-1, keepdims=True) < 1e-3, other, rest)
+    return unit(across(unit(rest)))  # again: little is left of a nearly parallel one but rounding
