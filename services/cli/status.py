@@ -7,11 +7,13 @@ import tyro
 
 from common.transport.ports import LEARNER_URL
 
+_RUN = "quickstart"
+
 
 def status(
     run_dir: Annotated[pathlib.Path | None, tyro.conf.Positional] = None,
     connect: str = LEARNER_URL,
-    run: str = "quickstart",
+    run: str = _RUN,
     watch: bool = False,
     every: float = 1.0,
     certs: pathlib.Path | None = None,
@@ -45,6 +47,10 @@ def status(
     from services.ops.status import ask, follow, tables
 
     if run_dir is not None:
+        if (connect, run) != (LEARNER_URL, _RUN):
+            raise CongraspError(
+                f"The folder {run_dir} is in place of --connect and --run.", "Give either the folder or these."
+            )
         connect, run = learner_url(run_dir), open_run(run_dir).name
         if not connect:
             raise CongraspError(f"No learner is running in {run_dir}.", f"What it recorded: congrasp plot {run_dir}")

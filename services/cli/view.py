@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-_WAIT = 3.0  # seconds for a learner of this machine
+_RUN = "quickstart"
 
 
 def view(
@@ -13,7 +13,7 @@ def view(
     objects: pathlib.Path | None = None,
     policy: pathlib.Path | None = None,
     connect: str = "",
-    run: str = "quickstart",
+    run: str = _RUN,
     recordings: pathlib.Path | None = None,
     host: str = "127.0.0.1",
     port: int = 7480,
@@ -42,10 +42,16 @@ def view(
       congrasp view runs/mine
       congrasp view --objects my-objects --port 8080
     """
+    from common.errors import CongraspError
     from services.ops.shutdown import on_signal
     from services.viz.studio.app import open_view
 
     if run_dir is not None:
+        if connect or policy or recordings or run != _RUN:
+            raise CongraspError(
+                f"The folder {run_dir} is in place of --connect, --run, --policy and --recordings.",
+                "Give either the folder or these.",
+            )
         connect, run, policy, recordings = _of_folder(run_dir, certs)
     with (
         on_signal() as stop,
@@ -75,7 +81,7 @@ def _of_folder(run_dir: pathlib.Path, certs: pathlib.Path | None) -> tuple[str, 
     run, connect = open_run(run_dir).name, learner_url(run_dir)
     try:
         if connect:
-            urls.connect(connect, "observer", certs=certs, wait=_WAIT).close()
+            urls.connect(connect, "observer", certs=certs).close()
             return connect, run, None, run_dir
     except TransportError:
         print(f"No response from the learner of {run_dir}: what it left is shown.")

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from common.config import TaskConfig
+from common.config import SensingConfig, TaskConfig
 from common.policy.bundle import PolicyBundle
 from common.task.constraints import optional
 from common.task.plausibility import CLEAN_MM
@@ -19,12 +19,12 @@ _OVERLAPS = {
     "hand_object_mm": "It passes through the object",
 }
 _FAST = 1.0  # m/s of a wrist, above which an arm hardly follows
-_ALWAYS = (
+_SIMULATED = (
     "It was made and measured in simulation, never on a physical hand: success here says nothing about the safety of a "
-    "robot.",
-    "It observes exact poses, velocities and contact forces of a rigid object that fits the hand. Soft or jointed "
-    "objects, clutter and obstacles are nothing that it ever met.",
+    "robot."
 )
+_MET = "It met rigid objects that fit the hand: no soft or jointed ones, no clutter and no obstacles."
+_TRACKER_UNITS = {"period": "s", "delay": "s", "position_noise": "m", "rotation_noise": "rad", "dropout": ""}
 _CITATION = """@article{congraspxl,
   title  = {ConGraspXL: Controllable Constraint-Conditioned Dexterous Grasping Motion Synthesis},
   author = {Zhang, Hui and Meboldt, Mirko and Song, Jie}
@@ -59,7 +59,7 @@ def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
             "constraints are sampled, or those of the run's constraint sets.",
             _trained(policy.task),
         ),
-        "limits": (*limits(rows), *_ALWAYS),
+        "limits": (*limits(rows), _SIMULATED, _observed(policy.task), _MET),
         "licence": "The software and the policies that come with it: Apache-2.0. A policy of your own is yours, within "
         "the licences of the meshes, hands and captured grasps that it learnt from.",
         "citation": _CITATION,
@@ -107,7 +107,36 @@ def _worst(rows: Sequence[Row]) -> list[str]:
 def _trained(task: TaskConfig) -> str:
     """The distribution of the episodes in training."""
     parts = [f"{part.title} in {100 * getattr(task, f'p_{part.name}'):.0f} %" for part in optional(task)]
-    drawn = (("mass", task.mass_range), ("friction", task.friction_range))
-    ranges = [f"{name} x {low:g} to {high:g}" for name, (low, high) in drawn]
+    ranges = [f"mass x {_range(task.mass_range)}", f"sliding friction {_range(task.friction_range)}"]
+    if task.gain_range != (1.0, 1.0):
+        ranges.append(f"servo gains x {_range(task.gain_range)}")
+    ranges += _tracker(task.sensing)
     headings = "all headings" if task.headings == "all" else "headings within 30° of straight down"
     return f"In training: {headings}; {', '.join(parts) or 'no other constraint'}; {', '.join(ranges)}."
+
+
+def _tracker(sensing: SensingConfig) -> list[str]:
+    """What the tracker in training drew, each range in its unit; nothing of what was always zero."""
+    ranges = {name: (getattr(sensing, name), unit) for name, unit in _TRACKER_UNITS.items()}
+    return [
+        f"tracker's {name.replace('_', ' ')} {_range(limits)} {unit}".rstrip()
+        for name, (limits, unit) in ranges.items()
+        if any(limits)
+    ]
+
+
+def _range(limits: tuple[float, float]) -> str:
+    """Such as "0.8 to 1.2"; one number where the two are equal."""
+    low, high = limits
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def _observed(task: TaskConfig) -> str:
+    """What the policy sees of the world."""
+    if task.observation == "tracked":
+        return (
+            f"It observes the last {task.history} control steps of joint angles, the wrist, their targets and the "
+            "object's pose from a tracker; no velocities and no contact forces."
+        )
+    pose = "exact poses" if task.sensing == SensingConfig() else "the object's pose from a tracker"
+    return f"It observes {pose}, velocities and contact forces."

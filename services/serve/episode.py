@@ -97,6 +97,9 @@ class EpisodePolicy(Policy):
     def _exchange(self, episode: Mapping[str, np.ndarray], states: Sequence[State]) -> tuple[Message, list[Any]]:
         """A query of names at an episode's begin, which is checked field by field; packed ones from then on.
 
+        A query of names says nothing of the past: where a policy that looks back comes into an episode that goes on, it
+        only brings the layout.
+
         Returns:
           The reply; the actions, finger targets and wrist targets.
         """
@@ -106,7 +109,7 @@ class EpisodePolicy(Policy):
             arrays = {name: _numbers(name, value) for name, value in {**episode, **now, **states[0]}.items()}
             reply = self._query(Message(arrays, {**meta, "layout": True}))
             self._packer = _Packer(reply.meta, episode, len(reply.arrays["q_target"]))
-            if len(states) == 1:
+            if len(states) == 1 and not (self._past and self._packer.looks_back):
                 return reply, [[reply.arrays[name]] for name in ("action", "q_target", "u_target")]
         now |= {name: episode[name] for name in ("q_target", "u_target")}
         reply = self._query(self._packer.pack([{**now, **state} for state in states], self._past, meta))
@@ -118,12 +121,14 @@ class _Packer:
 
     Attributes:
       most: states that the policy takes in one query.
+      looks_back: whether it sees control steps before the present one.
     """
 
     def __init__(self, layout: Mapping[str, Any], episode: Mapping[str, np.ndarray], fingers: int):
         self._digest, self._fields, self._fingers = layout["layout"], layout["fields"], fingers
         self.most = int(layout.get("states", 1))
         self._past = {name: self._fields[f"past_{name}"][1] for name in _READ if f"past_{name}" in self._fields}
+        self.looks_back = bool(self._past)
         self._episode = np.zeros(layout["size"], np.float32)
         points = self._fields["surface_points"][1]
         for name, value in episode.items():

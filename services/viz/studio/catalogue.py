@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import tempfile
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
@@ -82,7 +83,7 @@ class Uploads:
     """
 
     def __init__(self, folder: pathlib.Path, catalogue: Catalogue, importer: Importer):
-        """None has come yet; files go into the folder."""
+        """None has come yet; each file goes into a folder of its own within the given one."""
         self._folder, self._catalogue, self._importer = folder, catalogue, importer
         self._known: dict[str, Upload] = {}
         self.pending: Upload | None = None
@@ -100,7 +101,7 @@ class Uploads:
         name = pathlib.PurePosixPath(name.replace("\\", "/")).name or "mesh"
         if not body:
             raise CongraspError(f"{name} is empty (0 bytes).", "Export or download it again.")
-        path = self._folder / name
+        path = pathlib.Path(tempfile.mkdtemp(dir=self._folder)) / name
         path.write_bytes(body)
         try:
             sides = self._importer.sides(path)

@@ -18,7 +18,7 @@ class Jobs:
     def __init__(self) -> None:
         """Nothing runs."""
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="studio")
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._number = 0
         self._state: dict[str, Any] = _state(0, running=False)
 
@@ -29,12 +29,17 @@ class Jobs:
           CongraspError: another one is still running.
         """
         with self._lock:
-            if self._state["running"]:
-                raise CongraspError(f"Please wait: {self._state['text']}.")
+            self.require_idle()
             self._number += 1
             self._state = _state(self._number, text=text)
             self._pool.submit(self._run, work)
             return dict(self._state)
+
+    def require_idle(self) -> None:
+        """Raises a CongraspError while a job is running."""
+        with self._lock:
+            if self._state["running"]:
+                raise CongraspError(f"Please wait: {self._state['text']}.")
 
     def state(self) -> dict[str, Any]:
         """The present job, or the last one: number, running, text, share, error, and what it made."""

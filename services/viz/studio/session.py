@@ -188,7 +188,7 @@ class Session:
                 "unit": self._choose_unit,
                 "grasp": self._grasp,
                 "draw_motion": self._draw_motion,
-                "delete": lambda id: self._motions.delete(id),
+                "delete": lambda id: self._motions.delete(str(id)),
                 "undo": self._history.undo,
                 "redo": self._history.redo,
                 **{name: functools.partial(self._history.do, name) for name in ACTIONS},
@@ -204,11 +204,12 @@ class Session:
     def _upload(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
         """A mesh to import; its object is chosen when that is done, unless several units would do."""
         upload = self._uploads.take(query.get("name", ""), body)
-        if not upload.unit:
-            with self._lock:
-                self._uploads.pending = upload
+        with self._lock:
+            if upload.unit:
+                return self._import(upload.path.name, lambda: self._uploads.load(upload, upload.unit))
+            self._jobs.require_idle()
+            self._uploads.pending = upload
             return self._jobs.state()
-        return self._import(upload.path.name, lambda: self._uploads.load(upload, upload.unit))
 
     def _choose_unit(self, unit: str) -> None:
         """Imports the uploaded mesh anew in another unit."""
@@ -262,8 +263,8 @@ class Session:
 
         if name not in self._objects.names:
             self._objects.get(name)
-        self._uploads.pending = None
         self._jobs.start(f"loading {name}", work)
+        self._uploads.pending = None
 
     def _show(self, name: str) -> None:
         """Puts an object that is there into the studio."""
@@ -286,12 +287,13 @@ class Session:
 
     def _draw_motion(self, id: str, kind: str, camera: Mapping[str, Any], frame: int = 0) -> None:
         """Begins to draw a motion as one of `DRAWN`; `drawn` then has it."""
-        episode = self.motion(str(id))
+        key = str(id)
+        episode = self.motion(key)
 
         def work(progress: Progress) -> str:
             """Draws it."""
             self._drawn = drawing(
-                episode, id, kind, camera, frame, lambda share: progress(f"drawing the {kind}", share)
+                episode, key, kind, camera, frame, lambda share: progress(f"drawing the {kind}", share)
             )
             return _DRAWING
 

@@ -11,13 +11,13 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from common.config import NetworkConfig, RunConfig, TaskConfig
+from common.config import NetworkConfig, RunConfig, SensingConfig, TaskConfig
 from common.errors import CongraspError
 from common.hands import known_hand
 from common.policy import bundle as bundles
 from services.assets.hands.check import Finding, write_findings
 from services.cli import main
-from services.evaluate.model_card import limits
+from services.evaluate.model_card import limits, model_card
 from services.evaluate.report import Commands, Picture, count_causes, curves_of, write_report
 from services.evaluate.reporting import Reported
 from services.evaluate.turntable import turntable
@@ -140,6 +140,20 @@ def test_limits_name_what_is_bad_by_the_figures():
         "Its fingers pass through one another: 11.0 mm at the deepest, in the mean of the worst row.",
         "Its wrist peaks at 2.5 m/s, in the mean of the fastest row.",
     ]
+
+
+def test_a_card_says_what_the_policy_sees_and_what_it_learnt_with(policy):
+    task = dataclasses.replace(policy.task, friction_range=(0.5, 1.2), mass_range=(1.0, 1.0))
+    card = model_card(dataclasses.replace(policy, task=task), [])
+    assert "It observes exact poses, velocities and contact forces." in card["limits"]
+    assert card["data"][1].endswith("; mass x 1, sliding friction 0.5 to 1.2.")
+    trackers = SensingConfig(delay=(0.0, 0.1), dropout=(0.0, 0.3))
+    task = dataclasses.replace(task, observation="tracked", history=8, gain_range=(0.8, 1.2), sensing=trackers)
+    card = model_card(dataclasses.replace(policy, task=task), [])
+    (observed,) = [text for text in card["limits"] if text.startswith("It observes")]
+    assert "last 8 control steps" in observed and "no velocities and no contact forces" in observed
+    said = "servo gains x 0.8 to 1.2, tracker's delay 0 to 0.1 s, tracker's dropout 0 to 0.3."
+    assert card["data"][1].endswith(f"; mass x 1, sliding friction 0.5 to 1.2, {said}")
 
 
 def test_few_episodes_are_a_warning(tmp_path, policy):

@@ -23,7 +23,7 @@ from learner.hub import LearnerHub
 from learner.run_directory import POLICY_FILE, create_run, listening
 from learner.staleness import StalenessManager
 from services.cli.status import status
-from services.cli.view import _of_folder
+from services.cli.view import _of_folder, view
 from services.ops.status import ask, tables, warnings
 from tests.rollouts import ACTION, OBSERVATION, SCHEMA, bundle, rollout
 
@@ -67,7 +67,7 @@ def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
     assert "worker-7" in text and "accepted" in text and "1 rollout(s) of at most 64 waiting" in text
 
 
-@pytest.mark.timeout(30)
+@pytest.mark.timeout(90)
 def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
     create_run(tmp_path / "run", dataclasses.replace(RunConfig(), name="r"))
     with pytest.raises(CongraspError, match=r"No learner is running in .*congrasp plot"):
@@ -79,6 +79,16 @@ def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
         assert (connect, run, policy, recordings) == (endpoint, "r", None, tmp_path / "run")
     (tmp_path / "run" / POLICY_FILE).touch()
     assert _of_folder(tmp_path / "run", None) == ("", "r", tmp_path / "run" / POLICY_FILE, tmp_path / "run")
+
+
+def test_a_folder_beside_what_it_stands_for_is_refused(tmp_path):
+    folder, other = tmp_path / "run", {"connect": "tcp/127.0.0.1:1"}
+    for command, named in (
+        *((status, named) for named in (other, {"run": "r"})),
+        *((view, named) for named in (other, {"run": "r"}, {"policy": tmp_path}, {"recordings": tmp_path})),
+    ):
+        with pytest.raises(CongraspError, match=r"run is in place of --connect.*\. Give either the folder or these\."):
+            command(folder, **named)
 
 
 @pytest.mark.timeout(30)

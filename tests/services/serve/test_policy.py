@@ -204,5 +204,8 @@ def test_a_policy_that_looks_back_is_told_what_was_before(episode):
     np.testing.assert_array_equal(sent[5]["past_q_target"][0], targets)
     np.testing.assert_array_equal(sent[5]["q_target"][0], answers[4].q_target)
     same(policy.act_each([states[0]])[0], policy.act_each([{**states[0], "object_velocity": np.ones(3)}])[0])
+    expected = policy.act_each([states[3]])[0]
+    policy._packer._digest = "of another server"
+    same(policy.act_each([states[3]])[0], expected)
     moved = {**states[0], "u": states[0]["u"] + np.array([0.01, 0, 0, 0, 0, 0])}
     assert not np.array_equal(policy.act_each([moved])[0].u_target, policy.act_each([states[0]])[0].u_target)

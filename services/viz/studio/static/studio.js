@@ -34,9 +34,9 @@ export class StudioPanel {
       button.addEventListener("click", () => this.act("suggest", { constraint: button.dataset.suggest }));
     $("clear-paint").addEventListener("click", () => this.act("fill", { avoid: false }));
     $("close-hand").addEventListener("click", () => this.act("close_hand", {}));
-    this.gesture = 0; // of the roll's slider: what one drag does is one edit
+    this.gesture = Date.now(); // of the roll's slider: what one drag does is one edit, also beside other pages' drags
     $("roll").addEventListener("input", () => this.#roll($("roll").value, this.gesture));
-    $("roll").addEventListener("change", () => this.gesture++);
+    $("roll").addEventListener("change", () => (this.gesture = Date.now()));
     $("roll-number").addEventListener("change", () => this.#roll($("roll-number").value));
     $("save").addEventListener("change", () => {
       this.#save($("save").value);

@@ -4,6 +4,7 @@ import http.client
 import io
 import json
 import pathlib
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -17,6 +18,8 @@ from common.wire.codec import decode
 from services.cli.main import main
 from services.export.motion_file import load_motion
 from services.record.reader import read_episodes
+from services.viz.studio import files
+from services.viz.studio.catalogue import Uploads
 from services.viz.studio.server import PageServer
 from services.viz.studio.session import Session
 from tests import studio as made_up
@@ -170,6 +173,48 @@ def test_a_mesh_of_unknown_unit_waits_for_it_and_may_get_another(page: Page) -> 
     assert names[0] == names[1] and found["objects"].count(names[0]) == 1  # it took the place of the first
     page.do("object", name="mug")
     assert page.wait()["error"] == "" and state()["upload"] is None
+
+
+def test_a_second_mesh_of_the_same_name_does_not_touch_the_first(tmp_path: pathlib.Path) -> None:
+    uploads = Uploads(tmp_path, made_up.objects(), made_up.MadeUpImporter())
+    first, second = uploads.take("model.stl", b"first"), uploads.take("model.stl", b"second")
+    assert (first.path.read_bytes(), second.path.read_bytes()) == (b"first", b"second")
+    assert first.view()["file"] == second.view()["file"] == "model.stl"
+    with pytest.raises(CongraspError, match=r"^model\.txt is not an STL file"):
+        uploads.take("model.txt", b"first")
+
+
+def test_a_mesh_that_comes_during_a_job_is_refused(
+    page: Page, grasping: made_up.MadeUpGrasping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, free, grasp = threading.Event(), threading.Event(), grasping.grasp
+
+    def wait(*asked: Any) -> Any:
+        begun.set()
+        assert free.wait(30)
+        return grasp(*asked)
+
+    monkeypatch.setattr(grasping, "grasp", wait)
+    before = json.loads(page.ask("GET", "/api/state")[1])["upload"]
+    page.do("grasp")
+    assert begun.wait(30)
+    for name in ("x.stl", "unknown.stl"):
+        answer = page.ask("POST", f"/api/upload?name={name}", b"solid", Content_Type="application/octet-stream")[1]
+        assert "Please wait" in json.loads(answer)["error"]
+    free.set()
+    assert page.wait()["error"] == ""
+    assert json.loads(page.ask("GET", "/api/state")[1])["upload"] == before
+
+
+def test_a_motion_may_be_named_by_a_number(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)])
+    page.do("grasp")
+    number = int(page.wait()["made"])
+    camera = {"position": [0.5, 0.5, 0.5], "target": [0.0, 0.0, 0.0], "field_of_view": 40.0}
+    page.do("draw_motion", id=number, kind="png", camera=camera)
+    assert page.wait()["error"] == ""
+    page.do("delete", id=number)
+    assert str(number) not in [one["id"] for one in json.loads(page.ask("GET", "/api/state")[1])["motions"]]
 
 
 def test_resting_poses_have_thumbnails_and_edits_are_undone(page: Page) -> None:
