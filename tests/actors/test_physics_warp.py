@@ -82,7 +82,7 @@ def _agrees_with_native(objects: Sequence[GraspObject], start: ResetState) -> No
     warp.close()
 
 
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(900)
 def test_primitives_and_meshes_of_one_pool_agree_with_native(start):
     _agrees_with_native(OBJECTS, start)
 
@@ -114,7 +114,7 @@ def _scanned(folder: pathlib.Path) -> GraspObject:
     )
 
 
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(900)
 def test_scanned_objects_agree_with_native(shared_objects):
     objects = [_scanned(shared_objects / name) for name in ("camera", "flashlight", "hammer")]
     assert max(len(obj.pieces) for obj in objects) > 1
