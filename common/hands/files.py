@@ -33,9 +33,12 @@ TAKEN_JOINTS = _WRIST | {"object", "hold"}
 
 
 def hand_text(hand: Hand) -> str:
-    """The hand's file."""
+    """The hand's file; links without `solids` have no such key, as in files from before there were any."""
     fields = dataclasses.asdict(hand)
     del fields["text"]
+    for link in fields["links"]:
+        if not link["solids"]:
+            del link["solids"]
     return json.dumps({"format": FORMAT, **fields}, indent=1)
 
 

@@ -18,6 +18,8 @@ MAX_FACES = 3000
 """Triangles of a link; finer meshes are simplified."""
 MAX_BYTES = 16 << 20
 """Bytes of all meshes."""
+MAX_DISTANCE = 2.0
+"""Metres that each coordinate of a mesh may be from the wrist's origin: farther is a file in another unit."""
 PARTS = ("vertices", "faces")
 _REMEDY = "Make it anew with 'congrasp hands import', or delete it."
 
@@ -34,7 +36,7 @@ def load_meshes(path: pathlib.Path, hand: Hand) -> Meshes:
     """The meshes beside a hand file; none where there is no such file.
 
     Raises:
-      CongraspError: it is damaged, or not of this hand's links.
+      CongraspError: it is damaged, not of this hand's links, or larger than a hand.
     """
     file = beside(path)
     if not file.is_file():
@@ -47,6 +49,11 @@ def load_meshes(path: pathlib.Path, hand: Hand) -> Meshes:
         fits = fits and vertices.dtype.kind == "f" and faces.dtype.kind == "i" and np.isfinite(vertices).all()
         if not fits or faces.min() < 0 or faces.max() >= len(vertices) or len(faces) > MAX_FACES:
             raise CongraspError(f"{file} holds no mesh of '{name[:60]}'.", _REMEDY)
+        if (farthest := np.abs(vertices).max()) > MAX_DISTANCE:
+            raise CongraspError(
+                f"{file} has '{name[:60]}' {farthest:.3g} m from the wrist; {MAX_DISTANCE:g} m is the most.",
+                f"Is it in another unit? {_REMEDY}",
+            )
         found[name] = vertices, faces
     if odd := sorted({*found} - {link.name for link in hand.links}):
         raise CongraspError(f"{file} is not of the hand '{hand.name}', which has no link '{odd[0][:60]}'.", _REMEDY)

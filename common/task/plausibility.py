@@ -263,10 +263,13 @@ def _surface(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
     """The link of each point on the hand's meshes (P,), and the points (P, 3) in the wrist frame at zero.
 
     Of what lies in one cell of a grid the point farthest from its link's middle is kept, so that corners are; cells are
-    `_CELL` wide, or wider where that leaves more than `_MOST` points.
+    `_CELL` wide, or wider where that leaves more than `_MOST` points. They begin at sqrt(area / `_MOST`), which bounds
+    how many points are sampled.
     """
-    names, cell = [link.name for link in hand.links], _CELL
+    names = [link.name for link in hand.links]
     meshes = {names.index(name): mesh for name, mesh in own_meshes(hand).items()}
+    area = sum(float(trimesh.Trimesh(*mesh, process=False).area) for mesh in meshes.values())
+    cell = max(_CELL, float(np.sqrt(area / _MOST)))
     while True:
         parts = {link: _thinned(*mesh, cell) for link, mesh in meshes.items()}
         if sum(map(len, parts.values())) <= _MOST:

@@ -99,7 +99,8 @@ def grasp(
     by the benchmark's kinematics; the largest error in millimetres is printed.
 
     Args:
-      paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); what is not held is left out.
+      paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); what is not held, or
+        cannot be exported, is left out.
       to: The project.
       out: The folder to write.
       replay: Also hold the exam here, by MuJoCo C: six pushes of 1 N without gravity, from the grasp and from the

@@ -8,7 +8,9 @@ import numpy as np
 import trimesh
 from scipy.spatial import QhullError
 
-from common.caches import keep, read_kept
+import common.objects
+import services.assets.objects
+from common.caches import keep, read_kept, source_digest
 from common.errors import CongraspError
 from common.files import cache_folder, write_atomically
 from common.objects import shapes
@@ -69,9 +71,14 @@ def write_object(folder: pathlib.Path, obj: GraspObject, origin: np.ndarray, sca
 
 
 def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
-    """Convex pieces of one body, kept in the user's cache folder where it took a decomposition; none of a flat one."""
+    """Convex pieces of one body; none of a flat one.
+
+    What CoACD made is kept in the user's cache folder until the code of the decomposition changes. What stands in for
+    that where CoACD had too little time is not: another run may have more.
+    """
     vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
-    key = hashlib.sha256(b"".join([vertices.tobytes(), faces.tobytes(), bytes([most])])).hexdigest()[:32]
+    code = source_digest(services.assets.objects, common.objects).encode()
+    key = hashlib.sha256(b"".join([code, vertices.tobytes(), faces.tobytes(), bytes([most])])).hexdigest()[:32]
     file = cache_folder("pieces") / f"{key}.safetensors"
     if (kept := read_kept(file)) is not None:
         return [_piece(kept.arrays[name]) for name in sorted(kept.arrays)]
@@ -81,7 +88,7 @@ def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
         hulls = [simplify(piece) for piece in found.pieces]
     except QhullError:
         return []
-    if found.method != "convex":
+    if found.method == "coacd":
         keep(file, Message({f"{i:03d}": hull.astype(np.float32) for i, hull in enumerate(hulls)}), _MOST_FILES)
     return [_piece(hull) for hull in hulls]
 

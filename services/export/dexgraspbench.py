@@ -5,7 +5,10 @@ names and shapes, of which `examples/dexgraspbench.py` makes the benchmark's in 
 """
 
 import io
+import itertools
 import pathlib
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -21,6 +24,7 @@ from common.hands import HANDS, get_hand, own_hands
 from common.hands.mjcf import add_hand
 from common.hands.motors import motor_positions
 from common.hands.spec import Hand
+from common.inputs import file_name
 from common.npz import read_npz
 from common.objects.spec import GraspObject
 from services.export.benchmark_hands import Match, benchmarked, match_hand
@@ -76,10 +80,10 @@ class Grasp(NamedTuple):
 def export_grasps(
     paths: Sequence[pathlib.Path], folder: pathlib.Path, progress: Callable[[int], None] = lambda done: None
 ) -> tuple[list[Grasp], float, list[str]]:
-    """Writes the grasps of motions into a new folder.
+    """Writes the grasps of motions into a new folder, which comes into being when all are written.
 
     Args:
-      paths: see `motions_at`.
+      paths: NPZ files, recordings, and folders of `congrasp grasp`, of which all results below them are taken.
       folder: gets `GRASPS` and `OBJECTS`.
       progress: told how many motions are done.
 
@@ -87,35 +91,69 @@ def export_grasps(
       The grasps, the largest error in mm (`write_grasp`), and why motions were left out.
 
     Raises:
-      CongraspError: nothing can be exported, or the motions are of several hands.
+      CongraspError: nothing can be exported, the motions are of several hands, or the folder cannot be written.
     """
     if folder.exists():
         raise CongraspError(f"{folder} is there already.", "Remove it or name another with --out.")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workplace:
+            draft = pathlib.Path(workplace) / folder.name
+            found = _write_grasps(paths, draft, progress)
+            draft.rename(folder)
+    except OSError as error:
+        raise CongraspError(f"{folder} cannot be written: {error.strerror}.", "Choose another with --out.") from None
+    return found
+
+
+def _write_grasps(
+    paths: Sequence[pathlib.Path], folder: pathlib.Path, progress: Callable[[int], None]
+) -> tuple[list[Grasp], float, list[str]]:
+    """See `export_grasps`."""
     grasps: list[Grasp] = []
     left_out: list[str] = []
-    for done, (name, motion) in enumerate(motions_at(paths), 1):
-        if grasps and motion.hand != grasps[0].hand.name:
-            raise CongraspError(f"'{name}' is of another hand, {motion.hand}.", "Export each hand for itself.")
-        if motion.metrics.get("held", motion.success):
-            grasps.append(benchmark_grasp(name, motion))
+    names: set[str] = set()
+    worst = 0.0
+    for done, file in enumerate(_files_at(paths), 1):
+        try:
+            grasp = _grasp_at(file, names)
+        except CongraspError as error:
+            left_out.append(f"{file}: {error}")
         else:
-            left_out.append(f"in '{name}' the object is not held")
+            if grasps and grasp.hand.name != grasps[0].hand.name:
+                raise CongraspError(f"{file} is of another hand, {grasp.hand.name}.", "Export each hand for itself.")
+            if (off := write_grasp(grasp, folder)) <= TOLERANCE_MM:
+                grasps.append(grasp)
+                worst = max(worst, off)
+            else:
+                left_out.append(f"{file}: the benchmark has it {off:.3g} mm off; {TOLERANCE_MM} mm is let through")
         progress(done)
     if not grasps:
-        raise CongraspError("None of the motions holds its object.", "Name others, made by 'congrasp grasp'.")
-    return grasps, max(write_grasp(grasp, folder) for grasp in grasps), left_out
+        raise CongraspError(" ".join(["None of the motions can be exported.", *left_out[:1]]))
+    return grasps, worst, left_out
 
 
-def motions_at(paths: Sequence[pathlib.Path]) -> Iterator[tuple[str, GraspMotion]]:
-    """Motions of NPZ files, recordings, and all results below folders of `congrasp grasp`, by different names."""
-    taken: dict[str, int] = {}
+def _files_at(paths: Sequence[pathlib.Path]) -> Iterator[pathlib.Path]:
+    """Files as they are, and all results below folders of `congrasp grasp`."""
     for path in paths:
         below = sorted(path.rglob(_MOTION)) if path.is_dir() else []
-        for file in below or [path]:
-            motion = pick_motion(file)
-            name = file.resolve().parent.name if file.name == _MOTION else motion.object
-            taken[name] = taken.get(name, 0) + 1
-            yield name if taken[name] == 1 else f"{name}-{taken[name]}", motion
+        yield from below or [path]
+
+
+def _grasp_at(file: pathlib.Path, names: set[str]) -> Grasp:
+    """The grasp of a motion's file, by a name that is not among `names`, to which it is added.
+
+    Raises:
+      CongraspError: it is no motion, its object is not held or has no volume, or the benchmark does not have its hand.
+    """
+    motion = pick_motion(file)
+    if not motion.metrics.get("held", motion.success):
+        raise CongraspError("The object is not held.")
+    name = file.resolve().parent.name if file.name == _MOTION else file_name(motion.object, "the object of a motion")
+    free = next(x for i in itertools.count(1) if (x := name if i == 1 else f"{name}-{i}") not in names)
+    grasp = benchmark_grasp(free, motion)
+    names.add(free)
+    return grasp
 
 
 def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
@@ -182,25 +220,25 @@ def arrays_of(grasp: Grasp) -> dict[str, np.ndarray]:
 
 
 def write_grasp(grasp: Grasp, folder: pathlib.Path) -> float:
-    """Writes a grasp and its object, and reads the grasp back; nothing is left of one that is off.
+    """Writes a grasp, reads it back, and writes its object; nothing is left of one that is off.
 
     Returns:
       The largest distance in mm between where the joints and points 5 cm from them are and where the benchmark's
-      kinematics has them.
+      kinematics has them; one of more than `TOLERANCE_MM` is off.
 
     Raises:
-      CongraspError: that is more than `TOLERANCE_MM`, or the folder cannot be written.
+      CongraspError: the folder cannot be written.
     """
-    write_object(folder / OBJECTS / grasp.name, grasp.obj, grasp.origin, grasp.scale)
     path = folder / GRASPS / grasp.name / "congrasp" / "0.npz"
     buffer = io.BytesIO()
     arrays: dict[str, Any] = arrays_of(grasp)
     np.savez(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
     error = error_mm(grasp, read_npz(path, "Export it anew."))
-    if not error <= TOLERANCE_MM:
-        path.unlink()
-        raise CongraspError(f"The benchmark has '{grasp.name}' {error:.3g} mm off; {TOLERANCE_MM} mm is let through.")
+    if error <= TOLERANCE_MM:
+        write_object(folder / OBJECTS / grasp.name, grasp.obj, grasp.origin, grasp.scale)
+    else:
+        shutil.rmtree(folder / GRASPS / grasp.name)
     return error
 
 

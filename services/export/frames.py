@@ -1,5 +1,6 @@
 """Poses of every link and of the object over time: what each format is made from, and what each is checked by."""
 
+import contextlib
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -92,9 +93,10 @@ def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def skin_of_motion(motion: GraspMotion) -> Skin:
-    """The surface of the motion's hand; the meshes of its file where it is one of the user's own."""
-    if motion.hand in own_hands() and _same_hand(motion, hand := get_hand(motion.hand)):
-        return skin_of(hand)
+    """The surface of the motion's hand; the meshes of its file where it is one of the user's own and can be read."""
+    with contextlib.suppress(CongraspError):  # the motion itself has all that is needed
+        if motion.hand in own_hands() and _same_hand(motion, hand := get_hand(motion.hand)):
+            return skin_of(hand)
     origins = np.zeros((len(motion.link_names), 3))
     first = np.unique(motion.joint_link, return_index=True)[1]
     origins[motion.joint_link[first]] = motion.joint_anchor[first]

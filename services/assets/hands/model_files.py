@@ -14,7 +14,7 @@ from common.errors import CongraspError
 from common.hands.files import TAKEN_JOINTS, faults, hand_from_text, hand_text
 from common.hands.kinematics import grasp_frame
 from common.hands.measures import fitting_scale
-from common.hands.meshes import Meshes
+from common.hands.meshes import MAX_DISTANCE, Meshes
 from common.hands.motors import motor_limits
 from common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from services.assets.hands.compile import compiled_model
@@ -99,7 +99,8 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     hand = dataclasses.replace(hand, object_scale=scale)
     _check(path, hand)
     hand = hand_from_text(hand_text(hand), str(path))
-    return Proposal(hand, model.body(tree.palm).name, tuple(notes), _meshes(model, data, tree))
+    meshes = _meshes(model, data, tree, notes)
+    return Proposal(hand, model.body(tree.palm).name, tuple(notes), meshes)
 
 
 def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
@@ -201,14 +202,17 @@ def _with_solids(
     return [dataclasses.replace(link, solids=solids) for link, solids in zip(links, found, strict=True)]
 
 
-def _meshes(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree) -> Meshes:
-    """What the file draws of each link, in the palm's frame at zero."""
+def _meshes(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[str]) -> Meshes:
+    """What the file draws of each link, in the palm's frame at zero, unless it is larger than a hand."""
     turn, origin = data.xmat[tree.palm].reshape(3, 3), data.xpos[tree.palm]
     found = {
         "palm" if link == tree.palm else body_name(model, link): link_mesh(model, data, bodies, turn, origin)
         for link, bodies in tree.groups.items()
     }
-    return {name: mesh for name, mesh in found.items() if mesh is not None}
+    drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
+    if large := [name for name, (vertices, _) in drawn.items() if np.abs(vertices).max() > MAX_DISTANCE]:
+        notes.append(f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and left out: {', '.join(large)}")
+    return {name: mesh for name, mesh in drawn.items() if name not in large}
 
 
 def _anchor(model: mujoco.MjModel, data: mujoco.MjData, link: int, turn: np.ndarray, origin: np.ndarray) -> np.ndarray:

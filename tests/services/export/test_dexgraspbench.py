@@ -19,8 +19,9 @@ from common.hands.mjcf import add_hand
 from common.hands.spec import Motor
 from services.assets.hands import grips
 from services.assets.hands.kinematics import mujoco_link_poses
+from services.assets.objects.decompose import Decomposition
 from services.cli.main import run
-from services.export import dexgraspbench
+from services.export import benchmark_objects, dexgraspbench
 from services.export.benchmark_hands import BENCHMARK_HANDS, benchmarked, match_hand
 from services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
 from services.export.replay import replay
@@ -357,7 +358,7 @@ def test_the_command_and_the_example_make_the_benchmarks_files(tmp_path, capsys)
     out = tmp_path / "bench"
     assert run(["export", "grasp", str(tmp_path / "grasps"), "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "Left out: in 'lost' the object is not held" in said and "1 grasps" in said
+    assert "lost/grasp.npz: The object is not held." in said and "1 grasps" in said
     script = [sys.executable, str(ROOT / "examples" / "dexgraspbench.py"), str(out), str(tmp_path / "graspdata")]
     subprocess.run(script, check=True, timeout=60, capture_output=True)
     # What the benchmark does: this file is ours, made a moment ago.
@@ -378,3 +379,80 @@ def test_the_command_and_the_example_make_the_benchmarks_files(tmp_path, capsys)
     assert sum(piece.volume for piece in pieces) == pytest.approx(coefficient, rel=1e-5)
     with pytest.raises(CongraspError, match="is there already"):
         run(["export", "grasp", str(tmp_path / "grasps"), "--out", str(out)])
+
+
+def save_motions(folder, **motions):
+    for name, motion in motions.items():
+        (folder / name).mkdir(parents=True)
+        save_motion(folder / name / "grasp.npz", motion)
+
+
+def test_every_motion_has_a_name_of_its_own(tmp_path):
+    motion = motion_of(get_hand("allegro"))
+    for above in ("1/a", "2/a", "3/a-2"):
+        save_motions(tmp_path / above[0], **{above[2:]: motion})
+    grasps, _, left_out = dexgraspbench.export_grasps([tmp_path / x for x in "123"], tmp_path / "out")
+    names = [grasp.name for grasp in grasps]
+    assert names == ["a", "a-2", "a-2-2"] and not left_out
+    for folder in (dexgraspbench.GRASPS, dexgraspbench.OBJECTS):
+        assert sorted(x.name for x in (tmp_path / "out" / folder).iterdir()) == names
+
+
+def test_one_motion_that_cannot_be_exported_is_left_out(tmp_path, monkeypatch):
+    motion = motion_of(get_hand("allegro"))
+    flat = dataclasses.replace(motion, object_vertices=motion.object_vertices * np.float32([1, 1, 0]))
+    moved = dataclasses.replace(motion, joint_anchor=motion.joint_anchor + 0.001 * np.arange(16)[:, None])
+    save_motions(tmp_path / "in", flat=flat, good=motion, moved=moved, off=motion)
+    (tmp_path / "in" / "torn").mkdir()
+    (tmp_path / "in" / "torn" / "grasp.npz").write_bytes(b"PK")
+    measure = dexgraspbench.error_mm
+    monkeypatch.setattr(dexgraspbench, "error_mm", lambda g, x: 1.0 if g.name == "off" else measure(g, x))
+    grasps, error, left_out = dexgraspbench.export_grasps([tmp_path / "in"], tmp_path / "out")
+    assert [grasp.name for grasp in grasps] == ["good"] and error < 0.01
+    said = dict(zip(("flat", "moved", "off", "torn"), left_out, strict=True))
+    assert all(f"{name}/grasp.npz" in reason for name, reason in said.items())
+    for name, word in {"flat": "has no volume", "moved": "no hand like", "off": "1 mm off", "torn": "motion"}.items():
+        assert word in said[name]
+    for folder in (dexgraspbench.GRASPS, dexgraspbench.OBJECTS):
+        assert [x.name for x in (tmp_path / "out" / folder).iterdir()] == ["good"]
+    with pytest.raises(CongraspError, match=r"None of the motions can be exported.*has no volume"):
+        dexgraspbench.export_grasps([tmp_path / "in" / "flat"], tmp_path / "none")
+
+
+def test_an_export_that_fails_midway_leaves_nothing_behind(tmp_path, monkeypatch):
+    motion = motion_of(get_hand("allegro"))
+    save_motions(tmp_path / "in", a=motion, b=motion)
+    write = dexgraspbench.write_object
+
+    def full(folder, *rest):
+        if folder.name == "b":
+            raise CongraspError("No space is left.")
+        write(folder, *rest)
+
+    monkeypatch.setattr(dexgraspbench, "write_object", full)
+    out = tmp_path / "below" / "out"
+    with pytest.raises(CongraspError, match="No space is left"):
+        dexgraspbench.export_grasps([tmp_path / "in"], out)
+    assert not [*out.parent.iterdir()]
+    monkeypatch.undo()
+    assert len(dexgraspbench.export_grasps([tmp_path / "in"], out)[0]) == 2
+
+
+@pytest.mark.parametrize(("method", "runs"), [("coacd", 1), ("hull", 2), ("vhacd", 2)])
+def test_only_what_coacd_made_is_kept(method, runs, tmp_path, monkeypatch):
+    """What stands in for it when the machine is busy is made anew, as is all after a change of the code."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    calls = []
+
+    def decompose(vertices, faces, **_):
+        calls.append(method)
+        return Decomposition([vertices], method, [])
+
+    monkeypatch.setattr(benchmark_objects, "decompose", decompose)
+    motion = motion_of(get_hand("allegro"))
+    first, second = (benchmark_objects.convex_object(motion) for _ in range(2))
+    assert len(calls) == runs
+    np.testing.assert_allclose(second.pieces[0].vertices, first.pieces[0].vertices, atol=1e-6)
+    monkeypatch.setattr(benchmark_objects, "source_digest", lambda *packages: "another")
+    benchmark_objects.convex_object(motion)
+    assert len(calls) == runs + 1

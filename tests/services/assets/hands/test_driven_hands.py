@@ -161,6 +161,7 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
 
     refused("holds no mesh of 'palm'", {"palm": (vertices, faces + len(vertices))})
     refused("has no link 'wing'", {"wing": (vertices, faces)})
+    refused("has 'palm' 85 m from the wrist; 2 m is the most", {"palm": (1000 * vertices, faces)})
     save_meshes(path, {})
     assert load_meshes(path, driven.hand) == {}
 
@@ -236,6 +237,16 @@ def test_a_hands_meshes_are_its_surface_in_pictures_and_exports(own):
     assert not np.array_equal(skin_of(stranger).faces, skin.faces)
 
 
+@pytest.mark.parametrize("damaged", ["own_driven.json", "own_driven.visual.npz"])
+def test_a_motion_is_drawn_by_its_own_arrays_where_its_hands_files_are_damaged(own, damaged, tmp_path):
+    motion = dataclasses.replace(motion_of_episode(episode()), hand=own.name, **hand_arrays(own))
+    expected = skin_of_motion(dataclasses.replace(motion, hand="unknown"))
+    (tmp_path / damaged).write_bytes(b"{")
+    get_hand.cache_clear()
+    skin_of.cache_clear()
+    np.testing.assert_array_equal(skin_of_motion(motion).points, expected.points)
+
+
 def test_meshes_are_measured_against_the_object_beside_the_capsules(own):
     """A ball of 3 cm whose centre is 4.5 cm from the cube's middle, along an edge's normal and a face's normal."""
     ball = plain_object("ball", (Piece("ellipsoid", (0.03, 0.03, 0.03)),), 500.0)
@@ -252,6 +263,34 @@ def test_meshes_are_measured_against_the_object_beside_the_capsules(own):
     assert depth(-0.06, 0.0, 0.0) == 0.0
     seen = np.zeros((1, 3), np.float32), upright, np.zeros(1, int), field
     assert np.isnan(plausibility.hand_mesh(get_hand("allegro"), transforms, *seen)).all()
+
+
+def test_points_on_a_large_mesh_are_bounded_before_they_are_sampled(own, tmp_path, monkeypatch):
+    """37 balls of 2 m, 1500 m^2: cells of 4 mm would ask for 7e8 samples."""
+    ball = trimesh.creation.icosphere(1, 2.0)
+    balls = trimesh.util.concatenate([ball] * 37)
+    save_meshes(tmp_path / "own_driven.json", {"palm": (balls.vertices.astype("f4"), balls.faces.astype("i4"))})
+    counts, draw = [], trimesh.sample.sample_surface
+
+    def counted(mesh, count, seed):
+        counts.append(count)
+        assert count <= 8 * 2048
+        return draw(mesh, count, seed=seed)
+
+    monkeypatch.setattr(trimesh.sample, "sample_surface", counted)
+    fresh = dataclasses.replace(own)
+    assert 0 < len(plausibility._surface(fresh)[1]) <= 2048 and counts
+
+
+def test_a_mesh_in_another_unit_is_left_out_of_the_import(tmp_path):
+    spec = mujoco.MjSpec.from_file(str(HANDS / "driven.xml"))
+    size = [40.0, 40.0, 80.0]
+    spec.body("base").add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, contype=0, conaffinity=0, mass=0.0)
+    spec.compile()
+    (tmp_path / "driven.xml").write_text(spec.to_xml())
+    proposal = import_hand(tmp_path / "driven.xml")
+    assert "drawn more than 2 m from the palm (in mm?), and left out: palm" in proposal.notes
+    assert "palm" not in proposal.meshes and len(proposal.meshes) == len(proposal.hand.links) - 1
 
 
 def test_a_fine_mesh_is_simplified(tmp_path):

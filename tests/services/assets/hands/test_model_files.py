@@ -120,6 +120,12 @@ def test_a_hand_file_is_a_hand_by_path_by_name_and_by_its_text(claw, tmp_path):
     assert spec.schema != policy_spec(TaskConfig(), travelled.network).schema
 
 
+def test_a_hand_file_from_before_links_had_solids_stays_as_it_is():
+    """Its text names the hand in policies, and says whether a training that was interrupted was of this hand."""
+    path = HANDS / "claw.json"
+    assert hand_text(read_hand(path)) == path.read_text()
+
+
 def test_wrong_hand_files_are_one_line(claw, tmp_path):
     path = tmp_path / "bad.json"
     fields = json.loads(hand_text(claw.hand))
