@@ -47,7 +47,7 @@ $(VENV)/.$(EXTRA): pyproject.toml constraints.txt
 	  { echo "congrasp needs Python 3.11, 3.12 or 3.13. Install one and name it: make PYTHON=python3.12" >&2; exit 2; }
 	@test -x $(VENV)/bin/python || { echo "Making $(VENV) with $(PYTHON)"; $(PYTHON) -m venv $(VENV); } || \
 	  { echo "Python's venv module does not work here. On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 2; }
-	@echo "Installing congrasp[$(EXTRA)] into $(VENV): about 1.5 GB, some minutes the first time"
+	@echo "Installing congrasp[$(EXTRA)] into $(VENV): about 3 GB with what tests need, some minutes the first time"
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[$(EXTRA)]'
 	@touch $@
 
