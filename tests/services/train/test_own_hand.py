@@ -147,7 +147,9 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
     command = ["hands", "train", str(CLAW), "--out", str(tmp_path / "out"), "--training=--updates 3"]
     assert main.run(command) == 0
     said = capsys.readouterr().out
-    assert "thumb        opposing_lower - opposing_upper" in said and "congrasp grasp examples/mug.obj --hand claw" in said
+    assert (
+        "thumb        opposing_lower - opposing_upper" in said and "congrasp grasp examples/mug.obj --hand claw" in said
+    )
     file = tmp_path / "hands" / "claw.json"
     made = file.read_text()
     assert main.run(command) == 0 and len(ran) == 3 and file.read_text() == made
