@@ -264,13 +264,16 @@ class Evaluator:
         plan = self.plan(name, max(attempts, len(self.objects)))
         first = zlib.crc32(name.encode()) % plan.total  # another object for another row
         plan = plan._replace(episodes=jax.tree.map(lambda x: np.roll(x, -first), plan.episodes))
-        conditions = batches(self._hand, self.task, self.bank_for(name), plan, self._seed, 1)
-        with self._episodes(1, traced=True) as running:
-            for begun, _ in itertools.islice(conditions, attempts):
+        bank = self.bank_for(name)
+        with self._episodes(attempts, traced=True) as running:
+            for begun, count in batches(self._hand, self.task, bank, plan, self._seed, running.batch):
                 batch = running.run(begun)
-                if batch.sample.values["success"][0] > 0:
+                tried = min(count, attempts)
+                succeeded = np.flatnonzero(batch.sample.values["success"][:tried] > 0)
+                attempts -= tried
+                if len(succeeded) or not attempts:
                     break
-            return batch.message(0)
+            return batch.message(int(succeeded[0]) if len(succeeded) else tried - 1)
 
     def _episodes(self, episodes: int, traced: bool = False, task: TaskConfig | None = None) -> Episodes:
         """What simulates rows of so many episodes; its batch depends on nothing else, so that rows do not either."""

@@ -78,6 +78,14 @@ def test_a_pool_that_never_allows_a_constraint_is_an_error(evaluator, monkeypatc
         evaluator.episode("trajectory+affordance")
 
 
+def test_an_episode_to_look_at_is_one_of_so_many_attempts(evaluator):
+    """The pool has three objects, so that a batch is larger than one attempt, and smaller than nine."""
+    for attempts in (1, 9):
+        episode = evaluator.episode("heading", attempts)
+        assert episode.meta["object"] in {obj.name for obj in OBJECTS} and not episode.meta["success"]
+        assert len(episode.arrays["table"]) == len(episode.arrays["q"]) > CONFIG.task.approach_steps
+
+
 @pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--pool", "-1"], ["--friction", "nan"]])
 def test_numbers_out_of_range_are_refused(policy, arguments):
     with pytest.raises(CongraspError, match="must"):
