@@ -17,8 +17,7 @@ def plain_object(name: str, pieces: tuple[Piece, ...], density: float) -> GraspO
     """
     mass, _, inertia = mass_properties(pieces, np.full(len(pieces), density))
     points, normals, _ = sample_union(pieces, np.random.default_rng(0))
-    parts = [shapes.tessellate(piece) for piece in pieces]
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts[:-1])])
+    vertices, faces = shapes.mesh_of(pieces)
     return GraspObject(
         name=name,
         family=name,
@@ -31,6 +30,6 @@ def plain_object(name: str, pieces: tuple[Piece, ...], density: float) -> GraspO
         normals=normals.astype(np.float32),
         labels=np.zeros(len(points), np.int32),
         rest_poses=np.zeros((0, 7)),
-        visual_vertices=np.concatenate([vertices for vertices, _ in parts]).astype(np.float32),
-        visual_faces=np.concatenate([f + start for (_, f), start in zip(parts, starts, strict=True)]).astype(np.int32),
+        visual_vertices=vertices,
+        visual_faces=faces,
     )

@@ -114,8 +114,7 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
     if not (sizes[0] <= size <= sizes[1] and _LEAST_SHARE <= share <= 1 - _LEAST_SHARE):
         return None
     clipped = float(np.clip(mass, *masses))
-    meshes = [shapes.tessellate(piece) for piece in pieces]
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes[:-1])])
+    vertices, faces = shapes.mesh_of(pieces)
     return GraspObject(
         name=name,
         family=family,
@@ -128,6 +127,6 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
         normals=normals.astype(np.float32),
         labels=labels,
         rest_poses=np.zeros((0, 7)),
-        visual_vertices=np.concatenate([vertices for vertices, _ in meshes]).astype(np.float32),
-        visual_faces=np.concatenate([f + s for (_, f), s in zip(meshes, starts, strict=True)]).astype(np.int32),
+        visual_vertices=vertices,
+        visual_faces=faces,
     )

@@ -203,6 +203,14 @@ def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
     return x @ rotation(piece).T + np.asarray(piece.pos), faces
 
 
+def mesh_of(pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float32 and faces (F, 3) int32 of all pieces, one after the other, in the object frame."""
+    meshes = [tessellate(piece) for piece in pieces]
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes[:-1])])
+    vertices = np.concatenate([vertices for vertices, _ in meshes]).astype(np.float32)
+    return vertices, np.concatenate([f + start for (_, f), start in zip(meshes, starts, strict=True)]).astype(np.int32)
+
+
 @functools.cache
 def _template(kind: str) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of a primitive of unit size."""

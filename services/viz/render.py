@@ -17,7 +17,7 @@ from services.record.goals import active_blocks, grasp_span, phases_of
 from services.record.palette import HEADING, OBJECT, WAYPOINT
 from services.viz.raster import render_scene, visible
 from services.viz.scene import Camera, Shape
-from services.viz.shapes import arrow, beads, capsule_shapes, fit, hand_shape, posed_hand, table_shape
+from services.viz.shapes import arrow, beads, capsule_shapes, fit, posed_hand, skin_shape, table_shape
 from services.viz.sheets import contact_sheet, save_video
 
 TOUCHING = (0.13, 0.74, 0.63)
@@ -43,7 +43,7 @@ def _bodies(episode: Message, step: int) -> list[Shape]:
     force = np.linalg.norm(arrays["contact_force"][step], axis=-1)
     share = np.where(force > _TOUCH, 0.3 + 0.3 * np.minimum(force / _FULL_CONTACT, 1.0), 0.0)
     links = arrays["link_position"][step], arrays["link_quaternion"][step]
-    shapes = [hand_shape(hand, *links, TOUCHING, share), _object(episode, step)]
+    shapes = [skin_shape(skin_of(hand), *links, TOUCHING, share), _object(episode, step)]
     if arrays["table"][step]:
         shapes.append(table_shape(arrays["object_position"][0]))
     return shapes

@@ -21,29 +21,6 @@ _SPACE = 1.06  # free space at the picture's edges
 _STILL = 1e-3  # m of a curl that tells no direction
 
 
-def hand_shape(
-    hand: Hand,
-    position: np.ndarray,
-    quaternion: np.ndarray,
-    tint: Colour = SKIN,
-    shares: Sequence[float] | np.ndarray | None = None,
-    alpha: float = 1.0,
-    skin: Skin | None = None,
-) -> Shape:
-    """The hand's skin.
-
-    Args:
-      hand: the hand.
-      position: (L, 3) origins of the links' frames in the world.
-      quaternion: (L, 4) their orientations.
-      tint: a colour besides the hand's own.
-      shares: (L,) of that colour on each link; none by default.
-      alpha: below one the hand is seen through.
-      skin: the surface; the hand's own by default.
-    """
-    return skin_shape(skin or skin_of(hand), position, quaternion, tint, shares, alpha)
-
-
 def skin_shape(
     skin: Skin,
     position: np.ndarray,
@@ -52,7 +29,16 @@ def skin_shape(
     shares: Sequence[float] | np.ndarray | None = None,
     alpha: float = 1.0,
 ) -> Shape:
-    """A skin with its links' frames at positions (L, 3) and orientations (L, 4); the rest is that of `hand_shape`."""
+    """A hand's skin.
+
+    Args:
+      skin: the surface.
+      position: (L, 3) origins of the links' frames in the world.
+      quaternion: (L, 4) their orientations.
+      tint: a colour besides the hand's own.
+      shares: (L,) of that colour on each link; none by default.
+      alpha: below one the hand is seen through.
+    """
     points, normals = skin.posed(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
     own = skin_colours(skin)
     share = (skin.weights @ np.asarray(shares, np.float32))[:, None] if shares is not None else 0.0
@@ -97,11 +83,11 @@ def posed_hand(
 ) -> Shape:
     """The hand with finger angles (F,) and its wrist at a position (3,) m and orientation in the world.
 
-    Tint, shares, alpha and skin are those of `hand_shape`.
+    Tint, shares and alpha are those of `skin_shape`; the skin is the hand's own by default.
     """
     links, quaternion = mujoco_link_poses(hand, q)
     turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
-    return hand_shape(hand, wrist.apply(links) + position, turned, tint, shares, alpha, skin)
+    return skin_shape(skin or skin_of(hand), wrist.apply(links) + position, turned, tint, shares, alpha)
 
 
 def table_shape(below: np.ndarray) -> Shape:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from common.config import NetworkConfig, RunConfig, SensingConfig, TaskConfig
 from common.errors import CongraspError
 from common.hands import known_hand
+from common.hands.skin import skin_of
 from common.policy import bundle as bundles
 from services.assets.hands.check import Finding, write_findings
 from services.cli import main
@@ -25,7 +26,7 @@ from services.record.channels import JsonChannels
 from services.record.writer import LogWriter
 from services.train.command import untrained
 from services.train.presets import get_preset
-from services.viz.shapes import hand_shape
+from services.viz.shapes import skin_shape
 from services.viz.sheets import save_png
 from tests.episodes import episode
 from tests.pages import Reader
@@ -183,7 +184,7 @@ def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
     points = np.column_stack([array("position", "<f4", 3), np.ones(len(bones))])
     moved = np.einsum("vk,vkij,vj->vi", weights, frames[which][bones], points)
     arrays, hand = recorded.arrays, known_hand(recorded.meta["hand"])
-    skin = hand_shape(hand, arrays["link_position"][step], arrays["link_quaternion"][step])
+    skin = skin_shape(skin_of(hand), arrays["link_position"][step], arrays["link_quaternion"][step])
     np.testing.assert_allclose(moved[: len(skin.vertices)], skin.vertices, atol=2e-3)
     solid = moved[bones[:, 0] == data["count"] - 2]
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
