@@ -10,8 +10,8 @@ import numpy as np
 from common.hands import kinematics
 from common.hands.spec import Hand
 
-CLOSURES = (0.0, 0.25, 0.5)
-"""Shares of the way from the open to the closed pose: open, and half closed around things of usual widths."""
+CLOSURES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+"""Shares of the way from the open to the closed pose: open, and less and less so, down to thin things."""
 
 
 class Outline(NamedTuple):
@@ -24,9 +24,11 @@ class Outline(NamedTuple):
     """(S, E, 3) m, their centres."""
     radii: np.ndarray
     """(E,) m."""
+    openings: np.ndarray
+    """(S,) m between the thumb's tip and the middle of the others, along w."""
 
 
-CENTER = Outline(np.zeros((1, 1, 3)), np.array([0.01]))
+CENTER = Outline(np.zeros((1, 1, 3)), np.array([0.01]), np.array([np.inf]))
 """A ball of 1 cm around the hand's centre, where no hand is named."""
 
 
@@ -38,10 +40,10 @@ def outline(hand: Hand) -> Outline:
     q = np.stack([hand.q_open + share * (hand.q_closed - hand.q_open) for share in CLOSURES])
     # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        ends, center = (
-            np.asarray(part, np.float64) for part in thread.submit(_ends_and_center, hand, np.float32(q)).result()
-        )
-    return Outline((ends - center[:, None]) @ axes.T, np.repeat(hand.capsule_radii, 2).astype(np.float64))
+        ends, tips = (np.asarray(part, np.float64) for part in thread.submit(_ends_and_tips, hand, np.float32(q)).result())
+    thumb, others = tips[:, 0], tips[:, 1:].mean(1)
+    points = (ends - (thumb + others)[:, None] / 2) @ axes.T
+    return Outline(points, np.repeat(hand.capsule_radii, 2).astype(np.float64), (others - thumb) @ frame.cross)
 
 
 def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
@@ -55,8 +57,9 @@ def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _ends_and_center(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ends (S, E, 3) of the hand's capsules and its centre (S, 3) at finger angles (S, F), wrist frame."""
+def _ends_and_tips(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Ends (S, E, 3) of the hand's capsules and its fingertips (S, G, 3), thumb first, at angles (S, F), wrist frame."""
     transforms = kinematics.link_transforms(hand, q)
     ends = kinematics.capsules(hand, transforms)
-    return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(hand, kinematics.keypoints(hand, transforms))
+    tips = kinematics.keypoints(hand, transforms)[..., len(hand.links) :, :]
+    return ends.reshape(*ends.shape[:-3], -1, 3), tips

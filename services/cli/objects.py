@@ -240,7 +240,7 @@ def _reach(obj: "GraspObject", headings: "Headings | None") -> list[str]:
     if headings is None:
         return ["none"] * len(obj.rest_poses)
     texts = []
-    found = within_reach(headings, obj.rest_poses, outline(HUMAN))
+    found = within_reach(headings, obj.points, obj.rest_poses, outline(HUMAN))
     for pose, cleared, reachable in zip(obj.rest_poses, *found, strict=True):
         texts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
     return texts

@@ -32,7 +32,7 @@ def headings(
         )
     options, weights = [], []
     for r, (cleared, room) in enumerate(
-        zip(*within_reach(found, obj.rest_poses, outline(hand), back_off), strict=True)
+        zip(*within_reach(found, obj.points, obj.rest_poses, outline(hand), back_off), strict=True)
     ):
         if request.rest not in (None, r):
             continue

@@ -80,8 +80,8 @@ def recipe(hand: Hand) -> RunConfig:
         task=TaskConfig(
             hand=hand.reference,
             p_affordance=own.p_affordance,
-            p_pose=0.4,
-            p_trajectory=0.4,
+            p_pose=0.35,
+            p_trajectory=0.35,
             hold_steps_max=200,
             disturbed_references=0.5,
             mass_range=(0.8, 1.25),

@@ -266,6 +266,6 @@ def test_a_card_is_approached_as_well_as_it_goes():
     card = made(([0, 0, -0.05], DOWN), ([0, 0, -0.05], UP))
     tall = Outline(np.array([[[0.05, 0, 0]]]), np.array([0.01]))  # fingers reach 6 cm beyond the centre
     assert not feasible(clear_table(card, FLAT, tall), FLAT, tall).any()
-    (cleared,), (reachable,) = within_reach(card, FLAT[None], tall)
+    (cleared,), (reachable,) = within_reach(card, np.zeros((1, 3)), FLAT[None], tall)
     np.testing.assert_array_equal(reachable, [True, False])
     np.testing.assert_allclose(cleared.position[0], [0, 0, -0.04], atol=2e-6)
