@@ -40,7 +40,8 @@ def outline(hand: Hand) -> Outline:
     q = np.stack([hand.q_open + share * (hand.q_closed - hand.q_open) for share in CLOSURES])
     # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        ends, tips = (np.asarray(part, np.float64) for part in thread.submit(_ends_and_tips, hand, np.float32(q)).result())
+        posed = thread.submit(_ends_and_tips, hand, np.float32(q)).result()
+        ends, tips = (np.asarray(part, np.float64) for part in posed)
     thumb, others = tips[:, 0], tips[:, 1:].mean(1)
     points = (ends - (thumb + others)[:, None] / 2) @ axes.T
     return Outline(points, np.repeat(hand.capsule_radii, 2).astype(np.float64), (others - thumb) @ frame.cross)
@@ -58,7 +59,7 @@ def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _ends_and_tips(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ends (S, E, 3) of the hand's capsules and its fingertips (S, G, 3), thumb first, at angles (S, F), wrist frame."""
+    """Ends (S, E, 3) of the hand's capsules and its tips (S, G, 3), thumb first, at angles (S, F), wrist frame."""
     transforms = kinematics.link_transforms(hand, q)
     ends = kinematics.capsules(hand, transforms)
     tips = kinematics.keypoints(hand, transforms)[..., len(hand.links) :, :]

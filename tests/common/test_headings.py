@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from common.hands import get_hand
 from common.hands.kinematics import capsules, grasp_frame, link_transforms
-from common.hands.outline import Outline, depth_below, outline
+from common.hands.outline import CENTER, Outline, depth_below, outline
 from common.objects.procedural import FAMILIES, generate
 from common.task.sampling.headings import (
     INWARD,
@@ -19,12 +19,14 @@ from common.task.sampling.headings import (
     above,
     clear_table,
     feasible,
+    local_width,
     sample_headings,
     within_reach,
 )
 
 DOWN, LEVEL, UP = [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
 FLAT = np.array([0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0])
+ANY = np.array([np.inf])  # opening of a hand that is open wide enough for everything
 
 
 def made(*rows):
@@ -34,7 +36,7 @@ def made(*rows):
     return Headings(position, direction, cross / np.linalg.norm(cross, axis=-1, keepdims=True))
 
 
-def local_width(points, position, direction, cross):
+def defined_width(points, position, direction, cross):
     """The definition, one heading at a time."""
     offset = points - position
     breadth = np.cross(direction, cross)
@@ -60,7 +62,8 @@ def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
     source = distance.argmin(-1)
     assert distance.min(-1).max() < 1e-5
     assert -(direction * obj.normals[source]).sum(-1).min() > np.cos(np.radians(30)) - 1e-5
-    widths = [local_width(obj.points[:256], *heading) for heading in zip(position, direction, cross, strict=True)]
+    widths = [defined_width(obj.points[:256], *heading) for heading in zip(position, direction, cross, strict=True)]
+    np.testing.assert_allclose(local_width(headings, obj.points), widths, atol=1e-5)
     assert max(widths) <= MAX_WIDTH + 1e-5
     avoid = obj.non_graspable_points
     if affordance:
@@ -105,7 +108,7 @@ def test_directions_fill_the_cone_evenly():
 def test_narrow_rolls_are_preferred():
     obj = generate(5, "screwdriver")
     headings = sample_headings(obj, np.random.default_rng(0), use_affordance=True)
-    assert np.median([local_width(obj.points, *heading) for heading in zip(*headings, strict=True)]) < 0.05
+    assert np.median([defined_width(obj.points, *heading) for heading in zip(*headings, strict=True)]) < 0.05
 
 
 def test_the_first_surface_that_the_hand_meets_is_the_headings():
@@ -173,7 +176,7 @@ def test_feasible_keeps_what_stays_above_the_table():
     )
     np.testing.assert_array_equal(feasible(headings, FLAT), [1, 0, 1, 0, 1, 0, 0])
     np.testing.assert_array_equal(
-        feasible(headings, FLAT, Outline(np.zeros((1, 1, 3)), np.array([0.004]))), [1, 1, 1, 0, 1, 1, 0]
+        feasible(headings, FLAT, Outline(np.zeros((1, 1, 3)), np.array([0.004]), ANY)), [1, 1, 1, 0, 1, 1, 0]
     )
     np.testing.assert_array_equal(feasible(headings, FLAT, steepest_up=1.0, back_off=0.03), [1, 0, 1, 1, 1, 1, 1])
     upside_down = np.array([0, 0, 0.05, 0, 1.0, 0, 0])
@@ -224,7 +227,7 @@ def test_parts_that_are_made_to_be_held_can_be(family):
 
 def test_a_hand_needs_room_below_its_centre():
     """A bar of 6 cm along the cross-finger axis, 1 cm thick: level it needs 1 cm, upright 4 cm."""
-    bar = Outline(np.array([[[0, -0.03, 0], [0, 0.03, 0]]]), np.array([0.01, 0.01]))
+    bar = Outline(np.array([[[0, -0.03, 0], [0, 0.03, 0]]]), np.array([0.01, 0.01]), ANY)
     upright = Headings(*(np.array([row], np.float32) for row in ([0, 0, -0.02], LEVEL, UP)))
     level = upright._replace(cross=np.array([[0, 1, 0]], np.float32))
     assert not feasible(upright, FLAT, bar)[0] and feasible(level, FLAT, bar)[0]  # 3 cm high
@@ -238,12 +241,44 @@ def test_a_hand_needs_room_below_its_centre():
 
 def test_an_open_hand_starts_over_the_table_and_may_close_on_the_way():
     """Open it reaches 5 cm down, closed 1 cm; a level approach starts as high as it ends."""
-    hand = Outline(np.array([[[0, 0, -0.04]], [[0, 0, 0.0]]]), np.array([0.01]))
+    hand = Outline(np.array([[[0, 0, -0.04]], [[0, 0, 0.0]]]), np.array([0.01]), np.array([0.1, 0.05]))
     cross = np.array([[0, 1, 0]], np.float32)  # v x w is up
     low = Headings(np.array([[0, 0, -0.02]], np.float32), np.array([LEVEL], np.float32), cross)
     assert not feasible(low, FLAT, hand)[0]
     falling = low._replace(direction=np.array([[0.8, 0, -0.6]], np.float32))
     assert feasible(falling, FLAT, hand)[0]  # it starts 9 cm higher, and is closed when it arrives
+    wide = np.array([0.029, 0.031, 0.5])  # with two fingers of 1 cm: 4.9, 5.1 and 52 cm
+    thrice = Headings(*(np.repeat(part, 3, 0) for part in falling))
+    np.testing.assert_array_equal(feasible(thrice, FLAT, hand, wide), [True, False, False])
+
+
+def test_the_width_is_that_of_the_slab_where_fingers_close():
+    """A cross of two bars, 4 x 10 cm and 10 x 2 cm, whose centre the hand comes to from above."""
+    one, other = np.meshgrid(np.linspace(-0.05, 0.05, 11), [0.0])
+    along_x = np.stack([one, other, 0 * one], -1).reshape(-1, 3)
+    points = np.concatenate([along_x, 0.4 * along_x[:, [1, 0, 2]], [[0.09, 0, -0.05], [0.09, 0.04, 0]]])
+    headings = Headings(
+        np.zeros((3, 3), np.float32),
+        np.array([DOWN, DOWN, LEVEL], np.float32),
+        np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32),
+    )
+    # 9 cm out is a point 5 cm below, past the fingers' end, and one 4 cm aside; both lie beyond a level hand's reach.
+    np.testing.assert_allclose(local_width(headings, points), [0.1, 0.04, 0.0], atol=1e-6)
+    far = headings._replace(position=np.float32([[0, 1, 0]] * 3))
+    np.testing.assert_array_equal(local_width(far, points)[:1], 0)
+
+
+def test_a_heading_moves_back_no_further_than_its_grasp_can_bear():
+    """At heights of 0 and -10 mm a centre that needs 1 cm moves 1 and 2 cm: the latter only where there is no other."""
+    both = made(([0, 0, -0.05], DOWN), ([0, 0, -0.06], DOWN))
+    point = np.zeros((1, 3))
+    (cleared,), (reachable,) = within_reach(both, point, FLAT[None], CENTER)
+    np.testing.assert_array_equal(reachable, [True, False])
+    np.testing.assert_allclose(cleared.position[:, 2], [-0.04, -0.06], atol=2e-6)
+    deep = Headings(*(part[1:] for part in both))
+    (cleared,), (reachable,) = within_reach(deep, point, FLAT[None], CENTER)
+    assert reachable[0]
+    np.testing.assert_allclose(cleared.position[0, 2], -0.04, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", ["human", "allegro", "sharpa"])
@@ -264,7 +299,7 @@ def test_a_table_that_the_outline_clears_is_clear_of_the_hand(name):
 
 def test_a_card_is_approached_as_well_as_it_goes():
     card = made(([0, 0, -0.05], DOWN), ([0, 0, -0.05], UP))
-    tall = Outline(np.array([[[0.05, 0, 0]]]), np.array([0.01]))  # fingers reach 6 cm beyond the centre
+    tall = Outline(np.array([[[0.05, 0, 0]]]), np.array([0.01]), ANY)  # fingers reach 6 cm beyond the centre
     assert not feasible(clear_table(card, FLAT, tall), FLAT, tall).any()
     (cleared,), (reachable,) = within_reach(card, np.zeros((1, 3)), FLAT[None], tall)
     np.testing.assert_array_equal(reachable, [True, False])

@@ -22,7 +22,7 @@ _TUBE = 0.01  # radius around the approach in which nothing may stand before the
 _MARGIN = (
     0.01  # an approach stays this far from the avoid region, and closing fingers, which are this thick, meet none of it
 )
-_BACK = 0.015  # longest way back from the table: to a hand whose centre is 5 mm inside the surface, which it still holds
+_BACK = 0.015  # longest way back from the table: to a hand whose centre is 5 mm inside the surface
 _FARTHEST_BACK = 0.03  # the same for objects that leave no other choice: to 1 cm over the surface
 _FACING = 0.5  # least cosine between a surface's inward normal and a direction that is given
 _ROLLS = 4

@@ -11,7 +11,7 @@ from common.hands import get_hand
 from common.hands.outline import outline
 from common.objects import procedural, store
 from common.task import constraint_sets as stored_sets
-from common.task.sampling.headings import Headings, clear_table, feasible
+from common.task.sampling.headings import Headings, within_reach
 from common.wire.codec import Message
 from services.cli.main import load
 from services.grasp import constraint_sets
@@ -53,12 +53,10 @@ def test_a_set_is_what_training_draws_from(sets):
         np.testing.assert_array_equal(arrays["pose/q"], bank.pose_q[n])
         rest = arrays["rest"]
         assert len(np.unique(rest, axis=0)) == len(rest) <= bank.rest.shape[1]
-        for r, pose in enumerate(rest):
-            headings = Headings(*(arrays[f"heading/{name}"][0] for name in Headings._fields))
-            cleared = clear_table(headings, pose, outline(HAND))
-            np.testing.assert_array_equal(
-                arrays["heading/allowed"][0, r], feasible(cleared, pose, outline(HAND), back_off=0.15)
-            )
+        headings = Headings(*(arrays[f"heading/{name}"][0] for name in Headings._fields))
+        all_cleared, reachable = within_reach(headings, OBJECTS[n].points, rest, outline(HAND))
+        np.testing.assert_array_equal(arrays["heading/allowed"][0], reachable)
+        for r, cleared in enumerate(all_cleared):
             moved = np.linalg.norm(cleared.position - headings.position, axis=-1)
             allowed = arrays["heading/allowed"][0, r]
             np.testing.assert_allclose(arrays["heading/back"][0, r][allowed], moved[allowed], atol=1e-6)
