@@ -44,10 +44,10 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
             return TrainingSet(pool, build_bank(hand, task, pool, seed))
     found, sets = load_pool(objects), list[Message]()
     if objects.constraints:
-        found, sets = load_for(pathlib.Path(objects.constraints), found)
+        found, sets = load_for(pathlib.Path(objects.constraints), found, objects.split)
         if not sets:
             raise CongraspError(
-                f"{objects.constraints} holds no constraint set of an object in {objects.folder}.",
+                f"{objects.constraints} holds no constraint set ({objects.split}) of an object in {objects.folder}.",
                 "Name folders that belong together.",
             )
         if sets[0].meta["hand"] != hand.name:

@@ -2,7 +2,7 @@
 
 import pathlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -35,8 +35,8 @@ MEANING = {
     "trajectory/position": "(V, M, K, 3) m, wrist waypoints in the object frame; trajectory m ends at pose m",
     "trajectory/quaternion": "(V, M, K, 4) wrist frame to object frame",
     "pose/allowed": "(V, R, M) bool, the table leaves room for the pose and its trajectory",
-    "heading/training": "(V, H) bool, the heading is among the 80 % for training; the others are held out",
-    "pose/training": "(V, M) bool, the same for pose m and trajectory m",
+    "heading/training": "(V, H) bool, the heading is for training (80 % are); the others are held out",
+    "pose/training": "(V, M) bool, the same for pose m and trajectory m (captured: 80 % of the data set's)",
     "visual/vertices": "(n, 3) m, object frame",
     "visual/faces": "(m, 3) indices of vertices",
 }
@@ -77,9 +77,7 @@ def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
 def _row(made: Message, split: Split) -> ConstraintBank:
     """One set as a row of a constraint bank: what belongs to the split, in resting poses that allow a heading."""
     arrays = made.arrays
-    heading, pose = (
-        arrays[f"{kind}/allowed"] & _belongs(arrays[f"{kind}/training"], split)[:, None] for kind in ("heading", "pose")
-    )
+    heading, pose = (_allowed(made, kind, split) for kind in ("heading", "pose"))
     usable = np.flatnonzero(heading[0].any(-1))
     if len(usable) == 0:
         raise CongraspError(
@@ -108,6 +106,12 @@ def _row(made: Message, split: Split) -> ConstraintBank:
         weight=np.float32(1.0),
         renewable=np.bool_(False),
     )
+
+
+def _allowed(made: Message, kind: Literal["heading", "pose"], split: Split) -> np.ndarray:
+    """(V, R, H or M) bool, the headings or references of a split for which the table leaves room."""
+    allowed, training = made.arrays[f"{kind}/allowed"], made.arrays[f"{kind}/training"]
+    return allowed & _belongs(training, split)[:, None]
 
 
 def _belongs(training: np.ndarray, split: Split) -> np.ndarray:
@@ -159,8 +163,10 @@ def _names(value: Any) -> list[str]:
     return value if isinstance(value, list) and all(isinstance(name, str) for name in value) else []
 
 
-def load_for(folder: pathlib.Path, objects: Sequence[GraspObject]) -> tuple[list[GraspObject], list[Message]]:
-    """The objects that have a set in a folder, and their sets.
+def load_for(
+    folder: pathlib.Path, objects: Sequence[GraspObject], split: Split = "all"
+) -> tuple[list[GraspObject], list[Message]]:
+    """The objects that have a set with a heading of the split in a folder, and their sets.
 
     Raises:
       CongraspError: a set cannot be read, or was made for another object of the same name.
@@ -172,6 +178,7 @@ def load_for(folder: pathlib.Path, objects: Sequence[GraspObject]) -> tuple[list
             made = load(path)
             if made.meta["object_digest"] != store.digest(obj):
                 raise CongraspError(f"{path} was made for another object '{obj.name}'.", "Name that object's folder.")
-            chosen.append(obj)
-            sets.append(made)
+            if _allowed(made, "heading", split)[0].any():
+                chosen.append(obj)
+                sets.append(made)
     return chosen, sets

@@ -227,6 +227,8 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
             left = [row["sequence"] for row in kept if not row["clear_of_table"] and row["from_below"] == below]
             if left:
                 print(f"No episode is drawn from {len(left)}, whose hand comes {why}: {', '.join(left)}.")
+        training = sum(row["split"] == "training" for row in kept)
+        print(f"{training} sequences are for training, {len(kept) - training} held out.")
         print(f"Constraint sets ({sets}) are in {out}, their objects in {objects}.")
     print(f"{out / REPORT} holds the outcome of each sequence.")
 

@@ -63,7 +63,8 @@ def evaluate(
         procedural objects of seeds that training never uses.
       constraints: Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import'; its
         references are used instead of the reference policy's. Objects without a set are left out.
-      split: Of these sets all constraints, the 80 % for training, or those that are held out.
+      split: Of these sets all constraints, the 80 % for training, or those that are held out. Objects without a heading
+        among them are left out, and rows of poses and trajectories are of the objects that have one among them.
       episodes: Episodes in each row; of the table 'objects', episodes in all.
       physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
       pool: Number of procedural objects; 0 takes 64, and for the table 'objects' one an episode, at most 50,000.
@@ -97,6 +98,7 @@ def evaluate(
     settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
     setup = Setup(episodes, pool=pool, folder=objects, **settings)
     pools = json and json.with_name(f"{json.name}.pools")
+    without: list[str] = []
     with tracked() as track:
         if objects and (constraints or set(table) != {"objects"}):
             setup = dataclasses.replace(setup, given=objects_of(objects, track=track))
@@ -105,6 +107,7 @@ def evaluate(
                 raise CongraspError("--constraints needs the sets' objects.", "Name their folder with --objects.")
             sets = captured(constraints, split, setup.given)
             _check_hand(sets.hand, [one.hand for one, _ in lineup.entrants])
+            without = sorted({obj.name for obj in setup.given} - {obj.name for obj in sets.objects})
             setup = dataclasses.replace(setup, given=sets.objects, bank=sets.bank, paper=sets.paper)
         results = []
         for one, tables in lineup.entrants:
@@ -116,6 +119,8 @@ def evaluate(
         f"{_who(lineup)}, on {_source(lineup, objects)}, {engine_title(engine)}, friction {friction:g}",
         by,
     )
+    if without:
+        print(f"Left out: objects without a constraint set, or a heading in it ({split}): {', '.join(without)}.")
     if json and pools:
         about = _about(lineup, objects, constraints, split) | settings
         write_json([row for found in results for row in found.rows], json, about)

@@ -188,14 +188,17 @@ class Captured(NamedTuple):
 
 
 def captured(folder: pathlib.Path, split: Split, objects: Sequence[GraspObject]) -> Captured:
-    """The objects that have a constraint set in a folder, and the sets.
+    """The objects that have a constraint set with a heading of the split in a folder, and the sets.
 
     Raises:
       CongraspError: none has one, or a set is not for its object.
     """
-    chosen, sets = load_for(folder, objects)
+    chosen, sets = load_for(folder, objects, split)
     if not sets:
-        raise CongraspError(f"{folder} holds no constraint set of these objects.", "Name folders that belong together.")
+        raise CongraspError(
+            f"{folder} holds no constraint set ({split}) of these objects.",
+            "Name folders that belong together, or take another --split.",
+        )
     sources = {made.meta.get("source", "") for made in sets}
     paper = CAPTURED_SETS.get(sources.pop(), "") if len(sources) == 1 else ""
     return Captured(chosen, bank_of(sets, split), sets[0].meta["hand"], paper)

@@ -46,7 +46,6 @@ def make_sets(
             fitting[n],
             seed,
             {"object_scale": scale, "object_digest": store.digest(obj)},
-            shuffled=False,
         )
         for n, obj in enumerate(objects)
     ]
@@ -59,7 +58,8 @@ def set_of(
     seed: int,
     about: dict[str, Any] | None = None,
     *,
-    shuffled: bool = True,
+    pose_training: np.ndarray | None = None,
+    heading_training: np.ndarray | None = None,
 ) -> Message:
     """The constraint set of one object.
 
@@ -67,10 +67,11 @@ def set_of(
       hand: the hand.
       row: of the constraint bank, without the axis of the objects.
       obj: the object.
-      seed: of the constraints; the split into training and held-out is drawn from it.
+      seed: of the constraints.
       about: further facts for the file.
-      shuffled: whether any references may be held out; otherwise they are the last ones, as in evaluations
+      pose_training: (M,) bool, the references for training; by default the first 80 %, as in evaluations
         (`services.evaluate.references`).
+      heading_training: (H,) bool, the headings for training; by default 80 % that are drawn from the seed.
     """
     # The bank fills an object's resting poses up to the most of any object by repeating them.
     again = np.flatnonzero((row.rest[1:] == row.rest[0]).all(-1))
@@ -81,6 +82,10 @@ def set_of(
         if v == 0 or row.has_affordance[r] or not row.avoid.any():
             allowed[v, r, row.heading_index[v, r]] = True
             back[v, r, row.heading_index[v, r]] = row.heading_back[v, r]
+    if pose_training is None:
+        pose_training = for_training(row.pose_q.shape[1])
+    if heading_training is None:
+        heading_training = for_training(row.heading_position.shape[1], seed)
     arrays = {
         "surface/points": row.points,
         "surface/minus": row.avoid,
@@ -96,8 +101,8 @@ def set_of(
         "trajectory/position": row.trajectory_position,
         "trajectory/quaternion": row.trajectory_quaternion,
         "pose/allowed": row.pose_valid[:, :rests],
-        "heading/training": _split(row.heading_position.shape[:2], seed),
-        "pose/training": _split(row.pose_q.shape[:2], seed if shuffled else None),
+        "heading/training": _twice(heading_training),
+        "pose/training": _twice(pose_training),
         "visual/vertices": np.asarray(obj.visual_vertices, np.float32),
         "visual/faces": np.asarray(obj.visual_faces, np.int32),
     }
@@ -120,10 +125,15 @@ def set_of(
     return Message(arrays, meta)
 
 
-def _split(shape: tuple[int, ...], seed: int | None) -> np.ndarray:
-    """(V, M) bool, true for 80 % of M (rounded up), the same in both regions; the first ones without a seed."""
-    order = np.arange(shape[1]) if seed is None else np.random.default_rng(seed).permutation(shape[1])
-    return np.broadcast_to(order < np.ceil(_TRAINING * shape[1]), shape).copy()
+def for_training(count: int, seed: int | None = None) -> np.ndarray:
+    """(count,) bool, true for 80 % (rounded up): drawn from the seed, or the first ones without one."""
+    order = np.arange(count) if seed is None else np.random.default_rng(seed).permutation(count)
+    return np.asarray(order < np.ceil(_TRAINING * count))
+
+
+def _twice(training: np.ndarray) -> np.ndarray:
+    """(V, M) of (M,): the same in both regions."""
+    return np.tile(training, (len(REGIONS), 1))
 
 
 def save(constraints: Message, folder: pathlib.Path) -> pathlib.Path:

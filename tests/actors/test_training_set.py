@@ -1,6 +1,7 @@
 """What actors train on: procedural objects, folders, captured constraints, and mixtures of them."""
 
 import dataclasses
+from typing import get_args
 
 import jax
 import numpy as np
@@ -10,12 +11,13 @@ from actors import harvest, initial
 from actors.bank import headings_of
 from actors.harvest import Grasps
 from actors.training_set import training_set
-from common.config import ObjectsConfig, RunConfig, TaskConfig
+from common.config import ObjectsConfig, RunConfig, Split, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
 from common.objects.store import Catalogue
 from common.task.bank import rows_of, stacked
+from common.task.constraint_sets import load_for
 from services.grasp.constraint_sets import make_sets, save
 
 HAND = get_hand("human")
@@ -65,6 +67,16 @@ def test_constraint_sets_keep_their_split_and_their_references(folders):
     for _ in range(4):  # a random place each time
         renewed = harvest.renew(HAND, TaskConfig(), found.bank, grasps, jax.random.key(0))
         np.testing.assert_array_equal(renewed.pose_q[0], found.bank.pose_q[0])
+
+
+def test_an_object_without_a_heading_of_the_split_is_left_out(tmp_path):
+    for obj, made in zip(OBJECTS, make_sets(HAND, TaskConfig(), OBJECTS, 5), strict=True):
+        if obj is OBJECTS[0]:
+            made.arrays["heading/allowed"] &= made.arrays["heading/training"][:, None]
+        save(made, tmp_path)
+    kept = {split: [obj.name for obj in load_for(tmp_path, OBJECTS, split)[0]] for split in get_args(Split)}
+    every = [obj.name for obj in OBJECTS]
+    assert kept == {"all": every, "training": every, "held-out": every[1:]}
 
 
 @pytest.mark.parametrize("family", procedural.HOUSEHOLD_FAMILIES)

@@ -3,7 +3,7 @@
 import collections
 import dataclasses
 import pathlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, Literal
 
 import numpy as np
@@ -28,7 +28,7 @@ from services.assets.captures.transfer import demonstrated_headings, transferred
 from services.assets.objects.affordance import near_points, relabelled, two_parts
 from services.assets.objects.meshes import UNLABELLED
 from services.assets.objects.sources import safe_name
-from services.grasp.constraint_sets import set_of
+from services.grasp.constraint_sets import for_training, set_of
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
 _TOUCHED = 0.03
@@ -49,7 +49,7 @@ class Options:
     """Radians by which a captured joint may exceed its limits; it is then moved to the limit. For `human` alone."""
     waypoints: int = 15
     seed: int = 0
-    """Of headings, and of the split into training and held-out."""
+    """Of headings, and of the split of all sequences into training and held-out."""
 
 
 @dataclasses.dataclass
@@ -114,9 +114,11 @@ def import_sets(
             progress(dropped.name)
             report.drop(dropped)
     objects, sets = [], []
-    for number, group in enumerate(groups.values()):
+    # Sets may be of one sequence each: 80 % are those of all sequences, not of each set's.
+    splits = _split(groups.values(), options.seed)
+    for number, (group, training) in enumerate(zip(groups.values(), splits, strict=True)):
         try:
-            obj, made = _set(hand, group, options, number, source)
+            obj, made = _set(hand, group, options, number, source, training)
         except CongraspError as error:
             for demonstration in group.demonstrations:
                 report.drop(Dropped(demonstration.name, "object out of reach", str(error)))
@@ -136,9 +138,16 @@ def import_sets(
                     "touched_points": len(demonstration.contact),
                     "clear_of_table": bool(usable[m]),
                     "from_below": bool(below[m]),
+                    "split": "training" if training[m] else "held-out",
                 }
             )
     return objects, sets, report
+
+
+def _split(groups: Collection[_Group], seed: int) -> list[np.ndarray]:
+    """Of each group which of its demonstrations (M,) are for training, 80 % of those of all groups together."""
+    ends = np.cumsum([len(group.demonstrations) for group in groups], dtype=int)
+    return np.split(for_training(int(ends[-1]), seed), ends[:-1]) if len(ends) else []
 
 
 def _shape(
@@ -206,8 +215,22 @@ def _nearest(clouds: list[np.ndarray], points: np.ndarray) -> np.ndarray:
     return np.argmin([cKDTree(cloud).query(points)[0] for cloud in clouds], axis=0)
 
 
-def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) -> tuple[GraspObject, Message]:
-    """The object, and its constraint set in the size in which the hand grasps it."""
+def _set(
+    hand: Hand, group: _Group, options: Options, number: int, source: str, training: np.ndarray
+) -> tuple[GraspObject, Message]:
+    """The object, and its constraint set in the size in which the hand grasps it.
+
+    Args:
+      hand: whose constraints these are.
+      group: the object and its M demonstrations.
+      options: see there.
+      number: of the group, for its seed.
+      source: name of the data set.
+      training: (M,) bool, the demonstrations for training.
+
+    Raises:
+      CongraspError: the hand can approach the object in no resting pose.
+    """
     task = TaskConfig(hand=hand.name, trajectory_points=options.waypoints)
     obj, demonstrations, seed = group.obj, group.demonstrations, (options.seed, number)
     scale = object_scale(hand, task)
@@ -241,7 +264,9 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
         "object_scale": scale,
         "object_digest": store.digest(obj),
     }
-    return obj, set_of(hand, row, fitting, options.seed, about)
+    # Demonstrated headings repeat, and each belongs where its demonstration does.
+    own = np.resize(training, HEADINGS) if given else None
+    return obj, set_of(hand, row, fitting, options.seed, about, pose_training=training, heading_training=own)
 
 
 def _from_below(made: Message) -> np.ndarray:

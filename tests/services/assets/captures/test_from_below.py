@@ -23,7 +23,8 @@ def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
 
 def test_the_report_names_them(capsys):
     def row(name: str, *, clear: bool, below: bool) -> dict:
-        return {"sequence": name, "object": "box", "residual_rad": 0.0, "clear_of_table": clear, "from_below": below}
+        place = {"clear_of_table": clear, "from_below": below, "split": "held-out" if name == "dig" else "training"}
+        return {"sequence": name, "object": "box", "residual_rad": 0.0} | place
 
     kept = [
         row("lift", clear=True, below=False),
@@ -36,3 +37,4 @@ def test_the_report_names_them(capsys):
     assert "room for 1 of 4" in said
     assert "No episode is drawn from 2, whose hand comes from below, which no episode does: scoop, dig." in said
     assert "No episode is drawn from 1, whose hand comes too near to the table: push." in said
+    assert "3 sequences are for training, 1 held out." in said

@@ -2,8 +2,11 @@
 
 import mujoco
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
+from common.objects.store import Catalogue
+from common.task.constraint_sets import bank_of, load_for
 from services.assets.captures.myohand import wrist_pose
 from tests.services.assets.captures import known
 
@@ -70,6 +73,26 @@ def test_a_known_answer_comes_back(run_import, tmp_path):
         known.check(sets["box"].arrays, m, case)
     assert sets["box"].meta["demonstrations"] == [case.name for case in cases]
     assert sets["box"].meta["source"] == "myohand"
+
+
+@pytest.mark.parametrize("headings", ["sampled", "demonstrated"])
+def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_own(run_import, tmp_path, headings):
+    for seed, name in enumerate("abcde"):
+        case = known.make(f"MyoHand_{name}_lift", name, seed)
+        write(case, tmp_path / "data" / f"{case.name}.npz")
+        known.write_mesh(case, tmp_path / "meshes" / f"{name}.stl")
+    options = ["--meshes", tmp_path / "meshes", "--headings", headings]
+    _, report = run_import("myohand", tmp_path / "data", *options)
+    held = [row["object"] for row in report.kept if row["split"] == "held-out"]
+    assert len(report.kept) == 5 and len(held) == 1
+    catalogue = Catalogue(tmp_path / "objects")
+    found = [catalogue.get(name) for name in catalogue.list()]
+    for split, names in (("training", set("abcde") - set(held)), ("held-out", set(held))):
+        objects, chosen = load_for(tmp_path / "out", found, split)
+        if headings == "demonstrated":  # a heading belongs where its demonstration does
+            assert {obj.name for obj in objects} == names
+        valid = bank_of(chosen, split).pose_valid[:, 0].any((1, 2))
+        assert {obj.name for obj, any_valid in zip(objects, valid, strict=True) if any_valid} == names
 
 
 def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
