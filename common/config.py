@@ -16,6 +16,7 @@ from typing_extensions import Doc
 
 from common.engines import PhysicsName
 from common.errors import CongraspError
+from common.hands.spec import CONTACT_TIME
 from common.inputs import file_name
 from common.task.constraints import CONSTRAINTS, PAPER
 from common.task.reward import GRASP
@@ -65,10 +66,10 @@ class ControlConfig:
     """The wrist's target is at most this far ahead of it, m: at kp/kv = 20/s a speed of 0.8 m/s."""
     guidance_rotation_limit: float = 0.3
     """The wrist's target is at most this far ahead of it, rad: 5 rad/s."""
-    wrist_acceleration: float = 0.0
+    wrist_acceleration: float = 15.0
     """Greatest acceleration that the wrist's servos give it, m/s^2; by its inertia their greatest force, too.
-    0: none."""
-    wrist_angular_acceleration: float = 0.0
+    0: any."""
+    wrist_angular_acceleration: float = 150.0
     """The same about its hinges, rad/s^2."""
     lookahead: int = 1
     """Waypoints ahead of the nearest one that the guidance aims at (0 is the paper's ablation without feed-forward)."""
@@ -127,7 +128,7 @@ class TaskConfig(_Shares):
     """Whether the hand collides with the table."""
     hand_self_collision: bool = True
     """Whether the hand's links collide with one another."""
-    contact_time: float = 0.016
+    contact_time: float = CONTACT_TIME
     """Time constant of the hand's contacts, s; at least two physics steps. At 0.006 a grasp's are about 1 mm deep."""
     back_off: float = 0.15
     """Metres from the aligned wrist to its start, against the heading direction."""

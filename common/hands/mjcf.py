@@ -6,7 +6,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from common.hands.spec import Capsule, Hand, Link, Solid, link_origin
+from common.hands.spec import CONTACT_TIME, Capsule, Hand, Link, Solid, link_origin
 from common.objects import shapes
 from common.objects.mjcf import GEOM_TYPES
 from common.objects.spec import Piece
@@ -14,8 +14,6 @@ from common.objects.spec import Piece
 HAND_CONTYPE = 1
 """Collision bit of the hand: whatever collides with it has this bit in its conaffinity."""
 _COUPLING_TIME = 0.005  # s, within which a joint is again where its leader puts it
-CONTACT_TIME = 0.006
-"""Seconds, the time constant of contacts that are as stiff as a hand of flesh or rubber needs them."""
 WRIST_JOINTS = ("wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz")
 
 

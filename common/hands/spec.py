@@ -13,6 +13,8 @@ from typing import Literal
 import numpy as np
 
 Vector = tuple[float, float, float]
+CONTACT_TIME = 0.006
+"""Seconds, the time constant of contacts that are as stiff as a hand of flesh or rubber needs them."""
 _ARM = 0.65  # kg, what an arm adds to the inertia of the hand that it carries
 _GYRATION = 0.06  # m, a hand's radius of gyration about its wrist
 

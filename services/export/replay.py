@@ -33,7 +33,7 @@ MASS, FRICTION = 0.1, 0.6
 STARTS = ("grasp", "pregrasp")
 _STAGE, _PUSH, _LOOK = 40, 200, 10  # control steps: of a stage, of a push, and from one look at contacts to the next
 _TOGETHER = 32  # grasps side by side
-_TASK = TaskConfig(contact_time=0.006)
+_TASK = TaskConfig()
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 

@@ -5,7 +5,7 @@ import dataclasses
 from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
-from services.train.recipe import ARM, CONTACT_TIME, recipe
+from services.train.recipe import recipe
 
 FULL = "full"
 """The preset of the full task for the hand that the command line names, the human hand by default."""
@@ -21,8 +21,6 @@ QUICKSTART = RunConfig(
         p_affordance=0.0,
         p_pose=0.0,
         p_trajectory=0.0,
-        control=ARM,
-        contact_time=CONTACT_TIME,
     ),
     objects=ObjectsConfig(count=16),
     network=NetworkConfig(hidden=(256, 128)),

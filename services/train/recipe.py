@@ -21,7 +21,6 @@ docs/training.md compares this with what had been found by hand. All else is the
 import dataclasses
 
 from common.config import (
-    ControlConfig,
     CurriculumConfig,
     ObjectsConfig,
     PPOConfig,
@@ -30,13 +29,10 @@ from common.config import (
     TaskConfig,
 )
 from common.hands.measures import tip_forces
-from common.hands.mjcf import CONTACT_TIME
 from common.hands.spec import Hand
 
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
 """Families that are hardest to hold by a part; twice as many of them are trained on."""
-ARM = ControlConfig(wrist_acceleration=15.0, wrist_angular_acceleration=150.0)
-"""The wrist moves as an arm does."""
 _FORCE, _HEADING, _AFFORDANCE = 5.0, 12.0, 0.6  # of the human hand: N, weight, share of the episodes
 _STRONG = 0.3  # share of its fingertips' strength that a strong hand needs
 
@@ -86,8 +82,6 @@ def recipe(hand: Hand) -> RunConfig:
             disturbed_references=0.5,
             mass_range=(0.8, 1.25),
             friction_range=(0.8, 1.2),
-            control=ARM,
-            contact_time=CONTACT_TIME,
             reward=RewardWeights(force_max=own.force_max),
         ),
         # Grasps first, then the precision with which constraints are met: with the second weights from the beginning

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from common.config import ControlConfig, RewardWeights, TaskConfig
+from common.config import RewardWeights, TaskConfig
 from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
 from common.task import metrics
 from common.task.constraints import blocks
@@ -26,7 +26,7 @@ from common.task.observation import layout, observe
 from common.task.reward import reward_terms, terms
 from tests.scenes import HAND, F, K, L, active, moved, near_targets, scene
 
-TASK = TaskConfig(control=ControlConfig(wrist_acceleration=15.0, wrist_angular_acceleration=150.0))
+TASK = TaskConfig()
 TERMS, MASKS = terms(TASK), ("affordance", "pose_finger", "pose_wrist", "trajectory")
 UNIT = RewardWeights(**{name: 1.0 for name in TERMS}, force_max=5.0)
 
