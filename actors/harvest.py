@@ -1,7 +1,7 @@
 """Reference poses and trajectories from the policy's own grasps (paper, section Hand Morphology).
 
 Successful episodes under a heading alone leave their final states behind; now and then these replace poses of the
-constraint bank, so that what later episodes ask for is what this hand can do.
+constraint bank, so that much of what later episodes ask for is what this hand can do.
 """
 
 import functools
@@ -79,14 +79,16 @@ def collect(
 def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, key: Array) -> ConstraintBank:
     """The constraint bank with each grasp in the place of a random reference pose of its object and region.
 
-    Places whose pose no resting pose allows are taken first.
+    Places whose pose no resting pose allows are taken first, and of the others only the first half: a policy that had
+    learnt from its own grasps alone held 97 % of these, and 66 % of another policy's.
     """
     slot_key, path_key = jax.random.split(key)
     objects = bank.pose_q.shape[0]
     fresh = Poses(grasps.q, grasps.position, grasps.quaternion)
     path, turns, valid = make_references(hand, fresh, bank.rest[grasps.object_index], path_key, task.trajectory_points)
     unused = ~bank.pose_valid[grasps.object_index, grasps.region].any(1)
-    slot = jnp.argmax(unused + jax.random.uniform(slot_key, unused.shape), -1)
+    own = jnp.arange(unused.shape[1]) < unused.shape[1] // 2
+    slot = jnp.argmax(2.0 * unused + own * jax.random.uniform(slot_key, unused.shape), -1)
     place = grasps.object_index, grasps.region, slot
     # Of several grasps for one place the last is taken, in all arrays: a scatter would mix them on a GPU.
     number = jnp.arange(slot.size)

@@ -141,8 +141,8 @@ class TaskConfig(_Shares):
     headings: Literal["all", "above"] = "all"
     """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier)."""
     own_references: bool = True
-    """Reference poses and trajectories are remade from the policy's own grasps as it learns; otherwise they stay those
-    that closing the hand around the objects gave."""
+    """Half of an object's reference poses and trajectories are remade from the policy's own grasps as it learns; the
+    others, or all without, stay those that closing the hand around the objects gave."""
     aligned_references: bool = False
     """An episode with a reference pose and a wrist trajectory gets the trajectory to that pose; otherwise the two are
     drawn independently, as in the paper, and the trajectory may end elsewhere."""

@@ -114,6 +114,23 @@ def test_a_grasp_replaces_one_reference_of_its_object_and_region(bank):
     jax.tree.map(np.testing.assert_array_equal, nothing, flat)
 
 
+def test_half_of_the_references_stay_as_the_closing_hand_gave_them(bank):
+    many = 64
+    grasps = Grasps(
+        jnp.ones(many, bool),
+        jnp.ones(many, int),
+        jnp.ones(many, int),
+        jnp.full((many, F), 0.123),
+        jnp.array([[0.0, 0.0, 0.2]] * many),
+        jnp.stack([_pointing(-1.0)] * many),
+    )
+    flat = bank._replace(rest=bank.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
+    flat = flat._replace(pose_valid=jnp.ones_like(flat.pose_valid))
+    new = renew(HAND, TASK, flat, grasps, jax.random.key(1))
+    changed = np.asarray((new.pose_q != flat.pose_q).any(-1))[1, 1]
+    np.testing.assert_array_equal(changed, np.arange(POSES) < POSES // 2)
+
+
 def test_only_masked_environments_are_exchanged():
     mask = jnp.array([True, False])
     new, old = {"a": jnp.ones((2, 3)), "b": jnp.array([True, True])}, {"a": jnp.zeros((2, 3)), "b": jnp.zeros(2, bool)}
