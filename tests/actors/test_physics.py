@@ -260,8 +260,18 @@ def test_a_pool_may_begin_with_an_object_whose_inertia_is_diagonal():
     assert np.isfinite(leaves["body_inertia"]).all()
 
 
+@pytest.fixture
+def optimised():
+    """MJX's program takes longer without the compiler's optimisations, which other tests do without."""
+    name = "jax_disable_most_optimizations"
+    before = jax.config.read(name)
+    jax.config.update(name, False)
+    yield
+    jax.config.update(name, before)
+
+
 @pytest.mark.timeout(900)
-def test_jax_agrees_with_native(env):
+def test_jax_agrees_with_native(env, optimised):
     """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
     start = above(env.reset_state, 0.2)
     # Without the hand's contacts with itself and the table, which take minutes to compile there.

@@ -24,7 +24,8 @@ from common.task.types import CONTACTS_PER_LINK, Action
 HAND = get_hand("human")
 TASK = TaskConfig()
 OBJECTS = procedural.generate_many(4, 0, ("box", "cylinder", "mug", "hammer"))
-BATCH = 8
+BATCH = 8  # of most workers here, so that their programs are compiled once
+DRAWN = 4000
 SIZE = sum(size for _, size in layout(HAND, TASK))
 
 
@@ -33,18 +34,23 @@ def bank():
     return build_bank(HAND, TASK, OBJECTS, 0)
 
 
+@pytest.fixture(scope="module")
+def drawn(bank):
+    """So many episodes that shares of them can be counted."""
+    return initial.sample(HAND, TASK, bank, jax.random.key(0), DRAWN)
+
+
 def _noise(parameters, observation, key):
     action = 0.3 * jax.random.normal(key, (observation.shape[0], len(HAND.joints) + 6))
     return action, -jnp.sum(action**2, -1)
 
 
-def _worker(bank, task=TASK, seed=0, batch=BATCH):
-    physics = NativePhysics(HAND, task, OBJECTS, 2)
-    return RolloutWorker(HAND, task, physics, bank, _noise, batch=batch, seed=seed, half_precision=True)
+def _worker(bank, seed=0):
+    physics = NativePhysics(HAND, TASK, OBJECTS, 2)
+    return RolloutWorker(HAND, TASK, physics, bank, _noise, batch=BATCH, seed=seed, half_precision=True)
 
 
-def test_masks_are_drawn_as_in_the_paper(bank):
-    drawn = initial.sample(HAND, TASK, bank, jax.random.key(0), 4000)
+def test_masks_are_drawn_as_in_the_paper(drawn):
     named = {block: np.asarray(active, float) for block, active in drawn.goal.active.items()}
     assert list(named) == ["affordance", "pose_finger", "pose_wrist", "trajectory"]
     assert abs(named["trajectory"].mean() - 0.5) < 0.08
@@ -54,8 +60,8 @@ def test_masks_are_drawn_as_in_the_paper(bank):
     assert np.all(np.asarray(drawn.hold) == TASK.hold_steps)
 
 
-def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(bank):
-    start, goal, *_ = initial.sample(HAND, TASK, bank, jax.random.key(1), 256)
+def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(drawn):
+    start, goal, *_ = drawn
     trajectory = np.asarray(goal.active["trajectory"])
     first = rotations.compose_pose(
         start.object_position,
@@ -66,7 +72,7 @@ def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(b
     np.testing.assert_allclose(np.asarray(start.base_position)[trajectory], np.asarray(first[0])[trajectory], atol=1e-5)
     # Otherwise v points along v-bar, and the hand centre lies 15 cm before p-bar.
     direction = np.asarray(rotations.rotate(start.object_quaternion, goal["heading"].direction))
-    v = np.asarray(rotations.rotate(start.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, (256, 3))))
+    v = np.asarray(rotations.rotate(start.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, (DRAWN, 3))))
     np.testing.assert_allclose(v[~trajectory], direction[~trajectory], atol=1e-4)
     center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, start.q)))
     center = np.asarray(rotations.rotate(start.base_quaternion, center) + start.base_position)
@@ -74,7 +80,7 @@ def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(b
     np.testing.assert_allclose((center + TASK.back_off * direction)[~trajectory], target[~trajectory], atol=1e-4)
     pose = np.asarray(goal.active["pose_finger"])
     np.testing.assert_allclose(np.asarray(start.q)[pose], np.asarray(goal["pose"].q)[pose], atol=1e-6)
-    np.testing.assert_allclose(np.asarray(start.q)[~pose], np.tile(HAND.q_open, (256 - pose.sum(), 1)), atol=1e-6)
+    np.testing.assert_allclose(np.asarray(start.q)[~pose], np.tile(HAND.q_open, (DRAWN - pose.sum(), 1)), atol=1e-6)
 
 
 def test_rollouts_go_through_whole_episodes_and_on(bank):
@@ -126,7 +132,7 @@ def test_success_needs_the_object_to_stay_up(bank):
     away = build_bank(HAND, task, OBJECTS, 0)
     physics = NativePhysics(HAND, task, OBJECTS, 2)
     still = lambda p, o, k: (jnp.zeros((o.shape[0], 26)).at[:, 20:23].set(-20.0), jnp.zeros(o.shape[0]))  # noqa: E731
-    worker = RolloutWorker(HAND, task, physics, away, still, batch=BATCH, seed=0, half_precision=False)
+    worker = RolloutWorker(HAND, task, physics, away, still, batch=BATCH, seed=0, half_precision=True)
     episodes = finished_episodes(worker.collect(None, 75), task)
     untouched = episodes["episode/links_at_removal"] == 0
     assert untouched.any()
@@ -197,7 +203,7 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(bank, end_when_fal
 
 
 def test_workers_with_the_same_seed_agree_bit_for_bit(bank):
-    a, b = (_worker(bank, seed=5, batch=3).collect(None, 20) for _ in range(2))
+    a, b = (_worker(bank, seed=5).collect(None, 20) for _ in range(2))
     np.testing.assert_array_equal(a.reward, b.reward)
     np.testing.assert_array_equal(a.observation, b.observation)
 

@@ -1,12 +1,14 @@
 """The command line as a user meets it: help, and one clear line for bad input."""
 
 import errno
+import logging
 import os
 import re
 import signal
 import socket
 import subprocess
 import sys
+from unittest import mock
 
 import pytest
 
@@ -19,6 +21,14 @@ def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Runs the command line in a process of its own."""
     command = [sys.executable, "-m", "services.cli.main", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def is_one_line(code: int, said: str, words: str) -> None:
+    """What was said on the standard error is one line with these words, and the exit code tells of bad input."""
+    assert code not in (0, 1), said
+    (line,) = said.splitlines()
+    assert line.startswith("congrasp: error: ")
+    assert re.search(words, line), line
 
 
 def test_help_names_every_command_and_every_command_exists():
@@ -43,13 +53,10 @@ def test_help_names_every_command_and_every_command_exists():
         (["evaluate", "--method", "graspxl"], "is of the method 'ours', not 'graspxl'.*train --method graspxl"),
         (["train", "--task.hand", "paw"], "no hand 'paw'"),
         (["train", "--resume", "--run-dir", "/nonexistent-run"], "is not a run directory"),
-        (["train", "--physics", "warp", "--run-dir", "/nonexistent-run"], "NVIDIA GPU"),
         (["evaluate", "--policy", "/nonexistent.safetensors"], "cannot be read"),
         (["serve", "--hand", "paw"], "no hand 'paw'"),
-        (["serve", "--policy", "/nonexistent.safetensors"], "cannot be read"),
         (["serve", "--policy", "a.safetensors", "--connect", "tcp/127.0.0.1:1"], "either a.safetensors or"),
         (["actor", "--connect", "nonsense"], "endpoint"),
-        (["query", "--connect", "tcp/127.0.0.1:1", "--repeat", "2"], "127.0.0.1:1"),
         (["plot", "/nonexistent-run"], "nonexistent-run"),
         (["learner", "--run-dir", "/nonexistent-run", "--listen", "tcp/0.0.0.0:7447"], "other machines.*--certs"),
         (["serve", "--listen", "tcp/[::]:7457"], "other machines.*--certs.*--insecure"),
@@ -58,12 +65,26 @@ def test_help_names_every_command_and_every_command_exists():
         (["certs", "issue", "/nonexistent-certs", "--role", "actor"], "no authority.*congrasp certs init"),
     ],
 )
-def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words):
+def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words, monkeypatch, capfd):
+    """In this process: starting one and importing JAX takes seconds each time."""
+    monkeypatch.setattr(logging.getLogger(), "handlers", [*logging.getLogger().handlers])  # roles add one that stays
+    with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
+        cli.main(arguments)
+    is_one_line(end.value.code, capfd.readouterr().err, words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["train", "--physics", "warp", "--run-dir", "/nonexistent-run"], "NVIDIA GPU"),
+        (["serve", "--policy", "/nonexistent.safetensors"], "cannot be read"),
+        (["query", "--connect", "tcp/127.0.0.1:1", "--repeat", "2"], "127.0.0.1:1"),
+    ],
+)
+def test_libraries_add_nothing_to_the_line(arguments, words):
+    """In a process that imports JAX, MuJoCo and Zenoh for the first time."""
     done = congrasp(*arguments)
-    assert done.returncode not in (0, 1), done.stderr
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("congrasp: error: ")
-    assert re.search(words, line), line
+    is_one_line(done.returncode, done.stderr, words)
 
 
 def test_a_full_disk_is_one_line_wherever_it_strikes(monkeypatch, capsys):
