@@ -119,6 +119,16 @@ def test_a_spoilt_bundle_is_refused_in_one_line(bundle, spoil, words):
     assert "p.safetensors" in str(caught.value)
 
 
+def test_a_policy_of_before_a_setting_keeps_what_held_then(bundle):
+    message = bundle.to_message()
+    task = {name: value for name, value in message.meta["task"].items() if name != "contact_time"}
+    task["control"] = {name: value for name, value in task["control"].items() if "acceleration" not in name}
+    older = PolicyBundle.from_message(Message(message.arrays, {**message.meta, "task": task}))
+    assert older.task.contact_time == 0.016
+    assert older.task.control.wrist_acceleration == older.task.control.wrist_angular_acceleration == 0
+    assert PolicyBundle.from_message(message).task == bundle.task
+
+
 def test_files_that_are_none_are_refused(bundle, tmp_path):
     with pytest.raises(CongraspError, match=r"nowhere\.safetensors cannot be read"):
         bundles.load(tmp_path / "nowhere.safetensors")

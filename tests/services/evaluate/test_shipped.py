@@ -22,6 +22,7 @@ def test_the_shipped_policy_grasps_under_every_constraint():
     rows = {row.constraint: row for row in evaluator.rows(["heading", "pose", "trajectory", "affordance"], EPISODES)}
     for name, row in rows.items():
         assert row.success > 0.8, name
+        assert row.plausibility["hand_hand_mm"] < 2 and row.plausibility["hand_table_mm"] < 2, name
     assert rows["heading"].errors["heading_rad"] < 0.35
     assert rows["pose"].errors["pose_rad"] < 0.3
     assert rows["trajectory"].errors["traj_m"] < 0.04
