@@ -228,8 +228,12 @@ def test_subscription_keeps_the_newest_and_counts_the_rest(pair):
         return subscription.receive(0.05)
 
     wait_for(arrived)
-    while subscription.receive(0.2):
-        pass
+    server.publish(KEYS.log("metrics", "learner", "0"), Message(meta={"n": -1}))
+    last = None
+    while last != -1:
+        found = subscription.receive(15)
+        assert found is not None
+        last = found[1].meta["n"]
     dropped = subscription.dropped
     for n in range(10):
         server.publish(KEYS.log("event", "learner", "0"), Message({"x": np.zeros(3)}, {"n": n}))

@@ -34,7 +34,7 @@ def test_replays_end_in_the_very_states_of_the_recording():
     rng = np.random.default_rng(0)
     state, touched = recorder.start(reset_state), False
     for step in range(20):
-        targets = 0.03 * rng.normal(size=(WORLDS, 6 + len(HAND.joints)))
+        targets = 0.01 * rng.normal(size=(WORLDS, 6 + len(HAND.joints)))
         state, seen = recorder.step(state, targets, np.full(WORLDS, step < 10))
         touched |= bool(seen.contact_found.any())
     assert touched

@@ -77,7 +77,8 @@ def test_seeds_and_rows_draw_for_themselves(bank):
     heading = plan_row(TASK, bank, OBJECTS, "heading", 30)
     drawn = [_all(bank, heading, seed).goal["heading"].position for seed in (0, 1)]
     drawn.append(_all(bank, heading._replace(constraint="affordance")).goal["heading"].position)
-    assert all(np.abs(a - b).max(-1).min() > 0 for a, b in ((drawn[0], drawn[1]), (drawn[0], drawn[2])))
+    for other in drawn[1:]:  # of the dozens of headings that an object has, two draws may well be the same
+        assert (np.abs(drawn[0] - other).max(-1) > 0).mean() > 0.8
 
 
 def test_pairs_are_drawn_independently_but_where_they_are_aligned(bank):
