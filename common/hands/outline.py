@@ -40,11 +40,11 @@ def outline(hand: Hand) -> Outline:
     q = np.stack([hand.q_open + share * (hand.q_closed - hand.q_open) for share in CLOSURES])
     # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        posed = thread.submit(_ends_and_tips, hand, np.float32(q)).result()
-        ends, tips = (np.asarray(part, np.float64) for part in posed)
-    thumb, others = tips[:, 0], tips[:, 1:].mean(1)
-    points = (ends - (thumb + others)[:, None] / 2) @ axes.T
-    return Outline(points, np.repeat(hand.capsule_radii, 2).astype(np.float64), (others - thumb) @ frame.cross)
+        ends, center, across = (
+            np.asarray(part, np.float64) for part in thread.submit(_posed, hand, np.float32(q)).result()
+        )
+    radii = np.repeat(hand.capsule_radii, 2).astype(np.float64)
+    return Outline((ends - center[:, None]) @ axes.T, radii, across @ frame.cross)
 
 
 def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
@@ -58,9 +58,11 @@ def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _ends_and_tips(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ends (S, E, 3) of the hand's capsules and its tips (S, G, 3), thumb first, at angles (S, F), wrist frame."""
+def _posed(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Of the hand at finger angles (S, F), wrist frame: the ends (S, E, 3) of its capsules, its centre (S, 3), and the
+    way (S, 3) from the thumb's tip to the middle of the others."""
     transforms = kinematics.link_transforms(hand, q)
-    ends = kinematics.capsules(hand, transforms)
-    tips = kinematics.keypoints(hand, transforms)[..., len(hand.links) :, :]
-    return ends.reshape(*ends.shape[:-3], -1, 3), tips
+    ends, points = kinematics.capsules(hand, transforms), kinematics.keypoints(hand, transforms)
+    tips = points[..., len(hand.links) :, :]
+    across = tips[..., 1:, :].mean(-2) - tips[..., 0, :]
+    return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(hand, points), across
