@@ -84,8 +84,8 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
     surfaces = [np.stack([getattr(obj, name) for obj in objects]).astype(np.float32) for name in ("points", "normals")]
     key = jax.random.key(seed)
     references = _references(hand, *surfaces, *chosen, columns["rest"], key, waypoints=task.trajectory_points)
-    weight, renewable = np.ones(count, np.float32), np.ones(count, bool)
-    return jax.device_put(ConstraintBank(**columns, **references, weight=weight, renewable=renewable))
+    own = {"weight": np.ones(count, np.float32), "renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
+    return jax.device_put(ConstraintBank(**columns, **references, **own))
 
 
 @functools.partial(jax.jit, static_argnames=("hand", "waypoints"))

@@ -77,22 +77,28 @@ def collect(
 
 @functools.partial(jax.jit, static_argnames=("hand", "task"))
 def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, key: Array) -> ConstraintBank:
-    """The constraint bank with each grasp in the place of a random reference pose of its object and region.
+    """The constraint bank with grasps in the places of random reference poses of their objects and regions.
 
-    Places whose pose no resting pose allows are taken first, and of the others only the first half: a policy that had
-    learnt from its own grasps alone held 97 % of these, and 66 % of another policy's.
+    Places whose pose no resting pose allows are taken first, and of the others only the first half. These become a
+    reservoir (Vitter 1985, algorithm R): after n grasps of an object and region a further one comes in by places / n,
+    so that they are of the policy at all its ages, not of the present one alone. A policy that had learnt from its
+    latest grasps alone held 97 % of these, and 66 % of another policy's.
     """
-    slot_key, path_key = jax.random.split(key)
+    slot_key, path_key, chance_key = jax.random.split(key, 3)
     objects = bank.pose_q.shape[0]
     fresh = Poses(grasps.q, grasps.position, grasps.quaternion)
     path, turns, valid = make_references(hand, fresh, bank.rest[grasps.object_index], path_key, task.trajectory_points)
+    usable = grasps.found & valid.any(-1) & bank.renewable[grasps.object_index]
+    seen = bank.grasps.at[grasps.object_index, grasps.region].add(usable.astype(bank.grasps.dtype))
     unused = ~bank.pose_valid[grasps.object_index, grasps.region].any(1)
-    own = jnp.arange(unused.shape[1]) < unused.shape[1] // 2
+    places = unused.shape[1] // 2
+    chance = places / jnp.maximum(bank.grasps[grasps.object_index, grasps.region], places)
+    usable &= unused.any(1) | (jax.random.uniform(chance_key, chance.shape) < chance)
+    own = jnp.arange(unused.shape[1]) < places
     slot = jnp.argmax(2.0 * unused + own * jax.random.uniform(slot_key, unused.shape), -1)
     place = grasps.object_index, grasps.region, slot
     # Of several grasps for one place the last is taken, in all arrays: a scatter would mix them on a GPU.
     number = jnp.arange(slot.size)
-    usable = grasps.found & valid.any(-1) & bank.renewable[grasps.object_index]
     taken = jnp.full(bank.pose_q.shape[:3], -1).at[place].max(jnp.where(usable, number, -1))
     # What is written outside of an array is dropped.
     row = jnp.where(usable & (taken[place] == number), grasps.object_index, objects)
@@ -104,4 +110,5 @@ def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, ke
         trajectory_position=bank.trajectory_position.at[where].set(path, mode="drop"),
         trajectory_quaternion=bank.trajectory_quaternion.at[where].set(turns, mode="drop"),
         pose_valid=bank.pose_valid.at[row, grasps.region, :, slot].set(valid, mode="drop"),
+        grasps=seen,
     )

@@ -256,6 +256,9 @@ class PPOConfig:
     """Bounds of the adaptive rate."""
     kl_target: float = 0.012
     """The rate falls above twice this and rises below half of it."""
+    settling: float = 0.0
+    """Share of the run's updates, its last ones, over which `kl_target` falls linearly to a tenth, so that the policy
+    settles; 0 keeps it."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     value_coefficient: float = 0.5
@@ -266,6 +269,11 @@ class PPOConfig:
     """Factor on rewards before returns are made."""
     max_staleness: int = 1
     """eta: versions by which an accepted rollout may be behind the update that uses it."""
+
+    def kl_target_at(self, version: int, updates: int) -> float:
+        """The KL target of the update of this version, in a run of so many updates."""
+        settled = 1.0 - (updates - version) / (self.settling * updates) if self.settling and updates else 0.0
+        return self.kl_target * (1.0 - 0.9 * min(max(settled, 0.0), 1.0))
 
 
 @dataclasses.dataclass(frozen=True)

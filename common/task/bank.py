@@ -50,6 +50,8 @@ class ConstraintBank(NamedTuple):
     """(N,) how often the object is drawn, in relation to the others."""
     renewable: Array
     """(N,) bool: grasps of the policy in training may take the place of the object's references."""
+    grasps: Array
+    """(N, V) int, how many of these grasps came so far."""
 
 
 _AXES = {

@@ -105,6 +105,7 @@ def _row(made: Message, split: Split) -> ConstraintBank:
         has_affordance=arrays["surface/minus"].any() & heading[1].any(-1),
         weight=np.float32(1.0),
         renewable=np.bool_(False),
+        grasps=np.zeros(2, int),
     )
 
 

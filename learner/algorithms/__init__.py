@@ -10,7 +10,7 @@ from learner.algorithms.ppo import PPO
 from learner.algorithms.protocol import Algorithm
 
 ALGORITHMS: dict[str, Callable[[PolicySpec, RunConfig], Algorithm]] = {
-    "ppo": lambda spec, config: PPO(spec, config.ppo),
+    "ppo": lambda spec, config: PPO(spec, config.ppo, config.updates),
     "distill": Distillation,
 }
 """Factories by name: of the policy's spec and the run's configuration."""

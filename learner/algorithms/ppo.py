@@ -71,9 +71,9 @@ class PPO:
 
     batch_schema: Schema = RECORDED
 
-    def __init__(self, spec: PolicySpec, config: PPOConfig):
-        """For a policy's networks, with these hyperparameters."""
-        self._spec, self._config = spec, config
+    def __init__(self, spec: PolicySpec, config: PPOConfig, updates: int = 0):
+        """For a policy's networks, with these hyperparameters, in a run of so many updates (`PPOConfig.settling`)."""
+        self._spec, self._config, self._updates = spec, config, updates
 
     def init(self, seed: int, initial: Policy | None = None) -> TrainState:
         """The state before the first update."""
@@ -120,7 +120,8 @@ class PPO:
             arrays,
             normalizer.observation_affine(frozen, layout),
             normalizer.value_affine(state.value),
-            {name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)},
+            {name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)}
+            | {"kl_target": config.kl_target_at(state.version, self._updates)},
         )
         learnt, returns, failure, scalars = _optimise(
             *shard(state[:_ON_DEVICE], mesh),

@@ -72,7 +72,7 @@ def recipe(hand: Hand) -> RunConfig:
         name=hand.name,
         environments=32_768,
         rollout_steps=10,
-        updates=600,
+        updates=1000,
         task=TaskConfig(
             hand=hand.reference,
             p_affordance=own.p_affordance,
@@ -108,5 +108,5 @@ def recipe(hand: Hand) -> RunConfig:
             ),
         ),
         objects=ObjectsConfig(families=("all", *HARD_FAMILIES), count=1600, by_failure=True),
-        ppo=PPOConfig(rollouts_per_update=1, gamma=0.99),
+        ppo=PPOConfig(rollouts_per_update=1, gamma=0.99, settling=0.25),
     )

@@ -129,6 +129,26 @@ def test_half_of_the_references_stay_as_the_closing_hand_gave_them(bank):
     new = renew(HAND, TASK, flat, grasps, jax.random.key(1))
     changed = np.asarray((new.pose_q != flat.pose_q).any(-1))[1, 1]
     np.testing.assert_array_equal(changed, np.arange(POSES) < POSES // 2)
+    assert np.asarray(new.grasps).tolist() == [[0, 0], [0, many]]
+
+
+def test_own_references_are_of_all_ages_of_the_policy(bank):
+    """Of 64 generations of 4 grasps for 10 places, the last half is expected in half of the places."""
+    flat = bank._replace(rest=bank.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
+    now = flat._replace(pose_valid=jnp.ones_like(flat.pose_valid))
+    each = np.ones(4, int)
+    for age in range(64):
+        grasps = Grasps(
+            jnp.ones(4, bool),
+            jnp.array(each),
+            jnp.array(each),
+            jnp.full((4, F), age / 100),
+            jnp.array([[0.0, 0.0, 0.2]] * 4),
+            jnp.stack([_pointing(-1.0)] * 4),
+        )
+        now = renew(HAND, TASK, now, grasps, jax.random.key(age))
+    ages = np.asarray(now.pose_q)[1, 1, : POSES // 2, 0] * 100
+    assert np.ptp(ages) > 24 and 1 <= (ages < 32).sum() <= 9
 
 
 def test_only_masked_environments_are_exchanged():

@@ -61,6 +61,7 @@ def _bank(valid: np.ndarray) -> ConstraintBank:
         has_affordance=np.ones((2, 1), bool),
         weight=np.ones(2, np.float32),
         renewable=np.ones(2, bool),
+        grasps=np.zeros((2, 2), int),
     )
 
 

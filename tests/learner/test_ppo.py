@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from common.config import PPOConfig
 from common.errors import CongraspError, PhysicsError
 from common.policy import bundle as bundles
 from common.policy import network, normalizer
@@ -104,6 +105,25 @@ def test_moving_the_value_statistics_does_not_move_the_values():
 def test_learning_rate_follows_the_divergence(kl, rate):
     hyper = {"kl_target": 0.012, "learning_rate_range": (1e-5, 1.0)}
     np.testing.assert_allclose(ppo._adapt_rate(jnp.float32(2e-3), jnp.float32(kl), hyper), rate, rtol=1e-6)
+
+
+def test_the_target_falls_to_a_tenth_over_the_last_updates():
+    settings = PPOConfig(kl_target=0.01, settling=0.2)
+    targets = [settings.kl_target_at(version, 1000) for version in (0, 800, 900, 1000, 1200)]
+    np.testing.assert_allclose(targets, [0.01, 0.01, 0.0055, 0.001, 0.001], rtol=1e-9)
+    assert PPOConfig(kl_target=0.01).kl_target_at(1000, 1000) == 0.01
+
+
+def test_a_run_that_settles_lowers_its_rate_in_its_last_update():
+    """By the divergence that the rate of the first update suits."""
+    batch = rollout(toy.bundle_of(fresh()), 0)
+    _, metrics = changed(epochs=1).update(fresh(), batch)
+    settings = dataclasses.replace(toy.SETTINGS, epochs=1, kl_target=metrics["kl"], settling=0.5)
+    rates = {}
+    for version in (0, 8):
+        moved, _ = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
+        rates[version] = float(moved.optimizer.hyperparams["learning_rate"])
+    np.testing.assert_allclose(rates[0] / rates[8], 1.5, rtol=1e-6)
 
 
 def test_learning_rate_stays_in_its_range():

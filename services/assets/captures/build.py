@@ -257,6 +257,7 @@ def _set(
         pose_valid=np.stack([clear.T, (clear & nearer[:, None]).T]),
         weight=np.float32(1.0),
         renewable=np.bool_(False),
+        grasps=np.zeros(2, int),
     )
     about = {
         "source": source,
