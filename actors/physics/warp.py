@@ -23,6 +23,8 @@ from common.hands.spec import Hand
 from common.objects.spec import GraspObject
 from common.task.types import CONTACTS_PER_LINK, Array
 
+wp.config.log_level = wp.LOG_WARNING  # not a line for each of some 50 modules that are loaded
+
 
 class WarpState(NamedTuple):
     """All that a control step of a batch of environments depends on."""

@@ -72,7 +72,7 @@ def recipe(hand: Hand) -> RunConfig:
         name=hand.name,
         environments=32_768,
         rollout_steps=10,
-        updates=1000,
+        updates=800,
         task=TaskConfig(
             hand=hand.reference,
             p_affordance=own.p_affordance,
