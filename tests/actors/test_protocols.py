@@ -218,13 +218,18 @@ def worker(task: TaskConfig, **arguments) -> RolloutWorker:
 
 def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     task = dataclasses.replace(TASK, approach_steps=20, hold_steps=10, hold_steps_max=10)
-    plain, measured = worker(task), worker(task, probe=plausibility.sample)
+    plain, *probed = worker(task), worker(task, probe=plausibility.sample), worker(task, probe=plausibility.sample)
     after = protocols.stress_steps(task)
-    measured.adjust(protocol=protocols.stress(task, OBJECTS, 10), probe_data=distance_field(OBJECTS))
+    for each in probed:
+        each.adjust(protocol=protocols.stress(task, OBJECTS, 10), probe_data=distance_field(OBJECTS))
+    ended, measured = probed
     measured.state = measured.state._replace(after=jnp.full(4, after))
-    one, other = plain.collect(None, 30), measured.collect(None, 30)
+    bare, one, other = (each.collect(None, 30) for each in (plain, ended, measured))
     np.testing.assert_array_equal(one.action, other.action)
     np.testing.assert_array_equal(one.episodes, other.episodes)
+    np.testing.assert_array_equal(bare.action, one.action)
+    # A program without the probe may round the last bit otherwise.
+    np.testing.assert_array_max_ulp(bare.episodes, one.episodes, 4)
     assert one.terminal[-1].all() and one.has_episode.all() and other.has_episode.all() and not other.terminal.any()
     rest = measured.collect(None, after)
     np.testing.assert_array_equal(rest.episodes, one.episodes)
@@ -234,8 +239,8 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     assert set(found) == WITHOUT_MESHES and all(np.isfinite(value).all() for value in found.values())
     short = protocols.assess(other.probed, np.ones(4, bool), task, 10)
     assert np.isnan(short["push_survival"]).all() and short["wrist_speed"] == pytest.approx(found["wrist_speed"])
-    plain.physics.close()
-    measured.physics.close()
+    for each in (plain, ended, measured):
+        each.physics.close()
 
 
 def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
