@@ -279,7 +279,8 @@ def test_jax_agrees_with_native(env, optimised):
     native = NativePhysics(HAND, task, OBJECTS, 1)
     other = MjxPhysics(HAND, task, OBJECTS)
     step = jax.jit(other.step)
-    a, b = native.start(start), other.start(jax.tree.map(jnp.asarray, start))
+    device = jax.devices()[0]  # a state that is on no certain one would have the step compiled once more
+    a, b = native.start(start), jax.device_put(other.start(jax.tree.map(jnp.asarray, start)), device)
     table = np.ones(ENVIRONMENTS, bool)
     force = np.zeros((2, ENVIRONMENTS))
     for i in range(40):
@@ -304,7 +305,7 @@ def test_jax_agrees_with_native(env, optimised):
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(again.u[1:], y.u[1:], atol=1e-6)
     start, target = servoed(env.reset_state)
-    a, b = native.start(start), other.start(jax.tree.map(jnp.asarray, start))
+    a, b = native.start(start), jax.device_put(other.start(jax.tree.map(jnp.asarray, start)), device)
     for _ in range(5):
         (a, x), (b, y) = native.step(a, target, table), step(b, jnp.asarray(target), jnp.asarray(table))
     np.testing.assert_allclose(x.q, y.q, atol=2e-4)
