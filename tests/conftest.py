@@ -33,6 +33,13 @@ def _programs_end_with_their_module():
         sys.modules["jax"].clear_caches()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _quickly_compiled_kernels():
+    """Warp's optimiser takes longer than its kernels run here."""
+    if "warp" in sys.modules:
+        sys.modules["warp"].config.optimization_level = 0
+
+
 @pytest.fixture(scope="session")
 def shared_objects() -> pathlib.Path:
     """Folder of the 24 scanned objects, which lies beside the repository where it is present."""
