@@ -9,7 +9,6 @@ import numpy as np
 import psutil
 import pytest
 
-from actors import initial
 from actors.bank import build_bank
 from actors.initial import InitialConditions
 from actors.physics import resolve_physics
@@ -23,6 +22,7 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
 from common.objects.spec import GraspObject
+from tests import draws
 
 HAND = get_hand("human")
 TASK = TaskConfig(p_pose=0.0, p_trajectory=0.0, p_affordance=0.0)
@@ -33,7 +33,7 @@ ENVIRONMENTS = 3
 def one_each(objects: Sequence[GraspObject]) -> InitialConditions:
     """Fresh episodes, one for each object."""
     bank = build_bank(HAND, TASK, objects, 0)
-    fresh = initial.sample(HAND, TASK, bank, jax.random.key(1), len(objects))
+    fresh = draws.sample(HAND, TASK, bank, jax.random.key(1), len(objects))
     index = jnp.arange(len(objects))
     rest = bank.rest[index, 0]
     start = fresh.reset_state._replace(object_index=index, object_position=rest[:, :3], object_quaternion=rest[:, 3:])

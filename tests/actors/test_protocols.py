@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from actors import initial, protocols
+from actors import protocols
 from actors.attempts import Attempts
 from actors.bank import build_bank
 from actors.env import GraspEnv, Settings
@@ -28,7 +28,7 @@ from common.objects.distance import distance_field
 from common.task import plausibility
 from common.task.types import Surface
 from services.train.command import untrained
-from tests import scripted
+from tests import draws, scripted
 
 HAND = get_hand("human")
 WITHOUT_MESHES = set(protocols.ASSESSED) - {"hand_mesh_mm"}
@@ -94,7 +94,7 @@ def test_pushes_follow_one_another_along_the_axes_of_the_world():
 @functools.cache
 def start():
     """Two objects at rest, with the hand far above them."""
-    fresh = initial.sample(HAND, TASK, build_bank(HAND, TASK, OBJECTS, 0), jax.random.key(1), BATCH)
+    fresh = draws.sample(HAND, TASK, build_bank(HAND, TASK, OBJECTS, 0), jax.random.key(1), BATCH)
     rest = np.array([obj.rest_poses[0] for obj in OBJECTS], np.float32)
     turns = Rotation.from_euler("xyz", [[180, 20, 0], [150, 0, 40]], degrees=True).as_quat(scalar_first=True)
     state = fresh.reset_state._replace(
@@ -275,7 +275,7 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     task = dataclasses.replace(TASK, approach_steps=30, hold_steps=5)
     policy = untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,))))
     obj, count = OBJECTS[1], task.surface_points
-    drawn = initial.sample(HAND, task, build_bank(HAND, task, [obj], 0), jax.random.key(0), 2)
+    drawn = draws.sample(HAND, task, build_bank(HAND, task, [obj], 0), jax.random.key(0), 2)
     rest = np.concatenate([drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1)
     surface = Surface(np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1)))
     asked = {name: np.zeros(2, bool) for name in ("affordance", "pose", "trajectory")}
