@@ -9,6 +9,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # Most of the time goes into compiling programs that run for a moment.
 if os.environ["JAX_PLATFORMS"] == "cpu":
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
+    # The older emitters of fused loops compile in half the time.
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import pathlib
 
@@ -29,6 +31,13 @@ def _programs_end_with_their_module():
     yield
     if "jax" in sys.modules:
         sys.modules["jax"].clear_caches()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _quickly_compiled_kernels():
+    """Warp's optimiser takes longer than its kernels run here."""
+    if "warp" in sys.modules:
+        sys.modules["warp"].config.optimization_level = 0
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ import sys
 
 import jax
 import jax.numpy as jnp
+import warp
 
 from actors.physics.engine import ResetState
 from actors.physics.warp import WarpPhysics
@@ -14,6 +15,7 @@ from learner.ranks import Ranks
 
 
 def main() -> None:
+    warp.config.optimization_level = 0  # as in conftest.py, so that the kernels are those of the other tests
     rank, port = sys.argv[1:]
     ranks = Ranks.join(int(rank), 2, f"127.0.0.1:{port}")
     hand = get_hand("human")

@@ -9,7 +9,6 @@ import numpy as np
 import psutil
 import pytest
 
-from actors import initial
 from actors.bank import build_bank
 from actors.initial import InitialConditions
 from actors.physics import resolve_physics
@@ -23,6 +22,7 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
 from common.objects.spec import GraspObject
+from tests import draws
 
 HAND = get_hand("human")
 TASK = TaskConfig(p_pose=0.0, p_trajectory=0.0, p_affordance=0.0)
@@ -33,7 +33,7 @@ ENVIRONMENTS = 3
 def one_each(objects: Sequence[GraspObject]) -> InitialConditions:
     """Fresh episodes, one for each object."""
     bank = build_bank(HAND, TASK, objects, 0)
-    fresh = initial.sample(HAND, TASK, bank, jax.random.key(1), len(objects))
+    fresh = draws.sample(HAND, TASK, bank, jax.random.key(1), len(objects))
     index = jnp.arange(len(objects))
     rest = bank.rest[index, 0]
     start = fresh.reset_state._replace(object_index=index, object_position=rest[:, :3], object_quaternion=rest[:, 3:])
@@ -279,7 +279,8 @@ def test_jax_agrees_with_native(env, optimised):
     native = NativePhysics(HAND, task, OBJECTS, 1)
     other = MjxPhysics(HAND, task, OBJECTS)
     step = jax.jit(other.step)
-    a, b = native.start(start), other.start(jax.tree.map(jnp.asarray, start))
+    device = jax.devices()[0]  # a state that is on no certain one would have the step compiled once more
+    a, b = native.start(start), jax.device_put(other.start(jax.tree.map(jnp.asarray, start)), device)
     table = np.ones(ENVIRONMENTS, bool)
     force = np.zeros((2, ENVIRONMENTS))
     for i in range(40):
@@ -304,7 +305,7 @@ def test_jax_agrees_with_native(env, optimised):
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(again.u[1:], y.u[1:], atol=1e-6)
     start, target = servoed(env.reset_state)
-    a, b = native.start(start), other.start(jax.tree.map(jnp.asarray, start))
+    a, b = native.start(start), jax.device_put(other.start(jax.tree.map(jnp.asarray, start)), device)
     for _ in range(5):
         (a, x), (b, y) = native.step(a, target, table), step(b, jnp.asarray(target), jnp.asarray(table))
     np.testing.assert_allclose(x.q, y.q, atol=2e-4)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from actors import initial, protocols
+from actors import protocols
 from actors.attempts import Attempts
 from actors.bank import build_bank
 from actors.env import GraspEnv, Settings
@@ -28,7 +28,7 @@ from common.objects.distance import distance_field
 from common.task import plausibility
 from common.task.types import Surface
 from services.train.command import untrained
-from tests import scripted
+from tests import draws, scripted
 
 HAND = get_hand("human")
 WITHOUT_MESHES = set(protocols.ASSESSED) - {"hand_mesh_mm"}
@@ -94,7 +94,7 @@ def test_pushes_follow_one_another_along_the_axes_of_the_world():
 @functools.cache
 def start():
     """Two objects at rest, with the hand far above them."""
-    fresh = initial.sample(HAND, TASK, build_bank(HAND, TASK, OBJECTS, 0), jax.random.key(1), BATCH)
+    fresh = draws.sample(HAND, TASK, build_bank(HAND, TASK, OBJECTS, 0), jax.random.key(1), BATCH)
     rest = np.array([obj.rest_poses[0] for obj in OBJECTS], np.float32)
     turns = Rotation.from_euler("xyz", [[180, 20, 0], [150, 0, 40]], degrees=True).as_quat(scalar_first=True)
     state = fresh.reset_state._replace(
@@ -218,13 +218,18 @@ def worker(task: TaskConfig, **arguments) -> RolloutWorker:
 
 def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     task = dataclasses.replace(TASK, approach_steps=20, hold_steps=10, hold_steps_max=10)
-    plain, measured = worker(task), worker(task, probe=plausibility.sample)
+    plain, *probed = worker(task), worker(task, probe=plausibility.sample), worker(task, probe=plausibility.sample)
     after = protocols.stress_steps(task)
-    measured.adjust(protocol=protocols.stress(task, OBJECTS, 10), probe_data=distance_field(OBJECTS))
+    for each in probed:
+        each.adjust(protocol=protocols.stress(task, OBJECTS, 10), probe_data=distance_field(OBJECTS))
+    ended, measured = probed
     measured.state = measured.state._replace(after=jnp.full(4, after))
-    one, other = plain.collect(None, 30), measured.collect(None, 30)
+    bare, one, other = (each.collect(None, 30) for each in (plain, ended, measured))
     np.testing.assert_array_equal(one.action, other.action)
     np.testing.assert_array_equal(one.episodes, other.episodes)
+    np.testing.assert_array_equal(bare.action, one.action)
+    # A program without the probe may round the last bit otherwise.
+    np.testing.assert_array_max_ulp(bare.episodes, one.episodes, 4)
     assert one.terminal[-1].all() and one.has_episode.all() and other.has_episode.all() and not other.terminal.any()
     rest = measured.collect(None, after)
     np.testing.assert_array_equal(rest.episodes, one.episodes)
@@ -234,8 +239,8 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     assert set(found) == WITHOUT_MESHES and all(np.isfinite(value).all() for value in found.values())
     short = protocols.assess(other.probed, np.ones(4, bool), task, 10)
     assert np.isnan(short["push_survival"]).all() and short["wrist_speed"] == pytest.approx(found["wrist_speed"])
-    plain.physics.close()
-    measured.physics.close()
+    for each in (plain, ended, measured):
+        each.physics.close()
 
 
 def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -270,7 +275,7 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     task = dataclasses.replace(TASK, approach_steps=30, hold_steps=5)
     policy = untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,))))
     obj, count = OBJECTS[1], task.surface_points
-    drawn = initial.sample(HAND, task, build_bank(HAND, task, [obj], 0), jax.random.key(0), 2)
+    drawn = draws.sample(HAND, task, build_bank(HAND, task, [obj], 0), jax.random.key(0), 2)
     rest = np.concatenate([drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1)
     surface = Surface(np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1)))
     asked = {name: np.zeros(2, bool) for name in ("affordance", "pose", "trajectory")}

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors import initial
 from actors.bank import build_bank
 from actors.env import GraspEnv, episode_fields, metric_names
 from actors.physics.engine import PhysicsState, where_environments
@@ -20,6 +19,7 @@ from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_tr
 from common.objects import procedural
 from common.task.observation import layout
 from common.task.types import CONTACTS_PER_LINK, Action
+from tests import draws
 
 HAND = get_hand("human")
 TASK = TaskConfig()
@@ -37,7 +37,7 @@ def bank():
 @pytest.fixture(scope="module")
 def drawn(bank):
     """So many episodes that shares of them can be counted."""
-    return initial.sample(HAND, TASK, bank, jax.random.key(0), DRAWN)
+    return draws.sample(HAND, TASK, bank, jax.random.key(0), DRAWN)
 
 
 def _noise(parameters, observation, key):
@@ -156,7 +156,7 @@ def _advance(env, targets):
 def test_a_lifted_object_that_stays_is_a_success(bank):
     """The protocol's bookkeeping on invented readouts: held up, against dropped by more than 5 cm."""
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    env, state, after = _begun(physics, TASK, initial.sample(HAND, TASK, bank, jax.random.key(2), 2))
+    env, state, after = _begun(physics, TASK, draws.sample(HAND, TASK, bank, jax.random.key(2), 2))
     found = np.zeros(after.contact_found.shape, bool)
     found[:, 0, 0] = True
     after = after._replace(contact_found=found)
@@ -177,7 +177,7 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(bank, end_when_fal
     """Errors and forces are those of the paper's 25 steps; only `held` looks at the end of the hold."""
     task = dataclasses.replace(TASK, hold_steps_max=40, end_when_fallen=end_when_fallen)
     physics = NativePhysics(HAND, task, OBJECTS, 1)
-    drawn = initial.sample(HAND, task, bank, jax.random.key(2), 2)
+    drawn = draws.sample(HAND, task, bank, jax.random.key(2), 2)
     env, state, after = _begun(physics, task, drawn._replace(hold=jnp.full(2, 40)))
     found, force = (
         np.zeros(after.contact_found.shape, bool),

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from actors import harvest, initial
+from actors import harvest
 from actors.bank import headings_of
 from actors.harvest import Grasps
 from actors.training_set import training_set
@@ -19,6 +19,7 @@ from common.objects.store import Catalogue
 from common.task.bank import rows_of, stacked
 from common.task.constraint_sets import load_for
 from services.grasp.constraint_sets import make_sets, save
+from tests import draws
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
@@ -120,5 +121,5 @@ def test_objects_of_different_sizes_stack_and_come_apart_again(folders):
 
 def test_objects_are_drawn_as_often_as_their_weights_say(folders):
     bank = training_set(HAND, _run(folder=folders[0]), 0).bank._replace(weight=np.array([1.0, 3.0], np.float32))
-    drawn = initial.sample(HAND, TaskConfig(), bank, jax.random.key(0), 4000)
+    drawn = draws.sample(HAND, TaskConfig(), bank, jax.random.key(0), 4000)
     assert 0.72 < np.mean(np.asarray(drawn.reset_state.object_index) == 1) < 0.78

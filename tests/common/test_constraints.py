@@ -210,7 +210,8 @@ def test_active_blocks(asked):
     assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
 
 
-@functools.partial(jax.jit, static_argnums=0)
+# The older emitters (see conftest.py) round the last bit otherwise in programs of more constraints.
+@functools.partial(jax.jit, static_argnums=0, compiler_options={"xla_cpu_use_fusion_emitters": True})
 def _draw(task: TaskConfig, bank) -> InitialConditions:
     return sample(HAND, task, bank, jax.random.key(3), BATCH)
 

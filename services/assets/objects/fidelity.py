@@ -16,6 +16,8 @@ from common.objects import shapes
 
 POINTS = 50_000
 """Most points of a surface whose distances from the other are taken, to the nearest of all points of that one."""
+MOST_SURFACE, MOST_VOLUME = 3e-3, 0.05
+"""Errors that are small enough: m, and share of the volume."""
 REACH = 2e-3
 """Radius of the ball, m."""
 _RAYS = 256  # along the longest side of the box around both bodies
@@ -32,6 +34,11 @@ class Fidelity(NamedTuple):
     """(Volume of the pieces' union - the mesh's) / the mesh's; None for an open mesh, which encloses no volume."""
     surface: float
     """Hausdorff distance of the two outer surfaces, m: the larger of both directions, by sampled points."""
+
+    @property
+    def excess(self) -> float:
+        """The larger of both errors as a share of what is small enough."""
+        return max(self.surface / MOST_SURFACE, abs(self.volume or 0.0) / MOST_VOLUME)
 
     def __str__(self) -> str:
         """Both errors as a phrase."""

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import trimesh
-from scipy.spatial import QhullError, cKDTree
+from scipy.spatial import cKDTree
 
 from common.errors import CongraspError
 from common.files import cache_folder
@@ -22,18 +22,16 @@ from common.objects.spec import Colours, GraspObject, Piece
 from common.objects.surface import halves, mass_properties, sample_mesh
 from common.parallel import cores
 from services.assets.objects import decompose, repair
+from services.assets.objects.collision import convex_pieces
 from services.assets.objects.colours import sample_colours
-from services.assets.objects.fidelity import Fidelity, fidelity
 from services.assets.objects.options import ImportOptions, check_options
-from services.assets.objects.pieces import SQUEEZE, merge, simplify, squeeze
 from services.assets.objects.sizes import metres_per_unit
-from services.assets.objects.sources import MeshFile, Source, read_mesh
+from services.assets.objects.sources import Source, read_mesh
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""
-_CACHE_VERSION = 5
+_CACHE_VERSION = 6
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
-_TOO_LARGE = 0.01  # share of the volume; pieces of thin walls fill the inside of their bends
 
 
 def import_source(source: Source, options: ImportOptions) -> GraspObject:
@@ -117,11 +115,12 @@ def _cache_key(source: Source, options: ImportOptions) -> str:
 def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     """The object of a source; the seed draws its surface points."""
     notes: list[str] = []
-    visuals = [read_mesh(file.path, notes) for file in source.visuals] or [
-        shapes.triangulate(_corners(file)) for file in source.pieces
-    ]
-    if not (source.pieces or source.parts):
-        visuals = [repair.closed(repair.largest_body(mesh, notes), notes) for mesh in visuals]
+    given = [np.asarray(read_mesh(file.path).vertices, np.float64) for file in source.pieces]
+    visuals = [read_mesh(file.path, notes) for file in source.visuals] or [shapes.triangulate(piece) for piece in given]
+    if not (given or source.parts):
+        visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
+    if not source.parts:
+        visuals = [repair.closed(mesh, notes) for mesh in visuals]
     sides = tuple(_joined(visuals).extents.tolist())
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
     meshes = [_scaled(mesh, factor) for mesh in visuals]
@@ -133,9 +132,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
             f"its surface is open, so that nobody knows what is inside: mass and inertia are those of its {stand_in} "
             "(--mass sets the mass)"
         )
-    hulls, owners = _pieces(source, meshes, factor, closed, options, notes)
-    hulls, errors = _fitted(np.asarray(whole.triangles), hulls, closed)
-    notes.append(f"{len(hulls)} convex piece{'s stand' if len(hulls) > 1 else ' stands'} for it: {errors}")
+    hulls, owners, errors = convex_pieces(source, meshes, whole, [factor * piece for piece in given], options, notes)
     solids = hulls if source.pieces else [np.asarray(whole.vertices)]
     mass, center, inertia = _weigh(whole if closed else None, solids, options)
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
@@ -197,11 +194,6 @@ def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)
 
 
-def _corners(file: MeshFile) -> np.ndarray:
-    """(V, 3) vertices of a file."""
-    return np.asarray(read_mesh(file.path).vertices, np.float64)
-
-
 def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
     """A mesh in metres that faces outwards."""
     mesh = mesh.copy()
@@ -209,56 +201,6 @@ def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
     if mesh.volume < 0:
         mesh.invert()
     return mesh
-
-
-def _pieces(
-    source: Source,
-    meshes: list[trimesh.Trimesh],
-    factor: float,
-    closed: bool,
-    options: ImportOptions,
-    notes: list[str],
-) -> tuple[list[np.ndarray], list[int]]:
-    """Vertices of the convex pieces, and the part of each (0 where the parts are labels)."""
-    try:
-        if source.pieces:
-            surface, given = _joined(meshes), [_corners(file) * factor for file in source.pieces]
-            volume = float(surface.volume) if closed else sum(shapes.hull_of(piece).volume for piece in given)
-            groups = [merge(given, options.max_pieces, np.asarray(surface.triangles), volume)]
-            if len(groups[0]) < len(given):
-                notes.append(f"its {len(given)} convex pieces were merged into {len(groups[0])} (--max-pieces)")
-        else:
-            volumes = np.array([shapes.hull_of(mesh.vertices).volume for mesh in meshes])
-            limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
-            groups = []
-            for mesh, limit in zip(meshes, limits, strict=True):
-                small = repair.with_few_faces(mesh)
-                found = decompose.decompose(
-                    np.asarray(small.vertices),
-                    np.asarray(small.faces),
-                    volume=float(mesh.volume) if closed and small.is_volume else None,
-                    time_limit=options.time_limit,
-                    max_pieces=limit,
-                )
-                groups.append(found.pieces)
-                notes.extend(found.notes)
-        hulls = [simplify(piece) for group in groups for piece in group]
-    except QhullError:
-        raise CongraspError(
-            f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
-        ) from None
-    owners = [owner if source.parts_are_pieces else 0 for owner, group in enumerate(groups) for _ in group]
-    return hulls, owners
-
-
-def _fitted(triangles: np.ndarray, hulls: list[np.ndarray], closed: bool) -> tuple[list[np.ndarray], Fidelity]:
-    """The pieces (V, 3), thinner where their union is larger than the mesh (F, 3, 3), and how faithful they are."""
-    errors = fidelity(triangles, hulls, closed)
-    if errors.volume is None or errors.volume < _TOO_LARGE:
-        return hulls, errors
-    thinner = [squeeze(hull, 1 / (1 + errors.volume)) for hull in hulls]
-    better = fidelity(triangles, thinner, closed)
-    return (thinner, better) if better.surface <= errors.surface + SQUEEZE else (hulls, errors)
 
 
 def _weigh(

@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from common.objects import shapes
 from common.objects.spec import MAX_MESH_VERTICES
+from services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME
 
 DEPTH = 1.5e-3
 """Metres that joining pieces may bury the surface, or stand out from it, while they are few enough."""
@@ -19,7 +20,6 @@ _SAMPLES, _PROBES = 6000, 100  # points on the whole surface, and on the hull of
 _NEAR = 5e-4  # m; pieces whose boxes are nearer than this are neighbours
 _ON = 1e-4  # m; points of a hull that are nearer to a piece than this belong to it
 _LEAST = 1e-11  # m^3; a piece below is dust of the cutting
-_DEPTH_UNIT, _VOLUME_UNIT = 3e-3, 0.05  # m and share of the volume that weigh the same when pieces must be joined
 
 
 class _Join(NamedTuple):
@@ -91,7 +91,7 @@ class _Merger:
 
     def _push(self, checked: bool, i: int, j: int, depth: float, growth: float, hull: ConvexHull) -> None:
         """Enters a join under its cost."""
-        cost = depth / _DEPTH_UNIT + growth / (_VOLUME_UNIT * self._volume)
+        cost = depth / MOST_SURFACE + growth / (MOST_VOLUME * self._volume)
         heapq.heappush(self._joins, _Join(cost, checked, i, j, depth, growth, hull))
 
     def _make(self, join: _Join) -> None:
@@ -109,9 +109,10 @@ class _Merger:
 def merge(pieces: list[np.ndarray], max_pieces: int, triangles: np.ndarray, volume: float) -> list[np.ndarray]:
     """Joins neighbouring convex pieces until `max_pieces` are left, and on while the shape stays as it is.
 
-    A join costs what its hull adds in volume and how far it leaves the surface: the depth of the deepest surface point
-    inside of it, or the distance from the surface of its farthest point, by samples. Pieces that do not touch are
-    never joined, so that more than `max_pieces` are left where so many bodies lie apart.
+    A join costs what its hull adds in volume and how far it leaves the surface, each as a share of what is small enough
+    (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). How far is the depth of the deepest surface point inside of it, or the
+    distance from the surface of its farthest point, by samples. Pieces that do not touch are never joined, so that more
+    than `max_pieces` are left where so many bodies lie apart.
 
     Args:
       pieces: vertices (V, 3) of each, m.

@@ -8,7 +8,6 @@ import jax
 import numpy as np
 import pytest
 
-from actors import initial
 from actors.bank import build_bank
 from common.config import NetworkConfig, RunConfig, TaskConfig
 from common.hands import get_hand
@@ -20,6 +19,7 @@ from services.evaluate.protocol import protocol
 from services.evaluate.sensing import LEVELS, at_level, sensing_task
 from services.train.command import untrained
 from services.train.student import TRACKERS
+from tests import draws
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(0, "box")]
@@ -34,7 +34,7 @@ def bank():
 def test_a_level_is_what_it_says(bank):
     """At 10 ms a step: 60 ms are 6 steps, 30 Hz a sample every 10/3 steps, and no rate is more than one a step."""
     task = sensing_task(TASK)
-    drawn = initial.sample(HAND, task, bank, jax.random.key(0), 4)
+    drawn = draws.sample(HAND, task, bank, jax.random.key(0), 4)
     found = {level.label: jax.device_get(at_level(drawn, level, 0.01)) for level in LEVELS}
     assert len(found) == len(LEVELS)
     true, nominal = (found[level.label] for level in LEVELS[:2])

@@ -1,0 +1,136 @@
+"""The convex pieces that stand for an object in physics: its folder's own, or cut from its mesh if those are coarse."""
+
+import contextlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.spatial import QhullError
+
+from common.errors import CongraspError
+from common.objects import shapes
+from services.assets.objects import decompose, repair
+from services.assets.objects.fidelity import Fidelity, fidelity
+from services.assets.objects.options import ImportOptions
+from services.assets.objects.pieces import SQUEEZE, merge, simplify, squeeze
+from services.assets.objects.sources import Source
+
+_TOO_LARGE = 0.01  # share of the volume; pieces of thin walls fill the inside of their bends
+
+
+class Collision(NamedTuple):
+    """Convex pieces and how faithful they are."""
+
+    hulls: list[np.ndarray]
+    """Vertices (V, 3) of each piece, m."""
+    owners: list[int]
+    """The part of each (0 where the parts are labels)."""
+    errors: Fidelity
+    """Against the object's mesh."""
+
+    def __str__(self) -> str:
+        """How many there are, and their errors."""
+        count = len(self.hulls)
+        return f"{count} convex piece{'s stand' if count > 1 else ' stands'} for it: {self.errors}"
+
+
+def convex_pieces(
+    source: Source,
+    meshes: Sequence[trimesh.Trimesh],
+    whole: trimesh.Trimesh,
+    given: Sequence[np.ndarray],
+    options: ImportOptions,
+    notes: list[str],
+) -> Collision:
+    """The given pieces where they are within the budget of errors; else a decomposition, or they where they are closer.
+
+    Args:
+      source: the object's files.
+      meshes: its surface, m: one of the whole, or one of each part.
+      whole: all of them as one.
+      given: vertices (V, 3) of the convex pieces that its folder brings, m; its surface, where that has no file.
+      options: how meshes become objects.
+      notes: which pieces were taken and how far they are off is added to it.
+
+    Raises:
+      CongraspError: the object has no volume.
+    """
+    triangles, closed = np.asarray(whole.triangles), all(mesh.is_volume for mesh in meshes)
+    try:
+        if not given:
+            found = _cut(source, meshes, triangles, closed, options, notes)
+            notes.append(str(found))
+            return found
+        own = _merged(given, triangles, float(whole.volume) if closed else None, options, notes)
+    except QhullError:
+        raise CongraspError(
+            f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
+        ) from None
+    if own.errors.excess <= 1 or not source.visuals:
+        notes.append(f"its own {own}")
+        return own
+    with contextlib.suppress(QhullError):
+        said: list[str] = []
+        cut = _cut(source, meshes, triangles, closed, options, said)
+        if cut.errors.excess < own.errors.excess:
+            notes.extend(said)
+            notes.append(f"{cut}; they were cut from its mesh, for its own {len(own.hulls)} are coarser: {own.errors}")
+            return cut
+    notes.append(f"its own {own}; pieces cut from its mesh are no closer")
+    return own
+
+
+def _merged(
+    given: Sequence[np.ndarray],
+    triangles: np.ndarray,
+    volume: float | None,
+    options: ImportOptions,
+    notes: list[str],
+) -> Collision:
+    """The given pieces (V, 3), fewer where there are too many; the volume is that of the mesh if it is closed."""
+    enclosed = sum(shapes.hull_of(piece).volume for piece in given) if volume is None else volume
+    found = merge(list(given), options.max_pieces, triangles, enclosed)
+    if len(found) < len(given):
+        notes.append(f"its {len(given)} convex pieces were merged into {len(found)} (--max-pieces)")
+    return _fitted(triangles, found, [0] * len(found), closed=volume is not None)
+
+
+def _cut(
+    source: Source,
+    meshes: Sequence[trimesh.Trimesh],
+    triangles: np.ndarray,
+    closed: bool,
+    options: ImportOptions,
+    notes: list[str],
+) -> Collision:
+    """A decomposition of each mesh; each may have pieces according to its share of the volume."""
+    volumes = np.array([shapes.hull_of(mesh.vertices).volume for mesh in meshes])
+    limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
+    hulls, owners = list[np.ndarray](), list[int]()
+    for owner, (mesh, limit) in enumerate(zip(meshes, limits, strict=True)):
+        small = repair.with_few_faces(mesh)
+        found = decompose.decompose(
+            np.asarray(small.vertices),
+            np.asarray(small.faces),
+            volume=float(mesh.volume) if closed and small.is_volume else None,
+            time_limit=options.time_limit,
+            max_pieces=limit,
+        )
+        hulls.extend(found.pieces)
+        owners.extend([owner if source.parts_are_pieces else 0] * len(found.pieces))
+        notes.extend(found.notes)
+    return _fitted(triangles, hulls, owners, closed)
+
+
+def _fitted(triangles: np.ndarray, found: list[np.ndarray], owners: list[int], closed: bool) -> Collision:
+    """Pieces (V, 3) of few vertices, thinner where their union is larger than the mesh (F, 3, 3)."""
+    hulls = [simplify(piece) for piece in found]
+    errors = fidelity(triangles, hulls, closed)
+    if errors.volume is None or errors.volume < _TOO_LARGE:
+        return Collision(hulls, owners, errors)
+    thinner = [squeeze(hull, 1 / (1 + errors.volume)) for hull in hulls]
+    better = fidelity(triangles, thinner, closed)
+    if better.surface <= errors.surface + SQUEEZE:
+        return Collision(thinner, owners, better)
+    return Collision(hulls, owners, errors)
