@@ -130,8 +130,8 @@ GRASP: tuple[Term, ...] = (
     Term(
         "wrist_effort",
         0.0,
-        "Penalty per squared acceleration, in units of 10 m/s^2 and 100 rad/s^2, that the wrist's servos ask for (ours, "
-        "against a wrist that trembles while it holds).",
+        "Penalty per squared acceleration, in units of 10 m/s^2 and 100 rad/s^2, that the wrist's servos ask for "
+        "(ours, against a wrist that trembles while it holds).",
         _wrist_effort,
     ),
     Term(
