@@ -68,7 +68,7 @@ def grasp(
       pictures: Write pictures.
       policy: A policy file; by default the one that comes with the package.
       hand: Hand whose pretrained policy is taken.
-      attempts: How many are simulated side by side.
+      attempts: How many are simulated side by side, 1024 at most.
       seed: Draws what is attempted.
       approach: Seconds in which the hand first comes from beside the table; longer where an arm needs it (1 m/s).
       lift: Metres by which the hand then lifts the object, which stands on the table until then; 0 removes the table.
