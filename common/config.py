@@ -385,6 +385,8 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         fields = json.loads(text, parse_constant=_no_constant)
         if not isinstance(fields, dict):
             raise ValueError("it is no object")
+        if "task" in fields:
+            fields["task"] = with_older_physics(fields["task"])
         config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
     except (ValueError, RecursionError) as error:  # no UTF-8, or nested too deep
         raise CongraspError(
@@ -394,6 +396,19 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         raise CongraspError(f"The configuration does not fit this version: {error}.") from None
     file_name(config.name, "a run")
     return config
+
+
+def with_older_physics(task: Any) -> Any:
+    """A `TaskConfig` from JSON; physics that an older file does not name is what held then, not today's default.
+
+    Args:
+      task: the value, of whatever type; only an object of which `control` is one, too, or is not there, is changed.
+    """
+    control = task.get("control", {}) if isinstance(task, dict) else None
+    if not isinstance(control, dict):
+        return task
+    unlimited = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0}
+    return {"contact_time": 0.016, **task, "control": {**unlimited, **control}}
 
 
 def _no_constant(name: str) -> float:

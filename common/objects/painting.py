@@ -1,5 +1,7 @@
 """Meshes cut finely enough for colours of their points to show a picture."""
 
+import functools
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -45,9 +47,24 @@ def finer(
 
 
 def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh (V, 3), (F, 3) cut finer, and (V', 3) uint8 sRGB of its points: of each the nearest known one's."""
-    vertices, faces = finer(vertices, faces, _OWN_EDGE, _OWN_MOST_FACES)
-    return vertices, faces, nearest(vertices, colours)
+    """A mesh (V, 3), (F, 3) cut finer, and (V', 3) uint8 sRGB of its points: of each the nearest known one's.
+
+    What was found for the last few objects is kept; the arrays are read-only.
+    """
+    kinds = (vertices, float), (faces, np.int64), (colours.points, float), (colours.values, np.uint8)
+    return _painted(*(np.asarray(array, kind).tobytes() for array, kind in kinds))
+
+
+@functools.lru_cache(maxsize=8)
+def _painted(*content: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`painted` by the content of its arrays, which tells objects apart."""
+    kinds = float, np.int64, float, np.uint8
+    corners, faces, *own = (np.frombuffer(a, kind).reshape(-1, 3) for a, kind in zip(content, kinds, strict=True))
+    vertices, faces = finer(corners, faces, _OWN_EDGE, _OWN_MOST_FACES)
+    found = vertices, faces, nearest(vertices, Colours(*own))
+    for array in found:
+        array.flags.writeable = False
+    return found
 
 
 def nearest(points: np.ndarray, colours: Colours) -> np.ndarray:

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.config import NetworkConfig, TaskConfig
+from common.config import NetworkConfig, TaskConfig, with_older_physics
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands import check_reference, get_hand
@@ -154,7 +154,7 @@ class PolicyBundle:
                 action_size=int(meta["action_size"]),
                 network=_dataclass(NetworkConfig, meta["network"]),
             )
-            task = _dataclass(TaskConfig, _completed(meta["task"]))
+            task = _dataclass(TaskConfig, with_older_physics(meta["task"]))
             version, run_id, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
             for fault in (*network_faults(spec.network, spec.layout, spec.action_size), *task_faults(task)):
                 raise ValueError(fault)
@@ -214,12 +214,6 @@ def sample_action(
 def act_by_mean(layout: Layout, parameters: InferenceParameters, observation: Array, key: Array) -> tuple[Array, Array]:
     """`mean_action` in the place of `sample_action`: the key counts for nothing, and the log probability is 0."""
     return mean_action(layout, parameters, observation), jnp.zeros(observation.shape[:-1])
-
-
-def _completed(task: Any) -> dict[str, Any]:
-    """A task's fields; what files from before these settings do not name is what held then, not today's default."""
-    unlimited = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0}
-    return {"contact_time": 0.016, **task, "control": {**unlimited, **task.get("control", {})}}
 
 
 def _dataclass(cls: type, fields: Any) -> Any:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from services.grasp.jobs import Result
 
 NOT_HELD, BAD_INPUT = 1, 2
+_MOST_ATTEMPTS = 1024
 
 Constraints: Any = dataclasses.make_dataclass(
     "Constraints",
@@ -67,7 +68,7 @@ def grasp(
       pictures: Write pictures.
       policy: A policy file; by default the one that comes with the package.
       hand: Hand whose pretrained policy is taken.
-      attempts: How many are simulated side by side.
+      attempts: How many are simulated side by side, 1024 at most.
       seed: Draws what is attempted.
       approach: Seconds in which the hand first comes from beside the table; longer where an arm needs it (1 m/s).
       lift: Metres by which the hand then lifts the object, which stands on the table until then; 0 removes the table.
@@ -89,15 +90,18 @@ def grasp(
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
     at_least(1, attempts=attempts)
+    at_least(0, seed=seed)
+    at_most(_MOST_ATTEMPTS, "side by side", attempts=attempts)
     at_most(10.0, "seconds", approach=approach)
     at_most(0.5, "metres", lift=lift)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
     file = policy_file(policy, hand)
+    bundle = bundles.load(file)
     found, results = find_objects(objects, folder)
     identity = (bundles.content_hash(file.read_bytes()), attempts, seed, approach, lift)
     settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, video, pictures, again, rest)
-    grasper = Grasper(bundles.load(file), attempts=attempts, approach=approach, lift=lift, seed=seed)
+    grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed)
 
     for result in results:
         _show(result)

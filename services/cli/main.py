@@ -50,6 +50,17 @@ UNREAD = 128 + signal.SIGPIPE
 """The reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_PATH = (
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+    errno.EEXIST,
+)
 EXTRAS = {
     **dict.fromkeys(("foxglove", "imageio_ffmpeg", "jinja2", "matplotlib"), "viz"),
     **dict.fromkeys(("bvhio", "mcap_ros2", "onnx", "onnxruntime", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
@@ -74,10 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         code = UNREAD
     except OSError as error:
-        if error.errno not in _FULL:
-            raise
-        where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
-        code = _fail(f"{where}: {error.strerror}. Free space and start again.", USAGE_ERROR, debug)
+        code = _fail(_said_of(error), USAGE_ERROR, debug)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("common", "actors", "learner", "services"):
             raise
@@ -88,6 +96,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if code in SIGNALLED:  # no time for what an interpreter does at its end
         os._exit(code)
     sys.exit(code)
+
+
+def _said_of(error: OSError) -> str:
+    """What a full disk, or a path that cannot be used, is to a user; raises other errors, which are faults of ours."""
+    if error.errno in _FULL:
+        where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
+        return f"{where}: {error.strerror}. Free space and start again."
+    if error.errno in _PATH and error.filename:
+        return str(
+            CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its rights.")
+        )
+    raise error
 
 
 def run(arguments: list[str]) -> int:

@@ -12,10 +12,9 @@ from common.hands.skin import Skin
 from common.parallel import cores
 from services.export.frames import skin_of_motion
 from services.export.motion_file import GraspMotion
-from services.record.palette import OBJECT
 from services.viz.raster import render_scene
 from services.viz.scene import Camera, Shape
-from services.viz.shapes import fit, skin_shape, table_shape
+from services.viz.shapes import fit, object_shape, skin_shape, table_shape
 
 SIZE = (320, 240)
 """Width and height in pixels."""
@@ -64,16 +63,8 @@ def calibration(camera: Camera) -> dict[str, Any]:
 def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
     """The hand, the object, and the table while it stands."""
     hand = skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
-    colours = motion.colours
-    thing = Shape(
-        "mesh",
-        (0, 0),
-        OBJECT,
-        np.asarray(motion.object_position[frame], float),
-        np.asarray(motion.object_quaternion[frame], float),
-        vertices=motion.object_vertices,
-        faces=motion.object_faces,
-        paint_points=None if colours is None else colours.points,
-        paint_colours=None if colours is None else colours.values / 255,
-    )
+    own = motion.colours
+    mesh = motion.object_vertices, motion.object_faces
+    paint = None if own is None else (own.points, own.values / 255)
+    thing = object_shape(mesh, motion.object_position[frame], motion.object_quaternion[frame], paint)
     return [hand, thing, *([table_shape(motion.object_position[0])] if motion.table[frame] else [])]

@@ -44,6 +44,8 @@ def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -
     if not path.exists():
         raise CongraspError(f"There is no {path}.", "Name a motion (.npz), a recording (.mcap) or a run's folder.")
     if path.suffix == ".npz":
+        if index not in (-1, 0):
+            raise CongraspError(f"{path} is one motion and has no number {index}.", "Leave --index out.")
         return load_motion(path)
     if path.is_file() and path.suffix != ".mcap":
         raise CongraspError(f"{path} holds no motion.", "Name a grasp.npz, a recording (.mcap) or a run's folder.")

@@ -4,6 +4,7 @@ Files give positions in metres in the axes and with the origin of the object's o
 sets, which know the object's frame, are taken as they are.
 """
 
+import math
 import os
 import pathlib
 from collections.abc import Callable, Iterable, Mapping
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from common.errors import CongraspError
 from common.hands.motors import coupled
 from common.hands.spec import Hand
-from common.inputs import read_json
+from common.inputs import read_file, read_json
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.task import constraint_sets
@@ -118,12 +119,10 @@ def _numbers(text: str, count: int, name: str) -> np.ndarray:
 
 def _unit(vector: np.ndarray, name: str) -> np.ndarray:
     """The vector at length 1."""
-    size = np.linalg.norm(vector)
-    if size < 1e-9:
-        raise CongraspError(
-            f"{name} has no direction: all its numbers are zero.", f'Write for example {name} "0 0 -1".'
-        )
-    return vector / size
+    largest = np.abs(vector).max()
+    if largest < 1e-9:
+        raise CongraspError(f"{name} has no direction: all its numbers are zero.", "Make one of them 1 or -1.")
+    return vector / largest / np.linalg.norm(vector / largest)
 
 
 def _avoid(written: Written) -> np.ndarray:
@@ -152,7 +151,8 @@ def _avoid(written: Written) -> np.ndarray:
 
 def _check_near(obj: GraspObject, position: np.ndarray, what: str) -> None:
     """Raises a CongraspError if a place (3,), object frame, is so far off that its unit must be another."""
-    away = float(np.linalg.norm(obj.points - position, axis=-1).min())
+    with np.errstate(over="ignore"):
+        away = float(np.linalg.norm(obj.points - position, axis=-1).min())
     if away > _FAR:
         raise CongraspError(
             f"{what} lies {away:.3g} m from '{obj.name}'.", "Give metres, in the axes and with the origin of its file."
@@ -197,7 +197,7 @@ def _pose(written: Written) -> dict[str, np.ndarray] | None:
         return None
     path, index = numbered(text)
     if path.suffix == ".npz":
-        motion = _motion(path, hand)
+        motion = _motion(path, hand, index)
         last = grasp_part(motion)[1]
         position, quaternion = _wrist_on_object(motion, last)
         return _reference(motion.joint_position[last], position[last], quaternion[last])
@@ -232,7 +232,7 @@ def _trajectory(written: Written) -> dict[str, np.ndarray] | None:
         return None
     path, index = numbered(text)
     if path.suffix == ".npz":
-        motion = _motion(path, hand)
+        motion = _motion(path, hand, index)
         first, last = grasp_part(motion)
         position, quaternion = _wrist_on_object(motion, first)
         return _resampled(position[first : last + 1], quaternion[first : last + 1], waypoints, str(path))
@@ -241,12 +241,7 @@ def _trajectory(written: Written) -> dict[str, np.ndarray] | None:
         position, quaternion = (arrays[f"trajectory/{name}"][0, index] for name in ("position", "quaternion"))
         return _resampled(position, quaternion, waypoints, str(path))
     if path.suffix.lower() == ".csv":
-        try:
-            rows = np.genfromtxt(path, delimiter=",", comments="#", ndmin=2)
-        except (OSError, ValueError) as error:
-            raise CongraspError(f"--trajectory: {path} cannot be read: {str(error).splitlines()[0]}.") from None
-        rows = rows[~np.isnan(rows).all(-1)]  # a line of names
-        table = _floats(rows, (len(rows), 7), f"--trajectory: {path} (x, y, z, qw, qx, qy, qz in every line)")
+        table = _rows(path, 7, "x, y, z, qw, qx, qy, qz")
         position, quaternion = table[:, :3], table[:, 3:]
     else:
         given = _json(path, "--trajectory", ("position", "quaternion"))
@@ -267,8 +262,10 @@ def numbered(text: str) -> tuple[pathlib.Path, int]:
     )
 
 
-def _motion(path: pathlib.Path, hand: Hand) -> GraspMotion:
-    """A motion of this hand."""
+def _motion(path: pathlib.Path, hand: Hand, index: int) -> GraspMotion:
+    """A motion of this hand; a file holds one."""
+    if index:
+        raise CongraspError(f"{path} is one motion and has no number {index}.", "Leave the number out.")
     motion = load_motion(path)
     if motion.hand != hand.name:
         raise CongraspError(f"{path} is a motion of the hand '{motion.hand}', not '{hand.name}'.")
@@ -321,6 +318,36 @@ def _json(path: pathlib.Path, name: str, keys: tuple[str, ...]) -> dict[str, Any
         if not isinstance(given, dict) or key not in given:
             raise CongraspError(f"{name}: {path} lacks '{key}'.", remedy)
     return given
+
+
+def _rows(path: pathlib.Path, columns: int, names: str) -> np.ndarray:
+    """(n, columns) finite numbers of a CSV file's lines, of which a first one of names counts for nothing."""
+    remedy = f"Write {names} in every line."
+    try:
+        lines = read_file(path, _LARGEST, remedy).decode().splitlines()
+    except OSError as error:
+        raise CongraspError(f"--trajectory: {path} cannot be read: {error.strerror}.", remedy) from None
+    except UnicodeDecodeError:
+        raise CongraspError(f"--trajectory: {path} is not text.", remedy) from None
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 1):
+        words = [word.strip() for word in line.partition("#")[0].split(",")]
+        if not any(words) or (not rows and not any(map(_is_number, words))):
+            continue
+        if len(words) != columns or not all(map(_is_number, words)):
+            raise CongraspError(f"--trajectory: line {number} of {path} is not {columns} finite numbers.", remedy)
+        rows.append([float(word) for word in words])
+    if not rows:
+        raise CongraspError(f"--trajectory: {path} has no numbers.", remedy)
+    return np.array(rows)
+
+
+def _is_number(word: str) -> bool:
+    """Whether it is a finite number."""
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
 
 
 def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:

@@ -37,9 +37,10 @@ def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
         registry.register(collector)
     try:
         server, thread = start_http_server(port, host, registry)
-    except OSError as error:
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
         raise CongraspError(
-            f"The metrics cannot be offered at {host}:{port} ({error.strerror}).", "Choose another --metrics-port."
+            f"The metrics cannot be offered at {host}:{port} ({reason}).", "Choose another --metrics-port."
         ) from None
     try:
         yield

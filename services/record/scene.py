@@ -1,4 +1,4 @@
-"""An episode as a 3-D scene: link frames, capsules, object, constraints, contacts and signals, step by step.
+"""An episode as a 3-D scene: link frames, the hand's surface, object, constraints, contacts and signals, step by step.
 
 Each actor has a frame of its own, side by side under `world`. What stays the same through an episode is sent once, at
 its start; link frames, contacts and signals follow at the control step.
@@ -15,6 +15,7 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
@@ -29,7 +30,8 @@ from common.wire.messages import EPISODE, validate
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
 from services.record.goals import active_blocks
-from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, SKIN, TABLE, WAYPOINT
+from services.record.palette import AVOID, FLESH, GRASPABLE, HEADING, OBJECT, TABLE, WAYPOINT
+from services.record.surface import surface_parts, surface_points
 
 EPISODE_SCHEMA = "congrasp.Episode"
 _MOST = {"T": 2000, "V": 200_000, "Fc": 400_000, "N": 4096, "n": 64, "P": 100_000}
@@ -38,15 +40,12 @@ _OPEN = ("reward/", "error/", "goal/", "active/")
 SPACING = 0.8
 """Metres between two actors' frames in the world."""
 Colour = tuple[float, float, float, float]
-_SKIN, _GHOST, _OBJECT, _TABLE = (*SKIN, 1.0), (*HEADING, 0.25), (*OBJECT, 1.0), (*TABLE, 1.0)
-_GRASPABLE, _AVOID = (*GRASPABLE, 1.0), (*AVOID, 1.0)
+_GHOST, _OBJECT, _TABLE = (*HEADING, 0.25), (*OBJECT, 1.0), (*TABLE, 1.0)
 _HEADING, _WAYPOINT, _FORCE = (*HEADING, 1.0), (*WAYPOINT, 1.0), (0.93, 0.26, 0.21, 1.0)
 _AXES = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.7, 0.2, 1.0), (0.2, 0.3, 0.9, 1.0))
 _ARROW = 0.10  # length of the approach arrow, m
 _FORCE_LENGTH, _FORCE_MAX = 0.01, 0.10  # m per newton, and the longest arrow
 _FORCE_LEAST = 0.05  # N
-_SKIN_POINTS = 96  # on each capsule
-_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -97,9 +96,9 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
     yield Entry(opaque_channel(f"{topic}/raw", EPISODE_SCHEMA), start, encode(episode))
     yield _protobuf(f"{topic}/scene", start, _static_scene(hand, actor, arrays, episode.meta, start), latched=True)
     yield _protobuf(f"{topic}/surface", start, _surface(actor, arrays, start), latched=True)
-    for link in hand.links:
+    for link, (points, colours) in zip(hand.links, surface_points(hand), strict=True):
         # Rerun draws point clouds and no scenes; a topic holds one frame's cloud.
-        cloud = _cloud(f"{actor}/{link.name}", _skin(link), np.multiply(_SKIN, 255), start)
+        cloud = _cloud(f"{actor}/{link.name}", points, colours, start)
         yield _protobuf(f"{topic}/hand/{link.name}", start, cloud, latched=True)
     for i in range(len(arrays["object_position"])):
         now = start + i * step
@@ -142,20 +141,19 @@ def _static_scene(
     """Hand, object and constraints; begins by removing what the episode before it left."""
     update = SceneUpdate()
     update.deletions.add(type=SceneEntityDeletion.ALL).timestamp.FromNanoseconds(now)
-    for link in hand.links:
+    for link, parts in zip(hand.links, surface_parts(hand), strict=True):
         entity = _entity(update, f"hand/{link.name}", f"{actor}/{link.name}", now)
-        _add_capsules(entity, link, np.zeros(3), Rotation.identity(), _SKIN)
+        for part in parts:
+            _add_triangles(entity, part.points, part.faces, (*part.colour, 1.0))
+        if any(part.colour == FLESH for part in parts):
+            _add_capsules(entity, link, (*FLESH, 1.0))
     frame = f"{actor}/object"
-    body = _entity(update, "object", frame, now).triangles.add()
-    body.pose.orientation.w = 1.0
-    for vertex in arrays["visual_vertices"]:
-        _set_vector(body.points.add(), vertex)
-    body.indices.extend(arrays["visual_faces"].ravel().tolist())
+    entity = _entity(update, "object", frame, now)
+    body = _add_triangles(entity, arrays["visual_vertices"], arrays["visual_faces"], _OBJECT)
     if "colour_values" in arrays:
         own = Colours(arrays["colour_points"], arrays["colour_values"])
         for colour in (nearest(arrays["visual_vertices"], own) / 255).tolist():
             _set_colour(body.colors.add(), (*colour, 1.0))
-    _set_colour(body.color, _OBJECT)
     text = _entity(update, "label", frame, now).texts.add(billboard=True, font_size=0.015, text=_label(meta))
     _set_vector(text.pose.position, [0.0, 0.0, arrays["visual_vertices"][:, 2].max() + 0.12])
     _set_colour(text.color, (0.15, 0.17, 0.2, 1.0))
@@ -189,43 +187,28 @@ def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mappin
             _add_arrow(entity, origin, axis, 0.05, 0.003, colour)
         if active.get("pose_finger"):
             position, quaternion = mujoco_link_poses(hand, arrays["goal/pose_q"])
-            for k, link in enumerate(hand.links):
+            for k, parts in enumerate(surface_parts(hand)):
                 turn = wrist * Rotation.from_quat(quaternion[k], scalar_first=True)
-                _add_capsules(entity, link, wrist.apply(position[k]) + origin, turn, _GHOST)
+                for part in parts:
+                    points = turn.apply(part.points) + wrist.apply(position[k]) + origin
+                    _add_triangles(entity, points.astype(np.float32), part.faces, _GHOST)
 
 
 def _surface(actor: str, arrays: Mapping[str, np.ndarray], now: int) -> PointCloud:
     """The object's surface points: graspable region green, avoid region red."""
-    colours = np.where(arrays["surface_minus"][:, None], np.multiply(_AVOID, 255), np.multiply(_GRASPABLE, 255))
+    colours = np.where(arrays["surface_minus"][:, None], AVOID, GRASPABLE)
     return _cloud(f"{actor}/object", arrays["surface_points"], colours, now)
 
 
-def _skin(link: Link) -> np.ndarray:
-    """(n, 3) points spread evenly over the link's capsules, in its frame.
-
-    Equal steps along a capsule's whole length cut equal areas off it, caps included (Archimedes).
-    """
-    points = []
-    for capsule, (start, end) in zip(link.capsules, capsule_ends(link), strict=True):
-        length = float(np.linalg.norm(end - start))
-        axis = (end - start) / length if length else np.array([0.0, 0.0, 1.0])
-        turn = Rotation.from_quat(_turn_onto([0.0, 0.0, 1.0], axis), scalar_first=True)
-        along = np.linspace(-1, 1, 2 * _SKIN_POINTS + 1)[1::2] * (length / 2 + capsule.radius)
-        around = _GOLDEN_ANGLE * np.arange(_SKIN_POINTS)
-        radius = np.sqrt(capsule.radius**2 - np.maximum(np.abs(along) - length / 2, 0.0) ** 2)
-        local = np.stack([radius * np.cos(around), radius * np.sin(around), along], -1)
-        points.append(turn.apply(local) + (start + end) / 2)
-    return np.concatenate(points) if points else np.zeros((0, 3))
-
-
 def _cloud(frame: str, points: np.ndarray, colours: np.ndarray, now: int) -> PointCloud:
-    """Points (N, 3) of a frame with colours (4,) or (N, 4) from 0 to 255."""
+    """Points (N, 3) of a frame with colours (N, 3) from 0 to 1."""
     packed = np.zeros(len(points), [("position", "<f4", 3), ("colour", "u1", 4)])
     packed["position"] = points
     # Foxglove's packed colours lie as red, green, blue, alpha in memory, one field of a byte each.
-    packed["colour"] = colours
+    packed["colour"][:, :3], packed["colour"][:, 3] = np.multiply(colours, 255), 255
     cloud = PointCloud(frame_id=frame, point_stride=packed.dtype.itemsize, data=packed.tobytes())
     cloud.timestamp.FromNanoseconds(now)
+    cloud.pose.position.SetInParent()  # readers may miss a position that is not there
     cloud.pose.orientation.w = 1.0
     kinds = [("x", 0), ("y", 4), ("z", 8), ("red", 12), ("green", 13), ("blue", 14), ("alpha", 15)]
     for name, offset in kinds:
@@ -280,10 +263,20 @@ def _entity(update: SceneUpdate, name: str, frame: str, now: int, *, lifetime: i
     return entity
 
 
-def _add_capsules(entity: SceneEntity, link: Link, place: np.ndarray, turn: Rotation, colour: Colour) -> None:
-    """The capsules of a link whose frame lies at `place`, `turn` in the entity's frame."""
-    for capsule, ends in zip(link.capsules, capsule_ends(link), strict=True):
-        start, end = turn.apply(ends) + place
+def _add_triangles(entity: SceneEntity, points: np.ndarray, faces: np.ndarray, colour: Colour) -> TriangleListPrimitive:
+    """Adds a mesh (V, 3), (E, 3) in the entity's frame."""
+    mesh = entity.triangles.add()
+    mesh.pose.orientation.w = 1.0
+    for point in points:
+        _set_vector(mesh.points.add(), point)
+    mesh.indices.extend(faces.ravel().tolist())
+    _set_colour(mesh.color, colour)
+    return mesh
+
+
+def _add_capsules(entity: SceneEntity, link: Link, colour: Colour) -> None:
+    """Adds a link's capsules, which fill the inside of its skin where bent joints open it."""
+    for capsule, (start, end) in zip(link.capsules, capsule_ends(link), strict=True):
         length = float(np.linalg.norm(end - start))
         if length > 0:
             cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)

@@ -72,8 +72,9 @@ class PolicyServer:
           on_batch: given the number of states in every batch.
 
         Raises:
-          CongraspError: there is no policy yet.
+          CongraspError: there is no policy yet, or the name cannot be one.
         """
+        keys = Keys(run)
         first = source(-1)
         if first is None:
             raise CongraspError("There is no policy to serve yet.", "Start the server when the run has published one.")
@@ -94,7 +95,6 @@ class PolicyServer:
             share=SHARE,
             parts=Parts(TURN, _cut, self._join),
         )
-        keys = Keys(run)
         transport.serve(keys.health, lambda key, request: Message({}, self.health()))
         transport.serve(
             below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._turn_away

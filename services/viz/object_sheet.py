@@ -13,10 +13,10 @@ from common.objects.resting import rest_tilts
 from common.objects.shapes import tessellate
 from common.objects.spec import GraspObject
 from common.task.sampling.headings import Headings, within_reach
-from services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, PIECES
+from services.record.palette import AVOID, GRASPABLE, HEADING, PIECES
 from services.viz.raster import render_scene
 from services.viz.scene import Shape
-from services.viz.shapes import arrow, fit, shape_points, table_shape
+from services.viz.shapes import arrow, fit, object_shape, shape_points, table_shape
 from services.viz.sheets import contact_sheet
 
 _ARROWS, _LENGTH = 24, 0.08  # how many headings, and from how far before them they are drawn, m
@@ -98,14 +98,4 @@ def _painted(obj: GraspObject) -> Shape:
     """The object in its most likely resting pose, in the colours of its regions."""
     pose = np.asarray(obj.rest_poses[0], float)
     paint = np.where(obj.non_graspable_points[:, None], AVOID, GRASPABLE)
-    return Shape(
-        "mesh",
-        (0, 0),
-        OBJECT,
-        pose[:3],
-        pose[3:],
-        vertices=obj.visual_vertices,
-        faces=obj.visual_faces,
-        paint_points=obj.points,
-        paint_colours=paint,
-    )
+    return object_shape((obj.visual_vertices, obj.visual_faces), pose[:3], pose[3:], (obj.points, paint))

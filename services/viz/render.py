@@ -17,7 +17,7 @@ from services.record.goals import active_blocks, grasp_span, phases_of
 from services.record.palette import HEADING, OBJECT, WAYPOINT
 from services.viz.raster import render_scene, visible
 from services.viz.scene import Camera, Shape
-from services.viz.shapes import arrow, beads, capsule_shapes, fit, posed_hand, skin_shape, table_shape
+from services.viz.shapes import arrow, beads, capsule_shapes, fit, object_shape, posed_hand, skin_shape, table_shape
 from services.viz.sheets import contact_sheet, save_video
 
 TOUCHING = (0.13, 0.74, 0.63)
@@ -54,25 +54,17 @@ def _object(episode: Message, step: int) -> Shape:
     arrays = episode.arrays
     avoid = np.asarray(arrays["surface_minus"], bool)
     marked = active_blocks(arrays).get("affordance", False) and bool(avoid.any())
-    points = colours = None
+    paint = None
     if "colour_values" in arrays:
         points, colours = arrays["colour_points"], arrays["colour_values"] / 255
         if marked:
             near = cKDTree(arrays["surface_points"]).query(points)[1]
             colours = np.where(avoid[near, None], OBJECT_AVOID, colours)
+        paint = points, colours
     elif marked:
-        points, colours = arrays["surface_points"], np.where(avoid[:, None], OBJECT_AVOID, OBJECT)
-    return Shape(
-        "mesh",
-        (0, 0),
-        OBJECT,
-        np.asarray(arrays["object_position"][step], float),
-        np.asarray(arrays["object_quaternion"][step], float),
-        vertices=arrays["visual_vertices"],
-        faces=arrays["visual_faces"],
-        paint_points=points,
-        paint_colours=colours,
-    )
+        paint = arrays["surface_points"], np.where(avoid[:, None], OBJECT_AVOID, OBJECT)
+    mesh = arrays["visual_vertices"], arrays["visual_faces"]
+    return object_shape(mesh, arrays["object_position"][step], arrays["object_quaternion"][step], paint)
 
 
 def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:

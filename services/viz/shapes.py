@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from common.hands.skin import Skin, skin_of
 from common.hands.spec import Hand, capsule_ends
 from services.assets.hands.kinematics import mujoco_link_poses
-from services.record.palette import FLESH, JOINT, SKIN, TABLE, Colour
+from services.record.palette import FLESH, JOINT, OBJECT, SKIN, TABLE, Colour
 from services.viz.scene import Camera, Shape, between
 
 _TABLE_RADIUS, _TABLE_HALF_HEIGHT = 0.28, 0.008  # m
@@ -88,6 +88,34 @@ def posed_hand(
     links, quaternion = mujoco_link_poses(hand, q)
     turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
     return skin_shape(skin or skin_of(hand), wrist.apply(links) + position, turned, tint, shares, alpha)
+
+
+def object_shape(
+    mesh: tuple[np.ndarray, np.ndarray],
+    position: np.ndarray,
+    quaternion: np.ndarray,
+    paint: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Shape:
+    """An object.
+
+    Args:
+      mesh: (V, 3) and (F, 3) in its frame.
+      position: (3,) m, world.
+      quaternion: (4,) from its frame to the world.
+      paint: points (P, 3) in its frame, and what colour (P, 3) in [0, 1] the surface has at them; without, one for all.
+    """
+    points, colours = paint or (None, None)
+    return Shape(
+        "mesh",
+        (0, 0),
+        OBJECT,
+        np.asarray(position, float),
+        np.asarray(quaternion, float),
+        vertices=mesh[0],
+        faces=mesh[1],
+        paint_points=points,
+        paint_colours=colours,
+    )
 
 
 def table_shape(below: np.ndarray) -> Shape:

@@ -1,6 +1,7 @@
 """The run's configuration: JSON and back, and the curriculum."""
 
 import dataclasses
+import json
 
 import pytest
 
@@ -17,6 +18,23 @@ def test_configurations_survive_the_wire(name):
 def test_unknown_keys_are_named():
     with pytest.raises(CongraspError, match="colour"):
         run_config_from_json('{"colour": 3}')
+
+
+def test_a_run_of_before_a_setting_keeps_what_held_then():
+    config = RunConfig()
+    older = json.loads(to_json(config))
+    del older["task"]["contact_time"]
+    for name in ("wrist_acceleration", "wrist_angular_acceleration"):
+        del older["task"]["control"][name]
+    control = dataclasses.replace(config.task.control, wrist_acceleration=0.0, wrist_angular_acceleration=0.0)
+    task = dataclasses.replace(config.task, contact_time=0.016, control=control)
+    assert run_config_from_json(json.dumps(older)) == dataclasses.replace(config, task=task)
+
+
+@pytest.mark.parametrize("task", [None, 3, [], "task", {"control": None}, {"control": [1]}])
+def test_a_task_that_is_none_is_refused(task):
+    with pytest.raises(CongraspError, match="does not fit this version"):
+        run_config_from_json(json.dumps({"task": task}))
 
 
 def test_weights_go_along_the_ramp():

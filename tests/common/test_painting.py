@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from common.objects import painting
 from common.objects.painting import finer, nearest, painted
 from common.objects.spec import Colours
 
@@ -41,3 +42,24 @@ def test_points_take_the_colour_of_the_nearest():
     vertices, _, found = painted(box.vertices, box.faces, colours)
     above = vertices[:, 2] > 1e-6
     assert (found[above] == [0, 0, 255]).all() and above.sum() > 8
+
+
+def test_a_painted_mesh_is_cut_once_until_it_or_its_colours_change(monkeypatch):
+    cuts = []
+
+    def counted(*mesh):
+        cuts.append(mesh)
+        return finer(*mesh)
+
+    monkeypatch.setattr(painting, "finer", counted)
+    ball = trimesh.creation.icosphere(2, 0.0317)
+    colours = Colours(np.array([[0, 0, -1], [0, 0, 1]], np.float32), np.array([[255, 0, 0], [0, 0, 255]], np.uint8))
+    first = painted(ball.vertices, ball.faces, colours)
+    again = painted(np.array(ball.vertices), np.array(ball.faces, np.int32), Colours(*map(np.array, colours)))
+    assert len(cuts) == 1 and all(a is b for a, b in zip(first, again, strict=True))
+    with pytest.raises(ValueError, match="read-only"):
+        first[2][0] = 0
+    other = painted(ball.vertices, ball.faces, colours._replace(values=colours.values[::-1]))
+    assert len(cuts) == 2 and not np.array_equal(other[2], first[2])
+    painted(1.01 * ball.vertices, ball.faces, colours)
+    assert len(cuts) == 3

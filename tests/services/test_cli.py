@@ -58,6 +58,16 @@ def test_help_names_every_command_and_every_command_exists():
         (["serve", "--policy", "a.safetensors", "--connect", "tcp/127.0.0.1:1"], "either a.safetensors or"),
         (["actor", "--connect", "nonsense"], "endpoint"),
         (["plot", "/nonexistent-run"], "nonexistent-run"),
+        (["plot", "x" * 300], "x cannot be used: File name too long"),
+        (["export", "motion", "x" * 300], "x cannot be used: File name too long"),
+        (["status", "/dev/null"], "/dev/null is not a run directory"),
+        (["grasp", "x" * 300 + ".stl"], "x.stl cannot be used: File name too long"),
+        (["grasp", "mug:7", "--policy", "/nonexistent.safetensors"], "/nonexistent.safetensors cannot be read"),
+        (["grasp", "mug:7", "--policy", "/"], "/ is no regular file"),
+        (["grasp", "mug:7", "--seed", "-1"], "--seed is -1. It must be at least 0"),
+        (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It is from 0 to 1024"),
+        (["serve", "--metrics-port", "99999999"], "metrics cannot be offered at .*:99999999.*--metrics-port"),
+        (["view", "--recordings", "/dev/null", "--port", "0"], "/dev/null is no recording"),
         (["learner", "--run-dir", "/nonexistent-run", "--listen", "tcp/0.0.0.0:7447"], "other machines.*--certs"),
         (["serve", "--listen", "tcp/[::]:7457"], "other machines.*--certs.*--insecure"),
         (["train", "--listen", "tcp/10.0.0.5:7447"], "other machines.*--certs"),
@@ -100,6 +110,19 @@ def test_a_full_disk_is_one_line_wherever_it_strikes(monkeypatch, capsys):
         line
         == "congrasp: error: /data/version could not be written: No space left on device. Free space and start again."
     )
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG])
+def test_a_path_that_cannot_be_used_is_one_line_and_a_fault_of_ours_is_not(number, monkeypatch, capsys):
+    def refuse(arguments):
+        raise OSError(number, os.strerror(number), *arguments)
+
+    monkeypatch.setattr(cli, "run", refuse)
+    with pytest.raises(SystemExit) as end:
+        cli.main(["/data/grasps"])
+    is_one_line(end.value.code, capsys.readouterr().err, f"/data/grasps cannot be used: {os.strerror(number)}. Check")
+    with pytest.raises(OSError, match=os.strerror(number)):  # it names nothing that a user could mend
+        cli.main([])
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")

@@ -17,9 +17,9 @@ from common.hands.measures import fitting_scale
 from common.hands.meshes import MAX_DISTANCE, Meshes
 from common.hands.motors import motor_limits
 from common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
+from services.assets.hands.actuators import Drive
 from services.assets.hands.compile import compiled_model
 from services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_box, solids_of, surface
-from services.assets.hands.motors import Drive
 from services.assets.hands.poses import opening, propose_poses, thumb_of
 from services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
 from services.assets.hands.visual import link_mesh

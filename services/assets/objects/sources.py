@@ -17,6 +17,7 @@ from services.assets.objects.kinds import CONVERT, SUFFIXES, kind_of
 _GRASPABLE_WORDS = ("handle", "grip", "neck", "stem", "shaft", "body")
 # GraspXL marks the absence of a non-graspable part by a cube of 1 cm here (m).
 _NO_PART = 0.346408
+_FARTHEST = 1e12  # a coordinate in the file's unit: squares and products of those of a mesh stay finite
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,6 +114,8 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Tri
     if finite is None:
         bad = int((~np.isfinite(mesh.vertices)).any(-1).sum())
         raise CongraspError(f"{path} has {bad} vertices that are not finite numbers.", "Repair or export it again.")
+    if (farthest := np.abs(finite[0]).max(initial=0.0)) > _FARTHEST:
+        raise CongraspError(f"{path} has a coordinate of {farthest:.3g}.", f"{_FARTHEST:g} is the most, in any unit.")
     mesh = trimesh.Trimesh(*repair.reduced(*finite, said), process=False)
     mesh.merge_vertices()
     if len(mesh.faces):

@@ -9,6 +9,8 @@ from common.objects.shapes import matrix
 from common.objects.spec import GraspObject
 from common.task.sampling.headings import INWARD
 
+LARGEST = 1e6
+"""Of each number of a place (m) or a direction that a page sends: single precision has its squares, too."""
 _ROUND = 1e-6  # rad
 _LOWEST = 0.012  # m above the table of a target from above
 
@@ -73,13 +75,15 @@ def from_above(obj: GraspObject, rest: int) -> Arrow:
 
 
 def vector(what: str, value: Any) -> np.ndarray:
-    """(3,) three finite numbers, or a CongraspError."""
+    """(3,) three numbers of a size that can be reckoned with, or a CongraspError."""
     try:
         found = np.asarray(value, float)
     except (TypeError, ValueError):
         found = np.zeros(0)
     if found.shape != (3,) or not np.isfinite(found).all():
         raise CongraspError(f"The {what} must be three numbers, not {ascii(value)[:60]}.")
+    if np.abs(found).max() > LARGEST:
+        raise CongraspError(f"The {what} must be within {LARGEST:g} of zero.")
     return found
 
 

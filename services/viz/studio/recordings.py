@@ -31,9 +31,12 @@ class Recordings:
         self._found: dict[str, Message] = {}
 
     def check(self) -> None:
-        """Raises a CongraspError if there is no folder or file of this name."""
+        """Raises a CongraspError if there is no folder or recording of this name."""
+        remedy = "Name a run's folder, or its recordings."
         if not self.path.exists():
-            raise CongraspError(f"There is no file or folder {self.path}.", "Name a run's folder, or its recordings.")
+            raise CongraspError(f"There is no file or folder {self.path}.", remedy)
+        if not self.path.is_dir() and ".mcap" not in self.path.suffixes:
+            raise CongraspError(f"{self.path} is no recording (*.mcap).", remedy)
 
     def around(self, time: float, seconds: float) -> tuple[float, list[dict[str, Any]]]:
         """Episodes that were recorded around a time, in the order of their times.

@@ -141,7 +141,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """Answers by a route."""
         path, query = self._route()
-        length = int(self.headers.get("Content-Length") or -1)
+        given = self.headers.get("Content-Length") or ""
+        length = int(given) if given.isdecimal() and len(given) < 20 else -1
         if not 0 <= length <= MOST_BYTES:
             self.close_connection = True
             message = "The request has no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."

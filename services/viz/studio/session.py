@@ -179,7 +179,7 @@ class Session:
         try:
             request = json_object(body)
             action = request.pop("action")
-        except (ValueError, KeyError):
+        except (ValueError, KeyError, RecursionError):
             raise CongraspError("The request is not a JSON object with an 'action'.") from None
         with self._lock:
             actions: dict[str, Callable[..., Any]] = {
@@ -193,11 +193,11 @@ class Session:
                 "redo": self._history.redo,
                 **{name: functools.partial(self._history.do, name) for name in ACTIONS},
             }
-            if action not in actions:
+            if not isinstance(action, str) or action not in actions:
                 raise CongraspError(f"The studio cannot do '{str(action)[:40]}'.", f"It can: {', '.join(actions)}.")
             try:
                 actions[action](**request)
-            except TypeError as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise CongraspError(f"'{action}' takes other values ({error}).") from None
         return self.state()
 

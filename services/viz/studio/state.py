@@ -22,7 +22,7 @@ from common.task.types import Goal, Surface
 from common.wire.codec import Message
 from services.grasp.constraint_sets import make_sets
 from services.grasp.grasper import with_avoid
-from services.viz.studio.arrow import Arrow, arrow_of, from_above, vector
+from services.viz.studio.arrow import LARGEST, Arrow, arrow_of, from_above, vector
 from services.viz.studio.canvas import Canvas, Paint
 
 TOOLS = ("affordance", "pose", "trajectory")
@@ -95,8 +95,9 @@ class Studio:
 
     def set_rest_pose(self, rest: int) -> None:
         """Another resting pose."""
-        if not 0 <= rest < len(self.obj.rest_poses):
-            raise CongraspError(f"The object '{self.obj.name}' has no resting pose {rest + 1}.")
+        if not isinstance(rest, int) or not 0 <= rest < len(self.obj.rest_poses):
+            which = rest + 1 if isinstance(rest, int) else f"'{str(rest)[:20]}'"
+            raise CongraspError(f"The object '{self.obj.name}' has no resting pose {which}.")
         self.rest = rest
         self.arrow = from_above(self.obj, rest)
 
@@ -180,6 +181,8 @@ class Studio:
         drawn = np.asarray(points, float)
         if drawn.ndim != 2 or drawn.shape[1:] != (3,) or not 2 <= len(drawn) <= 2000 or not np.isfinite(drawn).all():
             raise CongraspError("A path must be 2 to 2000 points of three numbers.")
+        if np.abs(drawn).max() > LARGEST:
+            raise CongraspError(f"A path must be within {LARGEST:g} m of the object.")
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(drawn, axis=0), axis=-1))])
         if along[-1] < _LEAST_PATH:
             raise CongraspError(

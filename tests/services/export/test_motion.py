@@ -454,3 +454,11 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
         assert run(*arguments) == 2
         said = capsys.readouterr().err
         assert words in said and said.count("\n") == 1
+
+
+def test_a_motions_file_has_no_other_number(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "grasp.npz"
+    save_motion(path, human)
+    assert motion_formats.pick_motion(path, 0).object == motion_formats.pick_motion(path).object == human.object
+    with pytest.raises(CongraspError, match=r"grasp\.npz is one motion and has no number 99. Leave --index out"):
+        motion_formats.pick_motion(path, 99)

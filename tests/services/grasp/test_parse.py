@@ -1,6 +1,7 @@
 """Constraints as people write them down."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -131,8 +132,39 @@ def test_what_is_wrong_with_a_trajectory_is_said(block, tmp_path):
     path.write_text("0,0,300,1,0,0,0\n0,0,200,1,0,0,0\n")
     with pytest.raises(CongraspError, match=r"the end of .* lies 2.* m from 'block'. Give metres"):
         asked(block, trajectory=str(path))
-    path.write_text("0,0,0\n0,0,1\n")
-    with pytest.raises(CongraspError, match="must be 2 x 7 finite numbers"):
-        asked(block, trajectory=str(path))
+    for text, line in (
+        ("0,0,0\n0,0,1\n", 1),
+        ("x,y,z,qw,qx,qy,qz\n\n0,0,0,1,0,0,0\n0,0,nan,1,0,0,0\n", 4),
+        ("0,0,0,1,0,0,0  # the start\n0,0,1,1,0,0,0,9\n", 2),
+        ("0,0,0,1,0,0,0\n0,0,one,1,0,0,0\n", 2),
+    ):
+        path.write_text(text)
+        with pytest.raises(CongraspError, match=rf"line {line} of .*path\.csv is not 7 finite numbers"):
+            asked(block, trajectory=str(path))
+    for content, complaint in (
+        (b"", "path.csv has no numbers"),
+        (b"x,y,z,qw,qx,qy,qz\n", "path.csv has no numbers"),
+        (bytes(range(256)), "path.csv is not text"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(CongraspError, match=complaint):
+            asked(block, trajectory=str(path))
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(CongraspError, match=r"pipe\.csv is no regular file"):
+        asked(block, trajectory=str(tmp_path / "pipe.csv"))
     with pytest.raises(CongraspError, match="cannot be read"):
         asked(block, trajectory=str(tmp_path / "none.csv"))
+
+
+@pytest.mark.filterwarnings("error")
+def test_huge_numbers_are_directions_but_no_places(block):
+    direction = asked(block, heading="1e308 -1e308 0").given("heading", "direction")
+    np.testing.assert_allclose(direction, np.array([1, -1, 0]) / np.sqrt(2))
+    with pytest.raises(CongraspError, match="--at lies inf m from 'block'"):
+        asked(block, at="1e300 0 0")
+
+
+def test_a_motion_has_no_numbers(block):
+    for name in ("pose", "trajectory"):
+        with pytest.raises(CongraspError, match=r"grasp\.npz is one motion and has no number 3. Leave the number out"):
+            asked(block, **{name: "grasp.npz:3"})

@@ -1,25 +1,34 @@
 """What a viewer is told about an episode is where the simulation had it."""
 
 import json
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from common.errors import CongraspError
 from common.hands import get_hand, kinematics
+from common.hands.skin import skin_of
 from common.hands.spec import link_origin
 from common.wire.codec import Message, decode
 from services.assets.hands.kinematics import mujoco_link_poses
 from services.record.channels import Entry
 from services.record.entries import Converter
 from services.record.goals import active_blocks, active_constraints
+from services.record.palette import FLESH
 from services.record.scene import SPACING
+from services.record.surface import surface_parts
+from services.record.writer import LogWriter
 from tests.episodes import CONTROL_DT, FORCE, episode, older
 
 HAND = get_hand("human")
@@ -134,23 +143,67 @@ def test_surface_points_are_coloured_by_region(entries: list[Entry]) -> None:
     np.testing.assert_array_equal(red > green, arrays["surface_minus"])
 
 
-def test_points_of_every_link_lie_on_its_capsules_in_its_frame(entries: list[Entry]) -> None:
-    for link in HAND.links:
+def test_points_of_every_link_lie_on_its_surface_in_its_frame(entries: list[Entry]) -> None:
+    count = 0
+    for link, parts in zip(HAND.links, surface_parts(HAND), strict=True):
         (entry,) = of(entries, f"hand/{link.name}")
         cloud = PointCloud.FromString(entry.data)
         assert cloud.frame_id == f"a0/{link.name}" and entry.channel.latched
         raw = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
-        points = raw[:, :12].copy().view("<f4") + link_origin(link)
-        depth = []
-        for capsule in link.capsules:
-            start, along = np.array(capsule.start), np.subtract(capsule.end, capsule.start)
-            share = np.clip((points - start) @ along / (along @ along), 0, 1)
-            depth.append(np.linalg.norm(points - start - share[:, None] * along, axis=1) - capsule.radius)
-        each = np.split(np.arange(len(points)), len(link.capsules))
-        for distance, own in zip(depth, each, strict=True):
-            np.testing.assert_allclose(distance[own], 0, atol=1e-6)
-            ends = points[own].min(0), points[own].max(0)
-            assert np.linalg.norm(ends[1] - ends[0]) > 0.01
+        points = raw[:, :12].copy().view("<f4")
+        (part,) = parts
+        mesh = trimesh.Trimesh(part.points, part.faces, process=False)
+        assert np.abs(trimesh.proximity.closest_point_naive(mesh, points[::20])[1]).max() < 1e-6
+        assert np.linalg.norm(np.ptp(points, axis=0)) > 0.01
+        np.testing.assert_array_equal(raw[:, 12:], np.tile([*np.multiply(FLESH, 255).astype(int), 255], (len(raw), 1)))
+        count += len(points)
+    assert 2000 < count < 2100
+
+
+def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(tmp_path: Path) -> None:
+    """The messages' classes come from the file, and the turn is a quaternion's by the textbook."""
+    step, k = 9, [link.name for link in HAND.links].index("thumb_distal")
+    writer = LogWriter(tmp_path, "log")
+    writer.write(*Converter()(KEY, episode(), START))
+    writer.close()
+    with writer.files[0].open("rb") as file:
+        found = [
+            (channel.topic, message)
+            for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(
+                ["/episode/a0/tf", "/episode/a0/scene"]
+            )
+        ]
+    (scene,) = [message for topic, message in found if topic.endswith("scene")]
+    frame = [message for topic, message in found if topic.endswith("tf")][step].transforms[k + 1]
+    (entity,) = [e for e in scene.entities if e.id == "hand/thumb_distal"]
+    assert frame.child_frame_id == entity.frame_id == "a0/thumb_distal" and frame.parent_frame_id == "a0"
+    (mesh,) = entity.triangles
+    w, axis = frame.rotation.w, vector(frame.rotation)
+    local = np.array([vector(point) for point in mesh.points])
+    world = (
+        local + 2 * w * np.cross(axis, local) + 2 * np.cross(axis, np.cross(axis, local)) + vector(frame.translation)
+    )
+    arrays, skin = episode().arrays, skin_of(HAND)
+    turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True).as_matrix()
+    posed = skin.posed(arrays["link_position"][step], turns)[0]
+    own = posed[skin.weights[:, k] > 0.999]  # what moves with this link alone
+    assert len(own) > 3
+    assert cKDTree(world).query(own)[0].max() < 1e-4
+    corners = world[np.array(mesh.indices).reshape(-1, 3)]
+    middle = world.mean(0)
+    outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.sum(outwards * (corners.mean(1) - middle), -1) > 0).mean() > 0.9
+
+
+def test_a_recording_holds_the_hand_once_and_small(entries: list[Entry]) -> None:
+    (entry,) = of(entries, "scene")
+    scene = SceneUpdate.FromString(entry.data)
+    hand = sum(entity.ByteSize() for entity in scene.entities if entity.id.startswith("hand/"))
+    one_frame = len(skin_of(HAND).points) * 3 * 9  # three doubles and their tags
+    assert hand < 3 * one_frame
+    assert not any(
+        e.id.startswith("hand/") for x in of(entries, "contacts") for e in SceneUpdate.FromString(x.data).entities
+    )
 
 
 def test_table_and_forces_are_drawn_while_they_last(entries: list[Entry]) -> None:

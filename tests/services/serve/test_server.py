@@ -7,6 +7,7 @@ import pathlib
 import threading
 import time
 import types
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -312,3 +313,8 @@ def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: path
             PolicyServer(transport, "p", lambda version: None)
         with pytest.raises(TransportError):
             transport.query(Keys("p").health, Message({}, {}), timeout=0.5)
+
+
+def test_a_name_that_cannot_be_one_is_refused_before_a_policy_is_loaded():
+    with pytest.raises(CongraspError, match="'a/b' cannot be the name of a run"):
+        PolicyServer(mock.Mock(), "a/b", mock.Mock(side_effect=AssertionError))

@@ -90,6 +90,15 @@ def test_other_sites_are_turned_away(page: Page) -> None:
     [
         (b"", "JSON"),
         (b"[1]", "JSON"),
+        (b"[" * 100_000, "JSON"),
+        (b'{"action": ["fill"]}', "cannot do"),
+        (b'{"action": "set_rest_pose", "rest": 0.5}', "no resting pose '0.5'"),
+        (b'{"action": "set_rest_pose", "rest": "upright"}', "no resting pose 'upright'"),
+        (b'{"action": "draw", "points": "along"}', "'draw' takes other values"),
+        (b'{"action": "draw", "points": [[0, 0, 0], [1]]}', "'draw' takes other values"),
+        (b'{"action": "draw", "points": [[1e308, 0, 0], [-1e308, 0, 0]]}', "within"),
+        (b'{"action": "paint", "points": [["x", 0, 0]], "radius": 0.01, "avoid": true}', "'paint' takes other values"),
+        (b'{"action": "set_heading", "position": [1e308, 0, 0], "direction": [0, 0, 1]}', "within"),
         (b'{"action": "explode"}', "cannot do 'explode'"),
         (b'{"action": "view"}', "cannot do 'view'"),
         (b'{"action": "set_roll", "turns": 2}', "other values"),
@@ -104,8 +113,9 @@ def test_wrong_requests_are_answered_with_a_message(page: Page, body: bytes, say
     assert code == 200 and says in json.loads(found)["error"]
 
 
-def test_too_much_is_refused_before_it_is_read(page: Page) -> None:
-    assert page.ask("POST", "/api/upload?name=a.stl", b"", Content_Length=str(1 << 40))[0] == 413
+def test_too_much_or_of_no_length_is_refused_before_it_is_read(page: Page) -> None:
+    for length in (str(1 << 40), "-5", "many", "9" * 5000):
+        assert page.ask("POST", "/api/upload?name=a.stl", b"", Content_Length=length)[0] == 413
 
 
 def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasping, tmp_path: pathlib.Path) -> None:

@@ -1,4 +1,4 @@
-"""What moves a hand's joints in its file: motors with gains and limits, couplings between joints, tendons.
+"""The actuators of a hand's file: motors with gains and limits, couplings between joints, tendons.
 
 MuJoCo reads URDF's mimic joints as joint equalities. Everything is relative to the pose in which the file shows the
 hand, which is zero here.
