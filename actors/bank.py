@@ -132,15 +132,27 @@ def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints
       Trajectories (M, K, 3) and (M, K, 4), and (M, R) bool.
     """
     path, turns = make_trajectories(hand, poses.position, poses.quaternion, key, waypoints=waypoints)
-    room = jax.lax.map(lambda row: _fingers_over_table(hand, *row), (poses.q, path, turns, rest), batch_size=2048)
+    room = height_over_table(hand, poses.q, path, turns, rest) > -_SOFT
     return path, turns, clear_of_table(hand, poses.quaternion, path, rest) & room
 
 
-def _fingers_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
-    """(R,) bool: the hand stays over the table as its wrist follows a trajectory (K, 3), (K, 4) to a pose.
+def height_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
+    """(M, R) m, how high the lowest of a hand's capsules stays over the table on the way to each of M reference poses.
 
-    With the pose's fingers (F,) all along, and with open ones at the start; `rest` (R, 7) are the object's poses.
+    With the pose's fingers all along, and with open ones at the start.
+
+    Args:
+      hand: the hand.
+      q: (M, F) finger angles of the poses.
+      path: (M, K, 3) wrist waypoints, in the object frame.
+      turns: (M, K, 4).
+      rest: (M, R, 7) resting poses of the objects.
     """
+    return jax.lax.map(lambda row: _height_on_the_way(hand, *row), (q, path, turns, rest), batch_size=2048)
+
+
+def _height_on_the_way(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
+    """(R,) m, `height_over_table` of one reference."""
 
     def lowest(q: Array, path: Array, turns: Array) -> Array:
         """(R,) m over the table."""
@@ -150,7 +162,7 @@ def _fingers_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: A
         height = jnp.sum(up * ends, -1) + rest[:, None, None, 2] - np.repeat(hand.capsule_radii, 2)
         return jnp.min(height, (1, 2))
 
-    return jnp.minimum(lowest(q, path, turns), lowest(jnp.array(hand.q_open), path[:1], turns[:1])) > -_SOFT
+    return jnp.minimum(lowest(q, path, turns), lowest(jnp.array(hand.q_open), path[:1], turns[:1]))
 
 
 def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> Array:

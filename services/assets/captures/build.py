@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from actors.bank import HEADINGS, above_table, clear_of_table, headings_of
+from actors.bank import HEADINGS, above_table, clear_of_table, headings_of, height_over_table
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands.human import HUMAN
@@ -31,6 +31,8 @@ from services.assets.objects.sources import safe_name
 from services.grasp.constraint_sets import for_training, set_of
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
+_CAPTURE_ERROR = 0.01
+"""Metres by which captured hands are in things that they were beside."""
 _TOUCHED = 0.03
 """Metres around touched points that count as touched."""
 _VERTICES = 3
@@ -215,6 +217,27 @@ def _nearest(clouds: list[np.ndarray], points: np.ndarray) -> np.ndarray:
     return np.argmin([cKDTree(cloud).query(points)[0] for cloud in clouds], axis=0)
 
 
+def _resting_poses(
+    hand: Hand, q: np.ndarray, position: np.ndarray, quaternion: np.ndarray, rest: np.ndarray
+) -> np.ndarray:
+    """(M, R) bool, in which resting poses (R, 7) of the object each of M captured references is asked for.
+
+    Their wrist must stay over the table, and the hand out of it but for what captures are off by. Where no resting pose
+    allows that, it is the one in which the hand is least deep in the table.
+
+    Args:
+      hand: whose references these are.
+      q: (M, F) finger angles of the poses.
+      position: (M, K, 3) wrist waypoints, in the object frame; the pose is the last one.
+      quaternion: (M, K, 4).
+      rest: (R, 7).
+    """
+    rests = np.stack([rest] * len(position))
+    clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, rests))
+    height = np.where(clear, height_over_table(hand, q, position, quaternion, rests), -np.inf)
+    return clear & (height >= np.minimum(-_CAPTURE_ERROR, height.max(1, keepdims=True)))
+
+
 def _set(
     hand: Hand, group: _Group, options: Options, number: int, source: str, training: np.ndarray
 ) -> tuple[GraspObject, Message]:
@@ -245,7 +268,7 @@ def _set(
     else:
         posed = transferred(hand, demonstrations, fitting, scale)
     q, position, quaternion = (values.astype(np.float32) for values in posed)
-    clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, np.stack([fields["rest"]] * len(position))))
+    clear = _resting_poses(hand, q, position, quaternion, fields["rest"])
     nearer = _ends_nearer_to_graspable(position[:, -1], fields["points"], fields["avoid"])
     row = ConstraintBank(
         **{name: value for name, value in fields.items() if not name.startswith("chosen")},
