@@ -38,7 +38,7 @@ _CLOSED_TOGETHER = 16
 """Objects around which hands close at once, so that an accelerator has enough to do."""
 _CLEARANCE = 0.02
 """Metres over the table that every waypoint of a trajectory keeps."""
-_SOFT = 0.002
+SOFT = 0.002
 """Metres that fingers may be in the table, which contacts are too soft to prevent."""
 _STEEPEST_UP = 0.1
 """Largest upward component of a reference pose's approach direction."""
@@ -132,7 +132,7 @@ def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints
       Trajectories (M, K, 3) and (M, K, 4), and (M, R) bool.
     """
     path, turns = make_trajectories(hand, poses.position, poses.quaternion, key, waypoints=waypoints)
-    room = height_over_table(hand, poses.q, path, turns, rest) > -_SOFT
+    room = height_over_table(hand, poses.q, path, turns, rest) > -SOFT
     return path, turns, clear_of_table(hand, poses.quaternion, path, rest) & room
 
 

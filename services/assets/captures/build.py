@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from actors.bank import HEADINGS, above_table, clear_of_table, headings_of, height_over_table
+from actors.bank import HEADINGS, SOFT, above_table, clear_of_table, headings_of, height_over_table
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands.human import HUMAN
@@ -31,8 +31,6 @@ from services.assets.objects.sources import safe_name
 from services.grasp.constraint_sets import for_training, set_of
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
-_CAPTURE_ERROR = 0.01
-"""Metres by which captured hands are in things that they were beside."""
 _TOUCHED = 0.03
 """Metres around touched points that count as touched."""
 _VERTICES = 3
@@ -222,8 +220,8 @@ def _resting_poses(
 ) -> np.ndarray:
     """(M, R) bool, in which resting poses (R, 7) of the object each of M captured references is asked for.
 
-    Their wrist must stay over the table, and the hand out of it but for what captures are off by. Where no resting pose
-    allows that, it is the one in which the hand is least deep in the table.
+    Their wrist must stay over the table, and the hand out of it, as with other references. Where no resting pose allows
+    that, because captured hands are off by a centimetre, it is the one in which the hand is least deep in the table.
 
     Args:
       hand: whose references these are.
@@ -235,7 +233,7 @@ def _resting_poses(
     rests = np.stack([rest] * len(position))
     clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, rests))
     height = np.where(clear, height_over_table(hand, q, position, quaternion, rests), -np.inf)
-    return clear & (height >= np.minimum(-_CAPTURE_ERROR, height.max(1, keepdims=True)))
+    return clear & (height >= np.minimum(-SOFT, height.max(1, keepdims=True)))
 
 
 def _set(
