@@ -2,8 +2,11 @@
 
 import os
 import sys
+import tempfile
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Nobody's own hands and policies.
+os.environ["XDG_CONFIG_HOME"] = os.path.join(tempfile.gettempdir(), "congrasp-tests-without-configuration")
 # Every compiled program is kept, so that neither the other modules nor the processes that tests start compile it again.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # Most of the time goes into compiling programs that run for a moment.

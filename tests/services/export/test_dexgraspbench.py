@@ -330,7 +330,8 @@ def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(monkeypatch):
     q = grip.q.astype(float)
     closed = np.clip(q + 0.14 * np.sign(hand.q_closed - hand.q_open), hand.lower, hand.upper)
     grasp = dexgraspbench.State(np.zeros(3), still, q)
-    afar = dexgraspbench.State(np.array([0.0, 0.0, -0.5]), still, hand.q_open.astype(float))
+    # Where no push along an axis brings the box.
+    afar = dexgraspbench.State(np.array([-0.5, -0.5, -0.5]), still, hand.q_open.astype(float))
     held = dexgraspbench.Grasp(
         name="held",
         hand=hand,

@@ -195,7 +195,7 @@ def test_the_arrow_is_placed_by_a_click_and_turned_by_its_tail(opened: Any, site
     assert 0.05 < angle < 1.5
     opened.fill("#roll-number", "45")
     opened.press("#roll-number", "Enter")
-    eventually(lambda: site.studio["roll_deg"] == 45.0)
+    eventually(lambda: site.studio["roll_deg"] == 45.0 and opened.input_value("#roll") == "45")
     opened.focus("#roll")
     opened.keyboard.press("ArrowRight")
     eventually(lambda: site.studio["roll_deg"] > 45.0 and opened.input_value("#roll-number") != "45")
