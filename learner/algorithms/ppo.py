@@ -48,6 +48,7 @@ _CHECKED = (
 _FINE = -1  # no term was non-finite; otherwise an index into _CHECKED
 _UNREASONABLE_KL = 10.0  # nats between the policies before and after an update; a hundredth of one is aimed at
 _RATE_FACTOR = 1.5
+_TRUSTED_KL = 4.0  # targets; from a minibatch that sees the policy farther away the policy takes no step
 
 Learnt = tuple[Params, Any, Array]
 """Parameters, the optimiser's state and the random key: the entries of a `TrainState` that live on the device."""
@@ -97,6 +98,9 @@ class PPO:
         self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None
     ) -> tuple[TrainState, dict[str, float]]:
         """Epochs of minibatches over a batch; see `Algorithm.update`.
+
+        Where the policy is several KL targets from the proximal one already, the critic alone learns: a policy of small
+        standard deviations, such as one that a run began with, outlives a learning rate that is too large for it.
 
         The normalisers are frozen during the update and take the batch in afterwards; only the first batch is also what
         the first update normalises by. The critic's output layer is adapted to the moved value statistics so that its
@@ -345,6 +349,8 @@ def _epochs(
             norms["critic"],
         )
         steps, optimizer = transform.update(gradients, optimizer, params)
+        trusted = terms.kl <= _TRUSTED_KL * hyper["kl_target"]
+        steps = {**steps, "actor": jax.tree.map(lambda leaf: jnp.where(trusted, leaf, 0.0), steps["actor"])}
         return (optax.apply_updates(params, steps), optimizer, failure), (terms, norms)
 
     def epoch(carry: tuple[Params, Any, Array], key: Array):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from common.config import PPOConfig
 from common.errors import CongraspError, PhysicsError
@@ -124,6 +125,32 @@ def test_a_run_that_settles_lowers_its_rate_in_its_last_update():
         moved, _ = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
         rates[version] = float(moved.optimizer.hyperparams["learning_rate"])
     np.testing.assert_allclose(rates[0] / rates[8], 1.5, rtol=1e-6)
+
+
+def test_a_policy_that_left_its_trust_region_waits_while_the_critic_learns():
+    """With one minibatch, the second epoch sees what the first one's step did."""
+    batch = rollout(toy.bundle_of(fresh()), 0)
+    moved = []
+    for epochs, target in ((1, 1e-7), (2, 1e-7), (2, 1.0)):
+        state, _ = changed(minibatches=1, epochs=epochs, kl_target=target).update(fresh(), batch)
+        moved.append({name: np.asarray(ravel_pytree(tree)[0]) for name, tree in state.params.items()})
+    once, held, free = moved
+    np.testing.assert_allclose(held["actor"], once["actor"], rtol=1e-4, atol=1e-7)
+    assert np.abs(free["actor"] - once["actor"]).max() > 1e-5
+    assert np.abs(held["critic"] - once["critic"]).max() > 1e-5
+
+
+def test_a_rate_that_is_too_large_for_a_settled_policy_does_not_break_it():
+    """Standard deviations of a hundredth; without the trust region the first update is out of all reason."""
+    algorithm, state = changed(learning_rate=1e-3, kl_target=0.012), fresh()
+    actor = {**state.params["actor"], "log_std": jnp.full_like(state.params["actor"]["log_std"], np.log(0.01))}
+    state = state._replace(params={**state.params, "actor": actor})
+    rates = []
+    for seed in range(6):
+        state, metrics = algorithm.update(state, rollout(toy.bundle_of(state), seed))
+        assert metrics["kl"] < 3.0
+        rates.append(metrics["learning_rate"])
+    assert rates[-1] < rates[0] / 2
 
 
 def test_learning_rate_stays_in_its_range():
