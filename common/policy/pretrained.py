@@ -27,14 +27,20 @@ def own_policy_file(name: str) -> pathlib.Path:
 
 
 def named_policy(name: str | os.PathLike[str]) -> pathlib.Path:
-    """The policy file of this path, or the pretrained one of the hand of this name.
+    """The policy file of this path, or the pretrained one of this name (`allegro-student`) or of this hand.
 
     Raises:
       CongraspError: there is no such hand, or no policy for it.
     """
     path = pathlib.Path(name)
-    by_hand = str(name) in HANDS or not (path.suffix or path.exists())
-    return policy_file(None, str(name)) if by_hand else path
+    by_hand = str(name) in HANDS or not (path.suffix or path.exists() or _packaged(path))
+    return policy_file(None if by_hand else path, str(name))
+
+
+def _packaged(name: pathlib.Path) -> pathlib.Path | None:
+    """The policy file of this name that comes with the package, unless a file here has that name."""
+    file = _FOLDER / f"{name}{SUFFIX}"
+    return file if len(name.parts) == 1 and not name.exists() and file.exists() else None
 
 
 def reference_file(hand: str) -> pathlib.Path | None:
@@ -55,12 +61,12 @@ def hands_with_policy() -> list[str]:
 
 
 def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path:
-    """The policy file that a command was given, or the pretrained one for this hand.
+    """The policy file that a command was given, by path or by a name in the package, or else the pretrained one.
 
     Raises:
       CongraspError: neither is there, there is no such hand, or the user's own policy is of another hand of its name.
     """
-    path = given or pretrained_file(hand)
+    path = (_packaged(given) or given) if given else pretrained_file(hand)
     if not given and path is not None and (own := get_hand(hand)).text and bundles.load(path).spec.hand != own.text:
         raise CongraspError(
             f"{path} was trained for another hand of this name, or before the hand's file was changed.",

@@ -21,7 +21,7 @@ def policy(
     hand's MuJoCo model. docs/exports.md says how to use it; examples/onnx_grasp.py does.
 
     Args:
-      policy: The policy file (.safetensors); the pretrained one otherwise.
+      policy: The policy file (.safetensors), or 'allegro-student'; the pretrained one otherwise.
       hand: Whose pretrained policy.
       to: The format.
       out: The file to write; policy.onnx or policy.stablehlo.zip otherwise.

@@ -66,7 +66,7 @@ def grasp(
       constraint: What the grasp must keep to.
       video: Also write grasp.mp4, at half speed, with the constraints drawn.
       pictures: Write pictures.
-      policy: A policy file; by default the one that comes with the package.
+      policy: A policy file, or 'allegro-student'; by default the hand's that comes with the package.
       hand: Hand whose pretrained policy is taken.
       attempts: How many are simulated side by side, 1024 at most.
       seed: Draws what is attempted.

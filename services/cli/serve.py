@@ -20,7 +20,8 @@ def serve(
     """Answer live queries with a policy file, or with the newest policy of a run while it trains.
 
     Args:
-      policy: A policy file, read again whenever it changes; by default the one that comes with congrasp.
+      policy: A policy file, read again whenever it changes, or 'allegro-student', which needs no more than a robot has;
+        by default the policy that comes with congrasp.
       hand: Hand of the policy that comes with congrasp.
       connect: A learner's endpoint to follow instead of a file.
       run: Name of the run to follow.

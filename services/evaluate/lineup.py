@@ -62,7 +62,7 @@ def read_entrant(file: pathlib.Path, method: str | None = None) -> Entrant:
 
 
 def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entrant]:
-    """Policies that a user names: FILE, METHOD=FILE, or a folder of runs (or one run), of which each has a policy.
+    """Policies that a user names: FILE, METHOD=FILE, a name in the package, or a folder of runs, each with a policy.
 
     Args:
       texts: what the user wrote.
@@ -77,7 +77,7 @@ def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entra
         if not path.exists() and "=" in text:
             own, _, rest = text.partition("=")
             path = pathlib.Path(rest)
-        files = [path]
+        files = [policy_file(path)]
         if path.is_dir():
             files = sorted({*path.glob(_POLICY), *path.glob(f"*/{_POLICY}")})
             if not files:

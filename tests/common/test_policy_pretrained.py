@@ -14,11 +14,13 @@ from common.policy import bundle as bundles
 from common.policy import pretrained as module
 from common.policy.pretrained import (
     hands_with_policy,
+    named_policy,
     own_policy_file,
     policy_file,
     pretrained_file,
     pretrained_hands,
 )
+from services.evaluate.lineup import read_entrants
 from services.train.command import untrained
 
 ROOT = pathlib.Path(module.__file__).resolve().parents[2]
@@ -68,7 +70,23 @@ def test_what_is_shipped_is_installed_and_can_be_loaded():
     assert [module._FOLDER.relative_to(ROOT) / "*.safetensors"] == patterns
     assert pretrained_hands() == ["human", "allegro", "sharpa"]
     assert {path.stem for path in module._FOLDER.glob("*.safetensors")} == {
-        f"{hand}{kind}" for hand in pretrained_hands() for kind in ("", "-reference")
+        "allegro-student",
+        *(f"{hand}{kind}" for hand in pretrained_hands() for kind in ("", "-reference")),
     }
     for hand in pretrained_hands():
         assert bundles.load(policy_file(None, hand)).spec.hand == hand
+
+
+def test_a_policy_of_the_package_is_given_by_its_name(tmp_path, monkeypatch):
+    """Unless a file here has it."""
+    monkeypatch.chdir(tmp_path)
+    name = "allegro-student"
+    file = named_policy(name)
+    assert file == policy_file(pathlib.Path(name)) == module._FOLDER / f"{name}.safetensors"
+    student, teacher = bundles.load(file).task, bundles.load(policy_file(None, "allegro")).task
+    assert student.observation == "tracked" and student.hand == teacher.hand and student.control == teacher.control
+    (entrant,) = read_entrants([name])
+    assert (entrant.hand, entrant.method) == ("allegro", "student")
+    (tmp_path / name).touch()
+    assert policy_file(pathlib.Path(name)) == pathlib.Path(name)
+    assert policy_file(pathlib.Path("folder", name)) == pathlib.Path("folder", name)
