@@ -74,15 +74,6 @@ def _object_rotation(scene: Scene, earning: Earning) -> Array:
     return -jnp.minimum(turned**2, 1.0)
 
 
-def _wrist_effort(scene: Scene, earning: Earning) -> Array:
-    """Squared acceleration that the wrist's servos ask for, as a share of 10 m/s^2 and 100 rad/s^2."""
-    state, gains, (mass, inertia) = scene.state, scene.hand.wrist, scene.hand.wrist_inertia
-    ahead, speed = state.u_target - state.u, state.u_velocity
-    slides = (gains.slide_kp * ahead[..., :3] - gains.slide_kv * speed[..., :3]) / (mass * 10.0)
-    hinges = (gains.hinge_kp * ahead[..., 3:] - gains.hinge_kv * speed[..., 3:]) / (inertia * 100.0)
-    return -jnp.minimum(square(slides) + square(hinges), 10.0)
-
-
 def _drop(scene: Scene, earning: Earning) -> Array:
     """I_drop."""
     return -fallen(scene.task, scene.state).astype(jnp.float32)
@@ -126,13 +117,6 @@ GRASP: tuple[Term, ...] = (
         0.01,
         "w_u: per squared velocity of the six wrist joints (m/s and rad/s).",
         lambda scene, earning: -jnp.minimum(square(scene.state.u_velocity), 100.0),
-    ),
-    Term(
-        "wrist_effort",
-        0.0,
-        "Penalty per squared acceleration, in units of 10 m/s^2 and 100 rad/s^2, that the wrist's servos ask for "
-        "(ours, against a wrist that trembles while it holds).",
-        _wrist_effort,
     ),
     Term(
         "finger_deviation",

@@ -28,7 +28,8 @@ _ROWS = "report.json"
 _LARGEST = 1 << 24  # bytes of a file of rows
 _PATIENCE = 1800.0  # seconds of a check or a report
 _LINE_SECONDS = 10.0
-_RATE = 400_000  # trained steps a second of one H200
+_UPDATES = 560  # of the full task: with check and report, some 15 minutes of one H200
+_RATE = 350_000  # trained steps a second of one H200
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +131,8 @@ def _train(request: Request, note: Callable[[str], None]) -> pathlib.Path:
             said, told = time.monotonic(), line
             note(f"  {line}")
 
-    options = ["--physics", request.physics, *request.options] if request.full else request.options
+    full = ["--physics", request.physics, "--updates", str(_UPDATES)]
+    options = [*full, *request.options] if request.full else request.options
     train_in_background(request.run_dir, chosen, options, patience=request.patience, progress=progress)
     return request.run_dir / POLICY_FILE
 
@@ -179,9 +181,9 @@ def _run(request: Request, name: str, arguments: list[str], fine: tuple[int, ...
 def _what_a_gpu_would_take(request: Request) -> str:
     """What the short training leaves out."""
     full = get_preset(FULL, request.reference)
-    steps = full.updates * full.environments * full.rollout_steps * full.ppo.rollouts_per_update
+    steps = _UPDATES * full.environments * full.rollout_steps * full.ppo.rollouts_per_update
     return (
         "This machine has no GPU: a short training of an easier task follows, whose policy grasps from above at best. "
         f"On a GPU the same command trains the full task: {steps / 1e6:.0f} million steps, some "
-        f"{steps / _RATE / 60:.0f} minutes of one H200 and two to four for start and report."
+        f"{steps / _RATE / 60:.0f} minutes of one H200 and some five for start and report."
     )

@@ -80,8 +80,8 @@ def recipe(hand: Hand) -> RunConfig:
             p_trajectory=0.35,
             hold_steps_max=200,
             disturbed_references=0.5,
-            mass_range=(0.8, 1.25),
-            friction_range=(0.8, 1.2),
+            mass_range=(0.8, 1.6),
+            friction_range=(0.6, 1.2),
             reward=RewardWeights(force_max=own.force_max),
         ),
         # Grasps first, then the precision with which constraints are met: with the second weights from the beginning

@@ -166,18 +166,6 @@ def test_observation_blocks_by_hand():
     np.testing.assert_allclose(squash(np.array([[5.0, 0.0, 0.0]])), [[0.5, 0.0, 0.0]])
 
 
-def test_wrist_effort_is_what_the_servos_would_accelerate_by():
-    """5 m/s^2 beyond what keeps a speed are a quarter of the unit's square, 30 rad/s^2 nine hundredths; ten at most."""
-    state, surface, goal = scene(11)
-    (mass, inertia), gains = HAND.wrist_inertia, HAND.wrist
-    ahead = state.u_velocity * np.repeat([gains.slide_kv / gains.slide_kp, gains.hinge_kv / gains.hinge_kp], 3)
-    ahead[0, 1] += 5.0 * mass / gains.slide_kp
-    ahead[1, 4] -= 30.0 * inertia / gains.hinge_kp
-    ahead[2, 0] += 1.0
-    paid = REWARD(state._replace(u_target=np.float32(state.u + ahead)), surface, goal, UNIT)["wrist_effort"]
-    np.testing.assert_allclose(paid, [-0.25, -0.09, -10.0, 0.0], atol=2e-3)
-
-
 @pytest.mark.parametrize("near", [False, True])
 def test_reward_terms_against_numpy(near):
     """Far from its targets a hand pays the most that tracking can cost: 15 cm and half a radian."""
