@@ -71,6 +71,8 @@ class ControlConfig:
     0: any."""
     wrist_angular_acceleration: float = 150.0
     """The same about its hinges, rad/s^2."""
+    hold_acceleration: float = 1 / 3
+    """Share of both that is left when the table is gone, but for what slows the wrist down: it trembles less so."""
     lookahead: int = 1
     """Waypoints ahead of the nearest one that the guidance aims at (0 is the paper's ablation without feed-forward)."""
     follow_object: bool = False
@@ -407,8 +409,8 @@ def with_older_physics(task: Any) -> Any:
     control = task.get("control", {}) if isinstance(task, dict) else None
     if not isinstance(control, dict):
         return task
-    unlimited = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0}
-    return {"contact_time": 0.016, **task, "control": {**unlimited, **control}}
+    then = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0, "hold_acceleration": 1.0}
+    return {"contact_time": 0.016, **task, "control": {**then, **control}}
 
 
 def _no_constant(name: str) -> float:

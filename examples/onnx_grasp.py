@@ -217,12 +217,16 @@ class Grasp:
 
     def lead(self, ahead, residual, speed):
         """How far the wrist's targets are ahead of it, within its limits of speed and acceleration."""
+        table = self.time < self.meta["task"]["approach_steps"]
+        share = 1.0 if table else self.control["hold_acceleration"]
         found = []
         for part, kind in ((slice(0, 3), "position"), (slice(3, 6), "rotation")):
             servo, most = self.meta["wrist"][kind], self.control[f"guidance_{kind}_limit"]
             steady = servo["kv"] / servo["kp"] * speed[part]
             wanted = shorten(shorten(ahead[part], most) + residual[part], most)
-            hardest = servo["inertia"] / servo["kp"] * (self.control[servo["limit"]] or np.inf)
+            limit = self.control[servo["limit"]]
+            slowing = servo["kp"] / servo["kv"] * np.linalg.norm(speed[part])
+            hardest = servo["inertia"] / servo["kp"] * (np.clip(slowing, share * limit, limit) or np.inf)
             found.append(steady + shorten(wanted - steady, hardest))
         return np.concatenate(found)
 

@@ -1,5 +1,7 @@
 """From actions to joint targets: incremental fingers and feed-forward wrist guidance (paper, section Control Space)."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
@@ -20,6 +22,7 @@ jax.tree_util.register_dataclass(
         "guidance_rotation_limit",
         "wrist_acceleration",
         "wrist_angular_acceleration",
+        "hold_acceleration",
     ],
     meta_fields=["lookahead", "follow_object", "finger_guidance"],
 )
@@ -55,38 +58,58 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     q_target = joint_positions(hand, jnp.clip(motors, *motor_limits(hand)))
     ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
     gains, (mass, inertia) = hand.wrist, hand.wrist_inertia
-    slides = _lead(
-        ahead[..., :3],
-        control.wrist_position_scale * action[..., fingers : fingers + 3],
-        state.u_velocity[..., :3] * (gains.slide_kv / gains.slide_kp),
-        control.guidance_position_limit,
-        control.wrist_acceleration * (mass / gains.slide_kp),
+    slides = _Servo(
+        gains.slide_kp / mass, gains.slide_kv / mass, control.guidance_position_limit, control.wrist_acceleration
     )
-    hinges = _lead(
-        ahead[..., 3:],
-        control.wrist_rotation_scale * action[..., fingers + 3 :],
-        state.u_velocity[..., 3:] * (gains.hinge_kv / gains.hinge_kp),
+    hinges = _Servo(
+        gains.hinge_kp / inertia,
+        gains.hinge_kv / inertia,
         control.guidance_rotation_limit,
-        control.wrist_angular_acceleration * (inertia / gains.hinge_kp),
+        control.wrist_angular_acceleration,
     )
-    return Action(q_target, state.u + jnp.concatenate([slides, hinges], -1))
+    share = jnp.where(state.table, 1.0, control.hold_acceleration)
+    leads = [
+        _lead(servo, ahead[..., part], scale * action[..., fingers:][..., part], state.u_velocity[..., part], share)
+        for servo, scale, part in (
+            (slides, control.wrist_position_scale, slice(0, 3)),
+            (hinges, control.wrist_rotation_scale, slice(3, 6)),
+        )
+    ]
+    return Action(q_target, state.u + jnp.concatenate(leads, -1))
 
 
-def _lead(ahead: Array, residual: Array, steady: Array, farthest: Array | float, hardest: Array | float) -> Array:
+class _Servo(NamedTuple):
+    """Three wrist joints' servos: a = stiffness (target - u) - damping v."""
+
+    stiffness: Array | float
+    """kp / m, 1/s^2."""
+    damping: Array | float
+    """kv / m, 1/s."""
+    farthest: float
+    """Greatest lead of the target, m or rad."""
+    hardest: float
+    """Greatest acceleration, m/s^2 or rad/s^2; 0 for any."""
+
+
+def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: Array) -> Array:
     """How far (B, 3) the target is ahead of three wrist joints.
 
-    A servo moves a mass m by m a = kp (target - u) - kv v: at a target that is kv v / kp ahead it goes on at its speed,
-    and a target r from there accelerates it by kp r / m.
+    At a target that is damping v / stiffness ahead a joint goes on at its speed; one r from there accelerates it by
+    stiffness r. By v stiffness / damping it comes to rest along its guidance, however small the share.
 
     Args:
+      servo: of the joints.
       ahead: (B, 3) how far the guidance is ahead.
       residual: (B, 3) what the action adds.
-      steady: (B, 3) kv v / kp.
-      farthest: length of the lead.
-      hardest: m / kp times the greatest acceleration; 0 for any.
+      velocity: (B, 3) of the joints.
+      share: (B,) of the greatest acceleration, for all but coming to rest.
     """
-    wanted = _limit(_limit(ahead, farthest) + residual, farthest)
-    return steady + _limit(wanted - steady, jnp.where(jnp.asarray(hardest) > 0, hardest, jnp.inf))
+    rate, hardest = servo.stiffness / servo.damping, jnp.asarray(servo.hardest)
+    steady = velocity / rate
+    slowing = rate * jnp.linalg.norm(velocity, axis=-1)
+    most = jnp.clip(slowing, share * hardest, hardest)[..., None] / servo.stiffness
+    wanted = _limit(_limit(ahead, servo.farthest) + residual, servo.farthest)
+    return steady + _limit(wanted - steady, jnp.where(hardest > 0, most, jnp.inf))
 
 
 def _finger_guidance(scene: Scene, rate: float) -> Array:

@@ -228,8 +228,8 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     np.testing.assert_array_equal(one.action, other.action)
     np.testing.assert_array_equal(one.episodes, other.episodes)
     np.testing.assert_array_equal(bare.action, one.action)
-    # A program without the probe may round the last bit otherwise.
-    np.testing.assert_array_max_ulp(bare.episodes, one.episodes, 4)
+    # A program without the probe may round otherwise, and what is left of two lengths is as wrong as these are.
+    np.testing.assert_allclose(bare.episodes, one.episodes, rtol=1e-5, atol=1e-6)
     assert one.terminal[-1].all() and one.has_episode.all() and other.has_episode.all() and not other.terminal.any()
     rest = measured.collect(None, after)
     np.testing.assert_array_equal(rest.episodes, one.episodes)

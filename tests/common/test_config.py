@@ -24,9 +24,10 @@ def test_a_run_of_before_a_setting_keeps_what_held_then():
     config = RunConfig()
     older = json.loads(to_json(config))
     del older["task"]["contact_time"]
-    for name in ("wrist_acceleration", "wrist_angular_acceleration"):
+    then = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0, "hold_acceleration": 1.0}
+    for name in then:
         del older["task"]["control"][name]
-    control = dataclasses.replace(config.task.control, wrist_acceleration=0.0, wrist_angular_acceleration=0.0)
+    control = dataclasses.replace(config.task.control, **then)
     task = dataclasses.replace(config.task, contact_time=0.016, control=control)
     assert run_config_from_json(json.dumps(older)) == dataclasses.replace(config, task=task)
 

@@ -126,6 +126,7 @@ def test_a_policy_of_before_a_setting_keeps_what_held_then(bundle):
     older = PolicyBundle.from_message(Message(message.arrays, {**message.meta, "task": task}))
     assert older.task.contact_time == 0.016
     assert older.task.control.wrist_acceleration == older.task.control.wrist_angular_acceleration == 0
+    assert older.task.control.hold_acceleration == 1
     assert PolicyBundle.from_message(message).task == bundle.task
 
 
