@@ -99,7 +99,12 @@ def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
 
 
 def hand_hand(hand: Hand, transforms: tuple[Array, Array]) -> Array:
-    """(B,) deepest overlap in metres of two links.
+    """(B,) deepest of the `overlaps` in metres; 0 where there is none."""
+    return jnp.maximum(jnp.max(overlaps(hand, transforms), -1), 0.0)
+
+
+def overlaps(hand: Hand, transforms: tuple[Array, Array]) -> Array:
+    """(..., Q) by how much two capsules of different links overlap, in metres; negative where they are apart.
 
     Pairs are those that collide in the hand's model with `hand_self_collision`: not a link with its parent, nor those
     whose capsules nest in one another while the hand is open or at zero (`common.hands.mjcf.overlapping`).
@@ -113,7 +118,7 @@ def hand_hand(hand: Hand, transforms: tuple[Array, Array]) -> Array:
     apart = segment_distance(
         ends[..., first, 0, :], ends[..., first, 1, :], ends[..., second, 0, :], ends[..., second, 1, :]
     )
-    return jnp.maximum(jnp.max(radii[first] + radii[second] - apart, -1), 0.0)
+    return radii[first] + radii[second] - apart
 
 
 def hand_table(hand: Hand, transforms: tuple[Array, Array], wrist_position: Array, wrist_quaternion: Array) -> Array:

@@ -167,7 +167,7 @@ def import_captures(
             known,
             options,
             format,
-            lambda name: progress.update(task, description=f"Reading {name}", advance=1),
+            lambda doing: progress.update(task, description=doing, advance=1),
         )
     report = made[-1]
     if not report.kept and not report.dropped:
@@ -220,6 +220,14 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
             f"({worst['sequence']})."
         )
     if kept:
+        if apart := [row for row in kept if row["moved_apart_rad"]]:
+            deep, moved = (max(apart, key=lambda row: row[name]) for name in ("overlap_m", "moved_apart_rad"))
+            mean = sum(row["moved_apart_rad"] for row in apart) / len(apart)
+            print(
+                f"Fingers of {len(apart)} lay inside one another, {1e3 * deep['overlap_m']:.1f} mm deep at most "
+                f"({deep['sequence']}). They were moved apart: their farthest joint by {mean:.2f} rad on average, "
+                f"{moved['moved_apart_rad']:.2f} rad at most ({moved['sequence']})."
+            )
         above = sum(row["clear_of_table"] for row in kept)
         sets = len({row["object"] for row in kept})
         print(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")

@@ -22,7 +22,8 @@ from common.task.bank import ConstraintBank
 from common.task.sampling.headings import Headings
 from common.wire.codec import Message
 from services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
-from services.assets.captures.objects import load_object
+from services.assets.captures.objects import import_meshes
+from services.assets.captures.separate import deepest, separated
 from services.assets.captures.sequence import Dropped, Sequence
 from services.assets.captures.transfer import demonstrated_headings, transferred
 from services.assets.objects.affordance import near_points, relabelled, two_parts
@@ -31,6 +32,7 @@ from services.assets.objects.sources import safe_name
 from services.grasp.constraint_sets import for_training, set_of
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
+_Shapes = dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
 _TOUCHED = 0.03
 """Metres around touched points that count as touched."""
 _VERTICES = 3
@@ -83,7 +85,7 @@ def import_sets(
     hand: Hand,
     options: Options,
     source: str,
-    progress: Callable[[str], None] = lambda name: None,
+    progress: Callable[[str], None] = lambda doing: None,
 ) -> tuple[list[GraspObject], list[Message], Report]:
     """Objects and their constraint sets.
 
@@ -92,33 +94,36 @@ def import_sets(
       hand: whose constraints these are; any but the human one follows the demonstrations by its grasp axes.
       options: see there.
       source: name of the data set.
-      progress: is told each sequence's name.
+      progress: is told what is being done, for people.
 
     Returns:
       Objects and, in the same order, their sets; and what was kept and dropped.
     """
     report = Report()
-    shapes: dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError] = {}
+    read = []
+    for item in sequences:
+        progress(f"Reading {item.name}")
+        read.append(item)
+    shapes = _shapes([item for item in read if isinstance(item, Sequence)], progress)
     groups: dict[str, _Group] = {}
     beyond = options.beyond if hand is HUMAN else np.inf
-    for item in sequences:
+    for item in read:
         try:
             if isinstance(item, Dropped):
                 raise item
-            progress(item.name)
+            progress(f"Grasp of {item.name}")
             obj, surface = _shape(item, shapes)
             demonstration = extract(item, obj, surface, options.waypoints, beyond)
             labelled = _labelled(item, obj, demonstration, options.affordance)
             groups.setdefault(labelled.name, _Group(labelled)).demonstrations.append(demonstration)
         except Dropped as dropped:
-            progress(dropped.name)
             report.drop(dropped)
     objects, sets = [], []
     # Sets may be of one sequence each: 80 % are those of all sequences, not of each set's.
     splits = _split(groups.values(), options.seed)
     for number, (group, training) in enumerate(zip(groups.values(), splits, strict=True)):
         try:
-            obj, made = _set(hand, group, options, number, source, training)
+            obj, made, given = _set(hand, group, options, number, source, training)
         except CongraspError as error:
             for demonstration in group.demonstrations:
                 report.drop(Dropped(demonstration.name, "object out of reach", str(error)))
@@ -126,6 +131,7 @@ def import_sets(
         objects.append(obj)
         sets.append(made)
         usable, below = made.arrays["pose/allowed"].any((0, 1)), _from_below(made)
+        overlap, moved = np.asarray(deepest(hand, given)), np.abs(made.arrays["pose/q"][0] - given).max(-1)
         for m, demonstration in enumerate(group.demonstrations):
             report.kept.append(
                 {
@@ -135,6 +141,8 @@ def import_sets(
                     "first_frame": demonstration.start,
                     "residual_rad": round(demonstration.fit.angle, 5),
                     "residual_tip_m": round(demonstration.fit.tip, 5),
+                    "overlap_m": round(float(overlap[m]), 5),
+                    "moved_apart_rad": round(float(moved[m]), 5),
                     "touched_points": len(demonstration.contact),
                     "clear_of_table": bool(usable[m]),
                     "from_below": bool(below[m]),
@@ -150,18 +158,22 @@ def _split(groups: Collection[_Group], seed: int) -> list[np.ndarray]:
     return np.split(for_training(int(ends[-1]), seed), ends[:-1]) if len(ends) else []
 
 
-def _shape(
-    sequence: Sequence, shapes: dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
-) -> tuple[GraspObject, Surface]:
-    """The object of a sequence's mesh and its surface, imported once."""
-    if sequence.mesh not in shapes:
-        try:
-            obj = load_object(sequence.mesh, safe_name(sequence.object_name))
+def _shapes(sequences: list[Sequence], progress: Callable[[str], None]) -> _Shapes:
+    """The objects of the sequences' meshes and their surfaces, or why a mesh cannot be used; each imported once."""
+    names = {sequence.mesh: safe_name(sequence.object_name) for sequence in reversed(sequences)}
+    shapes: _Shapes = {}
+    for mesh, obj in import_meshes(names, lambda name: progress(f"Mesh of {name}")).items():
+        if isinstance(obj, CongraspError):
+            shapes[mesh] = obj
+        else:
             # Without labelled parts the whole surface may be grasped.
             obj = dataclasses.replace(obj, graspable=np.ones_like(obj.graspable))
-            shapes[sequence.mesh] = obj, Surface(obj)
-        except CongraspError as error:
-            shapes[sequence.mesh] = error
+            shapes[mesh] = obj, Surface(obj)
+    return shapes
+
+
+def _shape(sequence: Sequence, shapes: _Shapes) -> tuple[GraspObject, Surface]:
+    """The object of a sequence's mesh and its surface."""
     found = shapes[sequence.mesh]
     if isinstance(found, CongraspError):
         raise Dropped(sequence.name, "unusable mesh", str(found))
@@ -238,8 +250,8 @@ def _resting_poses(
 
 def _set(
     hand: Hand, group: _Group, options: Options, number: int, source: str, training: np.ndarray
-) -> tuple[GraspObject, Message]:
-    """The object, and its constraint set in the size in which the hand grasps it.
+) -> tuple[GraspObject, Message, np.ndarray]:
+    """The object, its constraint set in the size in which the hand grasps it, and the fingers (M, F) it was made of.
 
     Args:
       hand: whose constraints these are.
@@ -265,7 +277,8 @@ def _set(
         posed = tuple(np.stack([getattr(d, x) for d in demonstrations]) for x in ("q", "position", "quaternion"))
     else:
         posed = transferred(hand, demonstrations, fitting, scale)
-    q, position, quaternion = (values.astype(np.float32) for values in posed)
+    given_q, position, quaternion = (values.astype(np.float32) for values in posed)
+    q = separated(hand, given_q)
     clear = _resting_poses(hand, q, position, quaternion, fields["rest"])
     nearer = _ends_nearer_to_graspable(position[:, -1], fields["points"], fields["avoid"])
     row = ConstraintBank(
@@ -288,7 +301,8 @@ def _set(
     }
     # Demonstrated headings repeat, and each belongs where its demonstration does.
     own = np.resize(training, HEADINGS) if given else None
-    return obj, set_of(hand, row, fitting, options.seed, about, pose_training=training, heading_training=own)
+    made = set_of(hand, row, fitting, options.seed, about, pose_training=training, heading_training=own)
+    return obj, made, given_q
 
 
 def _from_below(made: Message) -> np.ndarray:

@@ -4,6 +4,7 @@ The paper leaves some terms open; here they mean:
 
 * wrist-object distance: from the wrist's origin to the nearest point of the object's surface;
 * contact: a finger's skin within `CONTACT` of the surface, or below it;
+* carried: the object has moved by `CARRIED`, and the wrist by less than half as much against it;
 * continuous: the wrist moves at most `JUMP` between two frames, and at most `GAP` frames in a row are missing;
 * too complex: the path is more than `DETOUR` times its straight line, or the wrist turns by more than `TURN` in all.
 """
@@ -34,6 +35,8 @@ DETOUR = 2.0
 TURN = 2.5
 DIP = 0.01
 """Metres by which the distance may fall, going backwards, before its maximum counts as passed."""
+CARRIED, STILL = 0.03, 0.01
+"""Metres by which a carried object has moved, and those within which it still was in its place."""
 BEYOND = 0.1
 _RADII = np.array([[0.010] * 3, *[[0.009, 0.0075, 0.0075]] * 3, [0.009, 0.0065, 0.0065]])
 """(5, 3) m, skin radius of each bone: those that GraspXL gives the MANO hand."""
@@ -80,7 +83,7 @@ class Demonstration:
     quaternion: np.ndarray
     """(K, 4)."""
     contact: np.ndarray
-    """(n, 3) points of the object's surface that fingers touch in the grasping frame."""
+    """(n, 3) points of the object's surface that fingers touch as soon as their contact is stable."""
 
 
 def extract(
@@ -107,7 +110,8 @@ def extract(
         reason = f"the wrist stays {nearest:.3g} m from the object: are its positions in metres?"
         raise Dropped(sequence.name, "wrong units", reason)
     skin = position[:, None, None] + np.einsum("tij,tfkj->tfki", rotation, sequence.joints)
-    frame = _grasping_frame(sequence, surface, skin)
+    touched = _grasping_frame(sequence, surface, skin)
+    frame = touched if sequence.grasp is not None else _before_carried(sequence, position, touched)
     start, path, turns = approach(sequence.name, position, rotation, far, sequence.present, frame, waypoints)
     found = _fit(sequence, frame)
     _check_limits(sequence.name, found.q, beyond)
@@ -119,7 +123,7 @@ def extract(
         q=np.clip(found.q, HUMAN.lower, HUMAN.upper),
         position=path,
         quaternion=turns,
-        contact=surface.within(*_skin_balls(skin[frame], CONTACT)),
+        contact=surface.within(*_skin_balls(skin[touched], CONTACT)),
     )
 
 
@@ -189,6 +193,24 @@ def _grasping_frame(sequence: Sequence, surface: Surface, skin: np.ndarray) -> i
             f"{', '.join(ever) or 'none'})",
         )
     return int(np.argmax(stable))
+
+
+def _before_carried(sequence: Sequence, position: np.ndarray, frame: int) -> int:
+    """The frame, or the last before it in which the object was where it was picked up, if the hand has carried it.
+
+    Skin that is a little off touches late. By then the hand may be where the table would be, were the object on it, and
+    its way there is no approach.
+
+    Args:
+      sequence: of frames.
+      position: (T, 3) of the wrist, m, object frame.
+      frame: of stable contact.
+    """
+    known = np.flatnonzero(sequence.present[: frame + 1])
+    moved = np.linalg.norm(sequence.object_position[known] - sequence.object_position[frame], axis=-1)
+    picked = int(known[moved >= moved.max() - STILL][-1])
+    slid = np.linalg.norm(position[picked] - position[frame])
+    return picked if moved.max() > CARRIED and slid < moved.max() / 2 else frame
 
 
 def _bones(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,14 +2,15 @@
 
 import dataclasses
 import pathlib
+from collections.abc import Callable, Mapping
 
 from common.errors import CongraspError
 from common.inputs import file_name
 from common.objects.spec import GraspObject
 from services.assets.captures.sequence import Dropped
-from services.assets.objects.meshes import import_source
+from services.assets.objects.meshes import import_sources
 from services.assets.objects.options import ImportOptions
-from services.assets.objects.sources import SUFFIXES, find_sources
+from services.assets.objects.sources import SUFFIXES, Source, find_sources
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +58,39 @@ class Meshes:
         return None
 
 
-def load_object(mesh: pathlib.Path, name: str) -> GraspObject:
-    """The object of a mesh in metres, under a data set's name; imports are remembered.
+def import_meshes(
+    meshes: Mapping[pathlib.Path, str], progress: Callable[[str], None]
+) -> dict[pathlib.Path, GraspObject | CongraspError]:
+    """The objects of meshes in metres, one for each core at a time; imports are remembered.
+
+    Args:
+      meshes: files, or folders, and the data set's names of their objects.
+      progress: is told each object's name once it is there, and how many there are.
+
+    Returns:
+      The object of each mesh, or why it cannot be used.
+    """
+    sources, found = {}, dict[pathlib.Path, GraspObject | CongraspError]()
+    for mesh, name in meshes.items():
+        try:
+            sources[mesh] = _source(mesh, name)
+        except CongraspError as error:
+            found[mesh] = error
+    paths = list(sources)
+    made = import_sources([sources[path] for path in paths], ImportOptions(unit="m"))
+    for done, (i, outcome) in enumerate(made, 1):
+        found[paths[i]] = outcome
+        progress(f"{meshes[paths[i]]} ({done} of {len(paths)})")
+    return found
+
+
+def _source(mesh: pathlib.Path, name: str) -> Source:
+    """The files of one object, under a data set's name.
 
     Raises:
-      CongraspError: the mesh cannot be used, or is a folder of several objects.
+      CongraspError: there are none, or those of several objects.
     """
     sources = find_sources(mesh)
     if len(sources) > 1:
         raise CongraspError(f"{mesh} holds {len(sources)} objects.", "Name the folder of one, or its file.")
-    return import_source(dataclasses.replace(sources[0], name=name), ImportOptions(unit="m"))
+    return dataclasses.replace(sources[0], name=name)

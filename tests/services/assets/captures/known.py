@@ -11,6 +11,7 @@ from common.hands.human import HUMAN
 from common.hands.mano import MANO_FINGERS
 from services.assets.captures.fit import joint_positions
 from services.assets.captures.mano import TO_HUMAN
+from services.assets.captures.separate import separated
 from services.assets.hands.kinematics import mujoco_link_poses
 
 FRAMES, GRASP = 90, 60
@@ -20,9 +21,9 @@ ORIGIN = np.array([0.02, -0.01, 0.03])
 
 
 def q_closed(rng: np.random.Generator) -> np.ndarray:
-    """(20,) a pinch within the limits, a little different each time."""
+    """(20,) a pinch within the limits, a little different each time, whose fingers are not in one another."""
     q = HUMAN.q_open + 0.35 * (HUMAN.q_closed - HUMAN.q_open) + rng.uniform(-0.05, 0.05, 20)
-    return np.clip(q, HUMAN.lower + 0.01, HUMAN.upper - 0.01)
+    return separated(HUMAN, np.clip(q, HUMAN.lower + 0.01, HUMAN.upper - 0.01)[None])[0]
 
 
 @dataclasses.dataclass

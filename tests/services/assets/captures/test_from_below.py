@@ -22,19 +22,22 @@ def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
 
 
 def test_the_report_names_them(capsys):
-    def row(name: str, *, clear: bool, below: bool) -> dict:
+    def row(name: str, *, clear: bool, below: bool, overlap: float = 0.0, moved: float = 0.0) -> dict:
         place = {"clear_of_table": clear, "from_below": below, "split": "held-out" if name == "dig" else "training"}
-        return {"sequence": name, "object": "box", "residual_rad": 0.0} | place
+        apart = {"overlap_m": overlap, "moved_apart_rad": moved}
+        return {"sequence": name, "object": "box", "residual_rad": 0.0} | place | apart
 
     kept = [
         row("lift", clear=True, below=False),
-        row("scoop", clear=False, below=True),
-        row("push", clear=False, below=False),
+        row("scoop", clear=False, below=True, overlap=0.004, moved=0.1),
+        row("push", clear=False, below=False, overlap=0.003, moved=0.2),
         row("dig", clear=False, below=True),
     ]
     _print_report(Report(kept), "human", pathlib.Path("sets"), pathlib.Path("objects"))
     said = capsys.readouterr().out
     assert "room for 1 of 4" in said
+    assert "of 2 lay inside one another, 4.0 mm deep at most (scoop)" in said
+    assert "by 0.15 rad on average, 0.20 rad at most (push)" in said
     assert "No episode is drawn from 2, whose hand comes from below, which no episode does: scoop, dig." in said
     assert "No episode is drawn from 1, whose hand comes too near to the table: push." in said
     assert "3 sequences are for training, 1 held out." in said

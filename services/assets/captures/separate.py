@@ -1,0 +1,79 @@
+"""Fingers of a reference pose that lie inside one another, moved apart.
+
+Captured hands have other bones and flesh than the hand that follows them, so that their angles put its fingers into one
+another: poses that no hand can hold.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+
+from common.hands.kinematics import link_transforms
+from common.hands.motors import transmission
+from common.hands.spec import Hand
+from common.task.plausibility import overlaps
+from common.task.types import Array
+
+DEEPEST = 0.001
+"""Metres that two links may be in one another: skin and flesh give way by as much."""
+_ITERATIONS = 100
+
+
+def separated(hand: Hand, q: np.ndarray) -> np.ndarray:
+    """The nearest finger angles whose links overlap by at most `DEEPEST`.
+
+    They minimise |q - q_0|^2 where no two links that may not overlap (`common.task.plausibility.overlaps`) do so by
+    more, by sequential quadratic programming. Motors move, so that joints that follow others, or share a tendon, still
+    do; all stay within their limits.
+
+    Args:
+      hand: any hand.
+      q: (M, F) rad, within the limits; poses that do not overlap by more are returned as they are.
+    """
+    deep = np.asarray(deepest(hand, q)) > DEEPEST
+    return np.stack([_apart(hand, row) if moved else row for row, moved in zip(q, deep, strict=True)])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def deepest(hand: Hand, q: Array) -> Array:
+    """(M,) m, how deep two links of the hand are in one another at finger angles (M, F); 0 where none is."""
+    return jnp.maximum(overlaps(hand, link_transforms(hand, q)).max(-1), 0.0)
+
+
+def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
+    """(F,) of one pose (F,)."""
+    own, motors = transmission(hand), range(len(hand.motors))
+    # Of each motor, how far it may go until the first of its joints is at a limit.
+    ends = np.sort([(limit - q) / own.ratio for limit in (hand.lower, hand.upper)], axis=0)
+    bounds = [(min(ends[0][own.motor == m].max(), 0.0), max(ends[1][own.motor == m].min(), 0.0)) for m in motors]
+    weight = np.bincount(own.motor, own.ratio**2)
+    found = minimize(
+        lambda way: (0.5 * weight @ way**2, weight * way),
+        np.zeros(len(weight)),
+        jac=True,
+        method="SLSQP",
+        bounds=bounds,
+        constraints={
+            "type": "ineq",
+            "fun": lambda way: np.asarray(_room(hand, q, way), float),
+            # Of two axes that meet, nothing says which way leads apart.
+            "jac": lambda way: np.nan_to_num(np.asarray(_room_change(hand, q, way), float)),
+        },
+        options={"maxiter": _ITERATIONS},
+    )
+    apart = np.clip(q + own.ratio * found.x[own.motor], hand.lower, hand.upper).astype(q.dtype)
+    before, after = deepest(hand, np.stack([q, apart]))
+    return apart if after < before else q
+
+
+def _room_of(hand: Hand, q: Array, way: Array) -> Array:
+    """(Q,) mm that two links may still come nearer, where motors have gone a way (M,) from angles (F,)."""
+    own = transmission(hand)
+    return 1e3 * (DEEPEST - overlaps(hand, link_transforms(hand, q + own.ratio * way[own.motor])))
+
+
+_room = jax.jit(_room_of, static_argnums=0)
+_room_change = jax.jit(jax.jacfwd(_room_of, 2), static_argnums=0)
