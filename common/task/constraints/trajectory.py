@@ -22,7 +22,7 @@ from common.task.constraints.base import (
 from common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
 from common.task.constraints.pose import heading_message
 from common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
-from common.task.sampling.disturbances import disturbed_way, disturbed_wrist
+from common.task.sampling.disturbances import disturbed_wrist
 from common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
@@ -87,10 +87,7 @@ class Trajectory(Constraint):
         index = draw.objects, draw.region, draw.reference["trajectory"]
         path = draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index]
         if draw.disturbance is not None:
-            way_key, wrist_key = jax.random.split(key)
-            up = rotations.to_matrix(draw.bank.rest[draw.objects, draw.rests, 3:])[..., 2, :]
-            way = disturbed_way(path[0], up, draw.disturbance, way_key)
-            path = disturbed_wrist(way, path[1], draw.disturbance, wrist_key)
+            path = disturbed_wrist(*path, draw.disturbance, key)
         return TrajectoryGoal(*path)
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:

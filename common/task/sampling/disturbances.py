@@ -21,12 +21,6 @@ WRIST = 0.01, 0.2
 """m and rad, largest standard deviation of the wrist's errors along and about each axis."""
 JITTER = 0.005
 """m, largest standard deviation of an independent error of every coordinate of every waypoint but the last."""
-ASIDE = 1.1
-"""rad, largest angle by which the way to the last waypoint is turned aside; less than a right angle."""
-SHORTER = 0.5
-"""Least share of that way's length that is left."""
-_OVER = 0.03
-"""m, how far a way that is turned begins over its end, if it did."""
 
 
 def disturbed_fingers(hand: Hand, q: Array, amount: Array, key: Array) -> Array:
@@ -65,28 +59,3 @@ def disturbed_wrist(position: Array, quaternion: Array, amount: Array, key: Arra
     jitter = jitter.at[:, -1].set(0.0)
     turn, last = jnp.broadcast_to(turn[:, None], quaternion.shape), position[:, -1:]
     return last + move[:, None] + rotations.rotate(turn, position - last) + jitter, rotations.multiply(turn, quaternion)
-
-
-def disturbed_way(position: Array, up: Array, amount: Array, key: Array) -> Array:
-    """Paths (B, K, 3) whose wrists come from elsewhere and from nearer, to the same end and as they were turned.
-
-    A way that would begin too low is turned to the opposite side: one of the two begins at least as far over its end as
-    the cosine of the angle leaves of its height.
-
-    Args:
-      position: m, object frame.
-      up: (B, 3) the world's upward direction there.
-      amount: (B,) between 0 and 1, share of the largest errors.
-      key: random key.
-    """
-    angle_key, side_key, share_key = jax.random.split(key, 3)
-    amount, last = amount[:, None], position[:, -1:]
-    way = position - last
-    axis = jnp.cross(way[:, 0], jax.random.normal(side_key, up.shape))
-    axis = axis / jnp.maximum(jnp.linalg.norm(axis, axis=-1, keepdims=True), 1e-9)
-    turn = (amount * ASIDE * jax.random.uniform(angle_key, amount.shape) * axis)[:, None]
-    there, back = (rotations.rotate(rotations.from_rotation_vector(sign * turn), way) for sign in (1.0, -1.0))
-    turned, opposite, before = (jnp.sum(one[:, 0] * up, -1) for one in (there, back, way))
-    low = (turned < jnp.minimum(before, _OVER)) & (opposite > turned)
-    share = 1 + amount * (jax.random.uniform(share_key, amount.shape, minval=SHORTER) - 1)
-    return last + share[..., None] * jnp.where(low[:, None, None], back, there)
