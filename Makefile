@@ -17,9 +17,10 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CACHE)/jax
 quickstart: install
 	$(VENV)/bin/congrasp train --preset quickstart
 
+# Three workers on two cores: many tests wait for processes that they start or kill.
 test: install
 	@tests/install_browser.sh $(VENV)/bin/python
-	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 2 --dist loadfile -m "not gpu" $(ARGS)
+	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 3 --dist loadfile -m "not gpu" $(ARGS)
 
 coverage:
 	$(MAKE) test ARGS="--cov --cov-report=term $(ARGS)"
