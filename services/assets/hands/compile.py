@@ -31,6 +31,8 @@ MAX_COUNT = 1000
 """Largest count of a replicate, composite or flexcomp in the file itself; nested ones meet the limits above."""
 LIMITS = {"nbody": 1000, "nv": 500, "ngeom": 10_000, "nmesh": 1000, "nmeshvert": 5_000_000, "nu": 1000, "neq": 1000}
 """Most parts of a model, by MuJoCo's names."""
+LEAST = 1e-3, 1e-7
+"""kg and kg m2, what a moving link without mass gets: of a file that has such links, no other has less."""
 _COUNTS = re.compile(r"""\bcount\s*=\s*["']([^"']*)["']""")
 _FINITE = (
     *(
@@ -146,7 +148,16 @@ def _compiled(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
         for mesh in missing:
             spec.delete(mesh)
         notes.append(_missing(len(missing)))
-    return spec.compile()
+    try:
+        return spec.compile()
+    except ValueError as error:
+        if "mass and inertia" not in str(error):
+            raise
+    spec.compiler.boundmass, spec.compiler.boundinertia = LEAST
+    model = spec.compile()
+    light = [model.body(i).name for i in np.flatnonzero(model.body_mass == LEAST[0])]
+    notes.append(f"links without mass get {1e3 * LEAST[0]:g} g ('<inertial>' in the file): {', '.join(light)}")
+    return model
 
 
 def _urdf(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
@@ -195,7 +206,10 @@ def _readable(file: pathlib.Path) -> bytes:
     if file.suffix.lower() in _NATIVE:
         return file.read_bytes()
     try:
-        return trimesh.exchange.stl.export_stl(trimesh.load_mesh(file))
+        scene = trimesh.load_scene(file)
+        # COLLADA states its unit. Its upward axis is left as it is, as ROS does.
+        scene = scene.convert_units("meters") if file.suffix.lower() == ".dae" else scene
+        return trimesh.exchange.stl.export_stl(scene.to_mesh())
     except Exception:  # whatever readers of many formats raise
         return b""
 

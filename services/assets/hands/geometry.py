@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from common.hands.spec import Capsule, Solid, vector
+from services.assets.hands.compile import LEAST
 
 _KINDS: dict[mujoco.mjtGeom, Literal["box", "cylinder", "capsule", "ellipsoid"]] = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
@@ -80,9 +81,9 @@ def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
 
 
 def inertia_box(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """World corners of the box with a body's mass and inertia, if it is as large as a link can be."""
+    """World corners of the box with a body's mass and inertia, if it has a mass and is as large as a link can be."""
     mass, (x, y, z) = model.body_mass[body], model.body_inertia[body]
-    if mass < 1e-4:
+    if mass <= LEAST[0]:
         return []
     half = np.sqrt(np.maximum(1.5 * np.array([y + z - x, x + z - y, x + y - z]) / mass, 0.0))
     if half.max() > _PLAUSIBLE[1] or half.max() < _PLAUSIBLE[0]:

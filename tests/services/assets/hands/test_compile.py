@@ -1,10 +1,13 @@
 """Robot descriptions that ask for more than a machine has."""
 
 import pathlib
+import re
 import time
 
 import mujoco
+import numpy as np
 import pytest
+import trimesh
 
 from common.errors import CongraspError
 from services.assets.hands import compile as compiling
@@ -53,3 +56,31 @@ def test_counts_that_multiply_meet_the_time_limit(tmp_path, monkeypatch):
     nested = '<replicate count="999">' * 3 + _GEOM + "</replicate>" * 3
     with pytest.raises(CongraspError, match=r"not read within 2 s|more than 3 GB"):
         compiled_model(_mjcf(tmp_path, nested), [])
+
+
+def test_links_without_mass_are_read_and_named(tmp_path):
+    """A hub between two joints: MuJoCo alone refuses a moving body without mass."""
+    inertia = '<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>'
+    link = '<link name="{}"><inertial><mass value=".1"/>' + inertia + "</inertial></link>"
+    joint = '<joint name="{0}{1}" type="revolute"><parent link="{0}"/><child link="{1}"/><axis xyz="0 0 1"/>'
+    robot = link.format("palm") + '<link name="hub"/>' + link.format("tip")
+    for one in (("palm", "hub"), ("hub", "tip")):
+        robot += joint.format(*one) + '<limit lower="0" upper="1" effort="1" velocity="1"/></joint>'
+    (tmp_path / "a.urdf").write_text(f'<robot name="a">{robot}</robot>')
+    model = compiled_model(tmp_path / "a.urdf", notes := [])
+    assert model.body("hub").mass == compiling.LEAST[0] and model.body("tip").mass == 0.1
+    assert model.nv == 2 and len(notes) == 1 and notes[0].endswith(": hub")
+
+
+def test_a_collada_mesh_in_millimetres_is_read_in_metres(tmp_path):
+    box = trimesh.exchange.dae.export_collada(trimesh.creation.box((20, 40, 60))).decode()
+    assert '<unit meter="1.0"' in box or "<unit" not in box
+    unit = '<unit name="millimeter" meter="0.001"/>'
+    box = re.sub(r"<unit[^>]*/>", unit, box) if "<unit" in box else box.replace("</asset>", unit + "</asset>")
+    (tmp_path / "box.dae").write_text(box)
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    shape = '<visual><geometry><mesh filename="package://a/box.dae"/></geometry></visual>'
+    (tmp_path / "a.urdf").write_text(f'<robot name="a"><link name="palm">{inertial}{shape}</link></robot>')
+    model = compiled_model(tmp_path / "a.urdf", notes := [])
+    np.testing.assert_allclose(sorted(np.ptp(model.mesh_vert, axis=0)), [0.02, 0.04, 0.06], rtol=1e-5)
+    assert notes == []
