@@ -95,9 +95,11 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
     ]
     counts = [len(part.vertices) for part in parts]
     starts = np.cumsum([0, *counts[:-1]])
+    normals = np.concatenate([part.vertex_normals for part in parts]).astype(np.float32)
+    normals[~normals.any(1)] = 0.0, 0.0, 1.0  # points of no face, or whose faces lie back to back
     return Skin(
         points=np.concatenate([part.vertices for part in parts]).astype(np.float32),
-        normals=np.concatenate([part.vertex_normals for part in parts]).astype(np.float32),
+        normals=normals,
         faces=np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]).astype(np.int32),
         weights=np.eye(len(parts), dtype=np.float32)[np.repeat(np.arange(len(parts)), counts)],
         origins=np.array([link_origin(link) for link in hand.links]),

@@ -18,6 +18,7 @@ LARGEST_FORCE = 40.0
 _REACH = 0.3  # rad of error at which a joint gives all its torque, where the file has no gain
 _SLACK = 0.3  # rad that a limited tendon may leave between two joints to count as a coupling
 _ROOM = 0.25  # least share of its range that a coupling leaves a joint
+_PULL = 0.05  # least share of a tendon's largest lever that counts
 _SLOW = 0.1  # s, longest time in which damping holds a joint back
 
 
@@ -42,30 +43,40 @@ class Follow:
     offset: float
 
 
-def servos(model: mujoco.MjModel) -> tuple[list[Servo], int]:
-    """The motors of joints and of fixed tendons, and how many muscles there are beside."""
-    found, muscles = [], 0
+def servos(model: mujoco.MjModel, notes: list[str]) -> list[Servo]:
+    """The motors of joints and of tendons; what is replaced or simplified is added to the notes."""
+    found, muscles, through_space, slopes = [], 0, 0, _slopes(model)
     for a in range(model.nu):
         kind, gear = mujoco.mjtTrn(model.actuator_trntype[a]), float(model.actuator_gear[a, 0])
         if model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
             muscles += 1
             continue
         target = int(model.actuator_trnid[a, 0])
-        if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+        of_joint = kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        if of_joint:
             joints = {target: 1.0}
-        elif kind == mujoco.mjtTrn.mjTRN_TENDON and (joints := _tendon(model, target)):
-            pass
+        elif kind == mujoco.mjtTrn.mjTRN_TENDON:
+            joints = _tendon(model, target)
+            if not joints:
+                through_space += 1
+                joints = _through_space(slopes[target])
         else:
             continue
         kp = max(0.0, -float(model.actuator_biasprm[a, 1])) * gear**2
         limit = float(np.abs(model.actuator_forcerange[a]).max()) if model.actuator_forcelimited[a] else 0.0
         if not limit and not kp and model.actuator_ctrllimited[a]:
             limit = float(np.abs(model.actuator_ctrlrange[a]).max() * abs(model.actuator_gainprm[a, 0]))
-        position = kp > 0 and model.actuator_ctrllimited[a] and gear == 1 and len(joints) == 1
+        position = kp > 0 and model.actuator_ctrllimited[a] and gear == 1 and of_joint
         position = position and np.isclose(model.actuator_gainprm[a, 0], kp)
         reach = tuple(model.actuator_ctrlrange[a] - model.qpos0[model.jnt_qposadr[target]]) if position else None
         found.append(Servo(joints, kp, limit * abs(gear), reach))  # type: ignore[arg-type]
-    return found, muscles
+    if muscles:
+        notes.append(f"{muscles} muscles move it in the file: here every joint has a motor")
+    if through_space:
+        notes.append(
+            f"{through_space} motors pull tendons through space: a straight line through their lengths is taken"
+        )
+    return found
 
 
 def couplings(model: mujoco.MjModel, hand: set[int], driven: set[int], notes: list[str]) -> list[Follow]:
@@ -162,6 +173,37 @@ def _tendon(model: mujoco.MjModel, t: int) -> dict[int, float]:
     return {int(model.wrap_objid[w]): float(model.wrap_prm[w]) for w in where}
 
 
+def _slopes(model: mujoco.MjModel) -> np.ndarray:
+    """(ntendon, njnt) m/rad, by how much tendons get longer over the range of a joint, the others in its middle."""
+    data = mujoco.MjData(model)
+    turning = np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (model.jnt_limited > 0))
+    where = model.jnt_qposadr[turning]
+    data.qpos[where] = model.jnt_range[turning].mean(1)
+    middle, slopes = data.qpos.copy(), np.zeros((model.ntendon, model.njnt))
+    for j, place in zip(turning, where, strict=True) if model.ntendon else ():
+        for end, sign in zip(model.jnt_range[j], (-1, 1), strict=True):
+            data.qpos[:] = middle
+            data.qpos[place] = end
+            mujoco.mj_fwdPosition(model, data)
+            slopes[:, j] += sign * data.ten_length / np.ptp(model.jnt_range[j])
+    return slopes
+
+
+def _through_space(slopes: np.ndarray) -> dict[int, float]:
+    """Coefficients of a tendon through space by joints, without those that it hardly pulls, from its slopes (njnt,)."""
+    least = _PULL * np.abs(slopes).max(initial=0.0)
+    return {int(j): float(slopes[j]) for j in np.flatnonzero(np.abs(slopes) > least)}
+
+
+def _shared_out(pulls: list[dict[int, float]]) -> list[dict[int, float]]:
+    """What motors pull if no joint hangs on two tendons: it stays with the motor that pulls it alone, or most."""
+    owner = {
+        j: max((k for k, pull in enumerate(pulls) if j in pull), key=lambda k: (len(pulls[k]) == 1, abs(pulls[k][j])))
+        for j in set[int]().union(*pulls)
+    }
+    return [{j: c for j, c in pull.items() if len(pull) == 1 or owner[j] == k} for k, pull in enumerate(pulls)]
+
+
 class Drive:
     """Gains of a hand's joints and motors from a file, and what had to be proposed for want of them."""
 
@@ -178,13 +220,10 @@ class Drive:
         self._model, self._names, self._levers = model, joints, levers
         self._inertia = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, self._inertia)
-        found, muscles = servos(model)
-        self._servos = [servo for servo in found if {*servo.joints} & {*joints}]
-        driven = {j for servo in self._servos for j in servo.joints if j in joints}
+        found = [servo for servo in servos(model, self.notes) if {*servo.joints} & {*joints}]
+        driven = {j for servo in found for j in servo.joints if j in joints}
         self.links = couplings(model, {*joints}, driven, self.notes)
         self._leaders = {link.a: link for link in self.links}
-        if muscles:
-            self.notes.append(f"{muscles} muscles move it in the file: here every joint has a motor")
         self._limitless: list[str] = []
         self._strong: list[str] = []
         self._damped: list[str] = []
@@ -193,7 +232,12 @@ class Drive:
             self.notes.append(
                 f"no motor in the file, here one each ('couplings' in the hand file): {', '.join(passive)}"
             )
-        self._tendons = [reduced for servo in self._servos if len(reduced := self._reduced(servo)) > 1]
+        pulls = [self._reduced(servo) for servo in found]
+        self._pulls = list(zip(found, _shared_out(pulls), strict=True))
+        if idle := sum(bool(before) and not after for before, (_, after) in zip(pulls, self._pulls, strict=True)):
+            self.notes.append(
+                f"{idle} motors that pull joints of others alone are left out ('tendons' in the hand file)"
+            )
 
     def couplings(self) -> tuple[Coupling, ...]:
         """As data."""
@@ -207,10 +251,9 @@ class Drive:
         armature = float(self._model.dof_armature[dof]) or 5e-4
         damping = float(self._model.dof_damping[dof])
         kp = kv = limit = 0.0
-        if j not in self._leaders and not any(j in tendon for tendon in self._tendons):
-            mine = [x for x in self._servos if {*self._reduced(x)} == {j}]
-            servo = next((x for x in mine if j in x.joints), mine[0] if mine else None)
-            scale = self._reduced(servo)[j] if servo else 1.0
+        if j not in self._leaders and not any(j in pulled for _, pulled in self._pulls if len(pulled) > 1):
+            mine = [(x, pulled[j]) for x, pulled in self._pulls if {*pulled} == {j}]
+            servo, scale = next((x for x in mine if j in x[0].joints), mine[0] if mine else (None, 1.0))
             kp, limit = self._gains(j, servo, scale, self._names[j])
             if servo and servo.reach and j in servo.joints:
                 lower, upper = max(lower, servo.reach[0]), min(upper, servo.reach[1])
@@ -233,8 +276,7 @@ class Drive:
     def tendons(self) -> tuple[Motor, ...]:
         """Motors of tendons, with coefficients of at most one."""
         found = []
-        for servo in self._servos:
-            pulled = self._reduced(servo)
+        for servo, pulled in self._pulls:
             if len(pulled) < 2:
                 continue
             largest = max(map(abs, pulled.values()))
@@ -266,10 +308,10 @@ class Drive:
             )
         return [*self.notes, *found]
 
-    def _reduced(self, servo: Servo | None) -> dict[int, float]:
+    def _reduced(self, servo: Servo) -> dict[int, float]:
         """What a servo pulls, with joints that follow others in the place of these."""
         pulled: dict[int, float] = {}
-        for j, c in servo.joints.items() if servo else ():
+        for j, c in servo.joints.items():
             link = self._leaders.get(j)
             leader, share = (link.b, c * link.ratio) if link else (j, c)
             if leader in self._names:

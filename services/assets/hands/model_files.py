@@ -25,6 +25,7 @@ from services.assets.hands.tree import Tree, body_name, hand_tree, hinges, ident
 from services.assets.hands.visual import link_mesh
 
 _LEVER = 0.02  # m from a joint to the tip that it moves, at least
+_TURN = np.deg2rad(10)  # of the joint with the largest range, below which nothing can be grasped
 _SMALL = 0.03  # m of opening below which a hand is doubtful
 
 
@@ -89,6 +90,11 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
         tendons=drive.tendons(),
     )
     notes += drive.remarks()
+    if max(joint.upper - joint.lower for joint in hand.joints) < _TURN:
+        raise CongraspError(
+            f"No joint of the hand in {path} turns by 10 degrees.",
+            'Are its angles in radians, without <compiler angle="radian"/>?',
+        )
     _check(path, hand, "pose")
     hand = dataclasses.replace(hand, thumb=thumb_of(hand, choices.thumb, notes))
     hand = propose_poses(hand, notes)

