@@ -91,7 +91,7 @@ def evaluate(
     from services.evaluate.tables import Setup, captured, evaluate_tables
 
     at_least(1, episodes=episodes)
-    at_least(0, pool=pool, batch=batch, seed=seed)
+    at_least(0, pool=pool, batch=batch)
     _check_friction(friction)
     lineup = line_up(table, read_entrants(policy, method), hand, method)
     engine = resolve_physics(physics)

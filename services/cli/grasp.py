@@ -90,7 +90,6 @@ def grasp(
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
     at_least(1, attempts=attempts)
-    at_least(0, seed=seed)
     at_most(_MOST_ATTEMPTS, "side by side", attempts=attempts)
     at_most(10.0, "seconds", approach=approach)
     at_most(0.5, "metres", lift=lift)

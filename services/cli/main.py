@@ -107,6 +107,8 @@ def _said_of(error: OSError) -> str:
         return str(
             CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its rights.")
         )
+    if error.errno == errno.EIO:
+        return "A file could not be read or written: the disk that it is on failed. Try another path."
     raise error
 
 

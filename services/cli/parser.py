@@ -18,6 +18,7 @@ Parser = Callable[[list[str]], Callable[[], Any]]
 """From the arguments to the call that they ask for."""
 _QUIET = ("", "None", "False")
 """Defaults that say nothing: the help text has what happens without the option."""
+_LARGEST_SEED = 10**15
 _CONTINUED = re.compile(r"\s*\n\s*")
 
 
@@ -76,7 +77,7 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     def bind(*args: Any, **options: Any) -> Callable[[], Any]:
         return functools.partial(command, *args, **options)
 
-    hints = {name: _described(hint) for name, hint in typing.get_type_hints(command, include_extras=True).items()}
+    hints = {name: _described(name, hint) for name, hint in typing.get_type_hints(command, include_extras=True).items()}
     signature = inspect.signature(command)
     taken = [value.replace(annotation=hints[name]) for name, value in signature.parameters.items()]
     vars(bind)["__signature__"] = signature.replace(parameters=taken)
@@ -85,15 +86,32 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     return bind
 
 
-def _described(hint: Any) -> Any:
-    """A parameter's type, with how its values and its default are shown."""
+def _described(name: str, hint: Any) -> Any:
+    """A parameter's type, with how its values and its default are shown, and what a seed may be."""
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
+    marks += [_SEED] if name == "seed" or name.endswith("_seed") else []
     for mark in marks:  # a type that is known only when a command line is parsed, such as the engines' names
         kind = made() if (made := getattr(mark, "constructor_factory", None)) else kind
     metavar = None
     if typing.get_origin(kind) is tuple and typing.get_args(kind)[-1] is Ellipsis:
         metavar = f"{_value(typing.get_args(kind)[0])} ..."
     return Annotated[(kind, *marks, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint))]
+
+
+def _seed(words: list[str]) -> int:
+    """A seed that every generator of random numbers takes, with room for those that follow it."""
+    if not words[0].isdecimal() or int(words[0]) > _LARGEST_SEED:
+        raise ValueError(f"a seed is a whole number from 0 to {_LARGEST_SEED:.0e}")
+    return int(words[0])
+
+
+_SEED = tyro.constructors.PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="INT",
+    instance_from_str=_seed,
+    is_instance=lambda x: isinstance(x, int),
+    str_from_instance=lambda x: [str(x)],
+)
 
 
 def _value(kind: Any) -> str:
@@ -123,7 +141,7 @@ def _dataclass(info: tyro.constructors.StructTypeInfo) -> tyro.constructors.Stru
         fields=tuple(
             tyro.constructors.StructFieldSpec(
                 field.name,
-                _described(hints[field.name]),
+                _described(field.name, hints[field.name]),
                 getattr(info.default, field.name),
                 functools.partial(_meaning, info.type, field.name),
             )

@@ -70,7 +70,7 @@ def reproduce(
     from services.reproduce.plan import BASELINES, policies
     from services.reproduce.run import Request, reproduce, to_train
 
-    at_least(0, episodes=episodes, pool=pool, seed=seed)
+    at_least(0, episodes=episodes, pool=pool)
     at_least(1, patience=patience)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder.")
