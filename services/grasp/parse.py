@@ -4,7 +4,6 @@ Files give positions in metres in the axes and with the origin of the object's o
 sets, which know the object's frame, are taken as they are.
 """
 
-import math
 import os
 import pathlib
 from collections.abc import Callable, Iterable, Mapping
@@ -18,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from common.errors import CongraspError
 from common.hands.motors import coupled
 from common.hands.spec import Hand
-from common.inputs import read_file, read_json
+from common.inputs import read_json
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.task import constraint_sets
@@ -29,6 +28,7 @@ from services.assets.objects.headers import check_header
 from services.assets.objects.sizes import size_in_words
 from services.export.frames import continuous_quaternions
 from services.export.motion_file import GraspMotion, load_motion
+from services.grasp.wrist_paths import HUGE, read_csv
 from services.record.goals import grasp_span
 
 ABOVE = "above"
@@ -241,8 +241,10 @@ def _trajectory(written: Written) -> dict[str, np.ndarray] | None:
         position, quaternion = (arrays[f"trajectory/{name}"][0, index] for name in ("position", "quaternion"))
         return _resampled(position, quaternion, waypoints, str(path))
     if path.suffix.lower() == ".csv":
-        table = _rows(path, 7, "x, y, z, qw, qx, qy, qz")
-        position, quaternion = table[:, :3], table[:, 3:]
+        try:
+            position, quaternion = read_csv(path)
+        except CongraspError as error:
+            raise CongraspError(f"--trajectory: {error}") from None
     else:
         given = _json(path, "--trajectory", ("position", "quaternion"))
         count = len(given["position"]) if isinstance(given["position"], list) else 0
@@ -320,43 +322,13 @@ def _json(path: pathlib.Path, name: str, keys: tuple[str, ...]) -> dict[str, Any
     return given
 
 
-def _rows(path: pathlib.Path, columns: int, names: str) -> np.ndarray:
-    """(n, columns) finite numbers of a CSV file's lines, of which a first one of names counts for nothing."""
-    remedy = f"Write {names} in every line."
-    try:
-        lines = read_file(path, _LARGEST, remedy).decode().splitlines()
-    except OSError as error:
-        raise CongraspError(f"--trajectory: {path} cannot be read: {error.strerror}.", remedy) from None
-    except UnicodeDecodeError:
-        raise CongraspError(f"--trajectory: {path} is not text.", remedy) from None
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines, 1):
-        words = [word.strip() for word in line.partition("#")[0].split(",")]
-        if not any(words) or (not rows and not any(map(_is_number, words))):
-            continue
-        if len(words) != columns or not all(map(_is_number, words)):
-            raise CongraspError(f"--trajectory: line {number} of {path} is not {columns} finite numbers.", remedy)
-        rows.append([float(word) for word in words])
-    if not rows:
-        raise CongraspError(f"--trajectory: {path} has no numbers.", remedy)
-    return np.array(rows)
-
-
-def _is_number(word: str) -> bool:
-    """Whether it is a finite number."""
-    try:
-        return math.isfinite(float(word))
-    except ValueError:
-        return False
-
-
 def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Finite numbers of this shape."""
+    """Numbers of this shape that can be meant."""
     try:
         array = np.asarray(values, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
-    if array.shape != shape or 0 in shape or not np.isfinite(array).all():
+    if array.shape != shape or 0 in shape or not (np.abs(array) < HUGE).all():
         raise CongraspError(f"{what} must be {' x '.join(map(str, shape))} finite numbers.")
     return array
 

@@ -4,8 +4,8 @@ What comes out is in metres, in a world whose z axis points up, for the `human` 
 the thumb's side +x, the back of the hand +z.
 """
 
-import io
 import pathlib
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,8 @@ from common.npz import read_npz
 
 _LARGEST, _DEEPEST = 32 << 20, 200
 """Bytes of a BVH or CSV file, and joints of a BVH chain."""
+HUGE = 1e9
+"""No angle, place or part of a quaternion is as large."""
 _UP = {"y": Rotation.from_euler("X", 90, degrees=True), "z": Rotation.identity()}
 _AXES = {
     f"{sign}{axis}": s * row for axis, row in zip("xyz", np.eye(3), strict=True) for sign, s in (("+", 1), ("-", -1))
@@ -153,15 +155,44 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
     return found, column, names
 
 
-def _csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """Positions (T, 3), quaternions (T, 4) and seconds between two frames, of a CSV file."""
+def read_csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines, of which a first one of names counts for nothing.
+
+    Raises:
+      CongraspError: the file cannot be read, or a line is not seven finite numbers.
+    """
+    remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
-        text = read_file(path, _LARGEST, "Cut it into shorter ones.").decode(errors="replace")
-        rows = np.genfromtxt(io.StringIO(text), delimiter=",", comments="#", ndmin=2)
-    except (OSError, ValueError) as error:
-        raise CongraspError(f"{path} cannot be read as CSV: {str(error).partition(chr(10))[0][:200]}.") from None
-    rows = rows[~np.isnan(rows).all(-1)]  # a line of names
-    return _checked(path, rows[:, :3], rows[:, 3:])
+        lines = read_file(path, _LARGEST, remedy).decode("utf-8-sig").splitlines()
+    except OSError as error:
+        raise CongraspError(f"{path} cannot be read: {error.strerror}.", remedy) from None
+    except UnicodeDecodeError:
+        raise CongraspError(f"{path} is not text.", remedy) from None
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 1):
+        words = re.sub(r"[,;]", " ", line.partition("#")[0]).split()
+        if not words or (not rows and not any(map(_is_number, words))):
+            continue
+        if len(words) != 7 or not all(map(_is_number, words)):
+            raise CongraspError(f"line {number} of {path} is not 7 finite numbers.", remedy)
+        rows.append([float(word) for word in words])
+    if not rows:
+        raise CongraspError(f"{path} has no numbers.", remedy)
+    table = np.array(rows)
+    return table[:, :3], table[:, 3:]
+
+
+def _is_number(word: str) -> bool:
+    """Whether it is a number that can be meant."""
+    try:
+        return abs(float(word)) < HUGE
+    except ValueError:
+        return False
+
+
+def _csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
+    """Positions, quaternions and seconds between two frames, of a CSV file."""
+    return _checked(path, *read_csv(path))
 
 
 def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:

@@ -103,6 +103,11 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
     np.testing.assert_allclose(path[:, 2], np.linspace(0.4, 0.2, 15), atol=1e-6)
     np.testing.assert_allclose(np.abs(turns[:, 0]), 1)
     assert (turns[:, 0] > 0).all() or (turns[:, 0] < 0).all()
+    for written in (";", "\t", " ", " , "):  # as spreadsheets write it, with a byte order mark
+        text = "x,y,z,w,x,y,z\r\n0.1,-0.2,0.7,1,0,0,0\r\n0.1,-0.2,0.5,-1,0,0,0\r\n".replace(",", written)
+        (tmp_path / "sheet.csv").write_text(text, "utf-8-sig")
+        again = asked(block, trajectory=str(tmp_path / "sheet.csv")).constraints["trajectory"]
+        np.testing.assert_array_equal(again["position"], path)
 
 
 @pytest.mark.parametrize(
@@ -115,6 +120,11 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
         ('{"joints": {}, "position": [0,0,500], "quaternion": [1,0,0,0]}', "the wrist of .* lies 5.* m from 'block'"),
         ('{"joints": {"index_pip": 45}, "position": [0,0,0], "quaternion": [1,0,0,0]}', "is at 45. Angles are in rad"),
         ('{"joints": {}, "position": [0,0,0], "quaternion": [0,0,0,0]}', "quaternion has no direction"),
+        ('{"joints": {}, "position": [0,0,1e999], "quaternion": [1,0,0,0]}', "'position' of .* must be 3 finite"),
+        (
+            '{"joints": {}, "position": [0,0,1' + 400 * "0" + '], "quaternion": [1,0,0,0]}',
+            "'position' of .* must be 3 finite",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_pose_is_said(block, tmp_path, text, complaint):
@@ -137,6 +147,8 @@ def test_what_is_wrong_with_a_trajectory_is_said(block, tmp_path):
         ("x,y,z,qw,qx,qy,qz\n\n0,0,0,1,0,0,0\n0,0,nan,1,0,0,0\n", 4),
         ("0,0,0,1,0,0,0  # the start\n0,0,1,1,0,0,0,9\n", 2),
         ("0,0,0,1,0,0,0\n0,0,one,1,0,0,0\n", 2),
+        ("1e308,0,0,1,0,0,0\n0,0,0.1,1,0,0,0\n", 1),
+        ("0,1;0;0,2;1;0;0;0\n", 1),
     ):
         path.write_text(text)
         with pytest.raises(CongraspError, match=rf"line {line} of .*path\.csv is not 7 finite numbers"):
