@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from actors.attempts import Attempts, Outcome
 from actors.initial import RequestedEpisodes
-from actors.protocols import ASSESSED
+from actors.protocols import ASSESSED, SURVIVAL
 from common.config import TaskConfig
 from common.errors import CongraspError, ContradictionError
 from common.hands import get_hand
@@ -45,6 +45,8 @@ _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in const
 _SCALES |= {"moved_at_removal": 0.03, "force_link_max": 10.0, "slip": 0.02}
 """What weighs as much as one another, among grasps that hold: errors, the object's way before table removal (m), the
 strongest link's force (N), and the object's way after it went (m)."""
+_FIRM = ("clean", *SURVIVAL)
+"""What counts one against a grasp that lacks it, likewise."""
 _UNLIKELY = 0.5
 """What each likelier resting pose weighs against a grasp, likewise."""
 _TOUCHED = 0.2
@@ -328,6 +330,7 @@ def costs(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: fl
     way = place[-1] - place[removal] - [0.0, 0.0, lift]
     values = {**outcome.metrics, "slip": np.linalg.norm(way, axis=-1)}
     cost = sum(np.minimum(values[name] / _SCALES[name], 10.0) for name in [*_errors_of(constraints), "slip"])
+    cost += sum(values[name] == 0 for name in _FIRM)
     return np.asarray(cost) + 1e3 * (values["success"] == 0) + 1e4 * (values["held"] == 0)
 
 

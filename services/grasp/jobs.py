@@ -65,6 +65,7 @@ class Result(NamedTuple):
             return self.error
         facts = self.facts
         outcome = "held" if facts["success"] else "not held"
+        outcome += ", also against pushes of 1 N" if facts.get("push_survival") else ""
         best = f"best of {facts['attempts']} attempts, {facts['attempts_held']} of which hold it"
         errors = [f"{what} {_shown(facts, stem)}" for stem, what in _ERRORS.items() if f"{stem}_m" in facts]
         if "affordance_ratio" in facts:

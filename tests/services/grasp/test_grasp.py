@@ -9,6 +9,9 @@ import pytest
 import trimesh
 from PIL import Image
 
+from actors.attempts import Outcome
+from actors.protocols import ASSESSED, SURVIVAL
+from actors.rollout import Trace
 from common.errors import CongraspError
 from common.policy import bundle as bundles
 from common.policy.pretrained import policy_file
@@ -19,7 +22,7 @@ from services.assets.objects.options import ImportOptions
 from services.cli.main import load
 from services.export.motion_file import load_motion, motion_of_episode
 from services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
-from services.grasp.grasper import Grasp, Grasper
+from services.grasp.grasper import Grasp, Grasper, costs
 from services.grasp.parse import read_request
 from services.record.reader import read_episodes
 from tests.episodes import episode
@@ -67,6 +70,25 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     np.testing.assert_array_equal(again.joint_position, motion.joint_position)
 
 
+def test_what_holds_comes_first_then_what_is_firm_clean_and_as_asked():
+    """Costs that are added up by hand, of five attempts."""
+    zeros = np.zeros(5)
+    metrics = {name: zeros.copy() for name in ("moved_at_removal", *ASSESSED)}
+    metrics |= {
+        "held": np.array([0.0, 1, 1, 1, 1]),
+        "success": np.array([0.0, 1, 1, 1, 1]),
+        "heading_rad": np.array([0.0, 0.0, 0.0, 0.1, 0.9]),  # one for 0.2 rad
+        "heading_m": zeros,
+        "force_link_max": np.array([0.0, 0.0, 10.0, 0.0, 0.0]),  # one for 10 N
+        "pose_rad": np.full(5, 9.0),  # not asked for
+        "clean": np.array([0.0, 0, 0, 1, 1]),
+        **dict.fromkeys(SURVIVAL, np.array([0.0, 0, 1, 1, 1])),
+    }
+    trace = Trace(*(np.zeros((3, 5, 3)) for _ in Trace._fields))
+    found = costs(Outcome(None, zeros > 0, zeros == 0, metrics, trace), ("heading",), 1)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found, [11004.0, 4.0, 2.0, 0.5, 4.5], rtol=1e-6)
+
+
 def test_a_grasp_lifts_the_block_off_a_table_that_stays(block):
     """By physics: the hand goes up and the block with it, because the hand holds it."""
     lifting = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, approach=0.3, lift=0.1, threads=2)
@@ -110,6 +132,7 @@ def made_up(monkeypatch):
         )
         made.meta["metrics"] |= {"affordance_ratio": 0.0, "moved_at_removal": 0.0, "force_link_max": 3.0}
         made.meta["metrics"]["held"] = float(made.meta["success"])
+        made.meta["metrics"]["push_survival"] = float(made.meta["object"] == "a")
         return Grasp(made, motion_of_episode(made), 4, 3, 0, ("The heading guides the wrist.",))
 
     monkeypatch.setattr(Grasper, "grasp", grasp)
@@ -136,7 +159,9 @@ def test_a_folder_is_grasped_once_and_bad_meshes_do_not_stop_it(tmp_path, capsys
     assert made_up == ["a", "b"]
     assert "bad.obj" in captured.err and captured.err.count("congrasp: error:") == 1
     line = next(line for line in captured.out.splitlines() if line.startswith("a:"))
-    assert "5.0 x 6.0 x 14.0 cm, about as long as a phone; held; best of 4 attempts, 3 of which hold it" in line
+    size = "5.0 x 6.0 x 14.0 cm, about as long as a phone"
+    assert f"{size}; held, also against pushes of 1 N; best of 4 attempts, 3 of which hold it" in line
+    assert f"b: {size}; held; best of" in captured.out
     assert "2 of 3 objects are held; 1 could not be used" in captured.out
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["objects"], summary["succeeded"]) == (3, 2)

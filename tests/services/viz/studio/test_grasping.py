@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from actors.attempts import Outcome
+from actors.protocols import ASSESSED
 from common.errors import CongraspError, TransportError
 from common.policy import bundle as bundles
 from common.policy.bundle import PolicyBundle
@@ -31,7 +32,7 @@ class Source:
 
 def outcome(held: list[int], error: list[float]) -> Outcome:
     names = ("success", "held", "heading_rad", "heading_m", "moved_at_removal", "force_link_max")
-    metrics = {name: np.zeros(ATTEMPTS) for name in names}
+    metrics = {name: np.zeros(ATTEMPTS) for name in (*names, *ASSESSED)}
     metrics["success"][held] = metrics["held"][held] = 1.0
     metrics["heading_rad"][: len(error)] = error
 
