@@ -58,7 +58,7 @@ class MjxPhysics:
         if any(link.solids for link in hand.links):
             raise CongraspError(
                 f"The engine jax collides capsules alone, and '{hand.name}' has solids of its own.",
-                "Choose native or warp, or import the hand without --collision own.",
+                "Choose native or warp; or, for a hand of your own, import it without --collision own.",
             )
         self._task = task
         self._pool = pool = Pool(hand, task, objects)

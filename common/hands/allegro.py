@@ -1,15 +1,16 @@
 """The right Allegro hand V3: four fingers of four joints each.
 
 Geometry, limits and masses are those of the maker's published models (BSD-2, SimLab 2016). Wrist frame: origin at the
-palm's mounting end, fingers towards +z, closing side +x, index finger on the side of +y. Collision capsules stand for
-the makers' boxes, 20 x 27 mm across a phalanx.
+palm's mounting end, fingers towards +z, closing side +x, index finger on the side of +y. What collides are the makers'
+boxes, 20 x 27 mm across a phalanx, and their round fingertips; rewards and features go by capsules inside them.
 """
 
 import dataclasses
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain, vector, wrist_gains
+from common.hands.spec import Capsule, Hand, Joint, Link, Solid, Vector, chain, vector, wrist_gains
 
 _GAINS = {"kp": 3.0, "kv": 0.1, "torque_limit": 0.7, "armature": 1e-3}
 """Of a proportional-derivative controller as it is common for this hand; the motors' greatest torque is 0.7 N.m."""
@@ -22,6 +23,10 @@ _LIMITS = ((-0.47, 0.47), (-0.196, 1.61), (-0.174, 1.709), (-0.227, 1.618))
 _THUMB_LIMITS = ((0.263, 1.396), (-0.105, 1.163), (-0.189, 1.644), (-0.162, 1.719))
 _LENGTHS = (0.0164, 0.0540, 0.0384, 0.0267)
 """From joint to joint, and from the last one to the fingertip's centre, m."""
+_THICK, _WIDE = 0.0098, 0.01375
+"""Half of a phalanx's box, across the joint's axis and along it, m."""
+_BOXES, _THUMB_BOXES = (0.0164, 0.0540, 0.0384, 0.0160), (0.0177, 0.0514, 0.0314)
+"""Lengths of the boxes, m; the thumb's first link is a block of its own."""
 _NAMES = ("base", "proximal", "medial", "distal")
 
 
@@ -31,7 +36,28 @@ def _finger(name: str, base: np.ndarray, lean: float) -> tuple[Link, ...]:
     flexion = np.array([0.0, np.cos(lean), -np.sin(lean)])
     points = [vector(_KNUCKLE + base + reach * along) for reach in np.cumsum([0.0, *_LENGTHS])]
     axes = (along, flexion, flexion, flexion)
-    return _links(name, points, axes, _LIMITS, (0.0119, 0.0650, 0.0355, 0.0264), (0.5, 1.0, 1.0, 3.0))
+    links = _links(name, points, axes, _LIMITS, (0.0119, 0.0650, 0.0355, 0.0264), (0.5, 1.0, 1.0, 3.0))
+    return _boxed(links, points, np.stack([np.cross(flexion, along), flexion, along], -1), _BOXES, (0.0190, 0.010))
+
+
+def _boxed(
+    links: tuple[Link, ...],
+    points: list[Vector],
+    axes: np.ndarray,
+    lengths: tuple[float, ...],
+    tip: tuple[float, float],
+) -> tuple[Link, ...]:
+    """Links with the makers' boxes, from `points` on along the last of `axes` (3, 3), as columns; on the last link also
+    a capsule `tip` (m from its joint to its middle, half length)."""
+    x, y, z, w = Rotation.from_matrix(axes).as_quat()
+    quaternion, along = (float(w), float(x), float(y), float(z)), axes[:, 2]
+    found = []
+    for link, point, length in zip(links, points, lengths, strict=False):
+        box = Solid("box", (_THICK, _WIDE, length / 2), vector(point + length / 2 * along), quaternion)
+        found.append(dataclasses.replace(link, solids=(box,)))
+    place, half = tip
+    end = Solid("capsule", (_TIP_RADIUS, half, 0.0), vector(points[len(links) - 1] + place * along), quaternion)
+    return (*found[:-1], dataclasses.replace(found[-1], solids=(*found[-1].solids, end)))
 
 
 def _links(
@@ -70,7 +96,11 @@ def _thumb() -> tuple[Link, ...]:
     # The first link is a block beside its joint's axis.
     middle = root - 0.0179 * up + 0.009 * forward + 0.0145 * out
     housing = Capsule(vector(middle - 0.008 * out), vector(middle + 0.008 * out), 0.0150)
-    return (dataclasses.replace(block, capsules=(housing,)), *rest)
+    turn = np.stack([np.cross(forward, out), forward, out], -1)
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    solid = Solid("box", (0.0179, 0.0170, 0.02275), vector(middle), (float(w), float(x), float(y), float(z)))
+    block = dataclasses.replace(block, capsules=(housing,), solids=(solid,))
+    return (block, *_boxed(tuple(rest), points[1:], turn, _THUMB_BOXES, (0.0350, 0.008)))
 
 
 _PALM = Link(
@@ -80,6 +110,7 @@ _PALM = Link(
     tuple(Capsule((-0.0093, y, 0.0204), (-0.0093, y, 0.0746), 0.0204) for y in (-0.0361, -0.0120, 0.0120, 0.0361)),
     0.4154,
     1.0,
+    solids=(Solid("box", (0.0204, 0.0565, 0.0475), (-0.0093, 0.0, 0.0475), (1.0, 0.0, 0.0, 0.0)),),
 )
 
 ALLEGRO = Hand(

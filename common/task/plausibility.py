@@ -20,11 +20,13 @@ from common.hands.mjcf import overlapping
 from common.hands.motors import motor_positions
 from common.hands.spec import Hand
 from common.objects.distance import DistanceField
+from common.objects.shapes import mesh_of
+from common.objects.spec import Piece
 from common.task.constraints.base import Scene
 from common.task.types import Array
 
 CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}
-"""Deepest penetrations below which an episode is clean; `hand_mesh_mm` is measured of hands with meshes alone."""
+"""Deepest penetrations below which an episode is clean; `hand_mesh_mm` is that of hands with meshes or solids alone."""
 MEASURES = (
     *CLEAN_MM,
     *(f"wrist_{of}{which}" for of in ("speed", "acceleration") for which in ("", "_mean", "_p95")),
@@ -169,7 +171,7 @@ def hand_mesh(
     index: Array,
     field: DistanceField,
 ) -> Array:
-    """(B,) how deep in metres points on the hand's meshes (`common.hands.meshes`) are in the object; NaN without any.
+    """(B,) how deep in metres points on the hand's meshes, else on its solids, are in the object; NaN without any.
 
     Arguments are those of `hand_object`. A finger through a thin blade counts with the blade's thickness.
     """
@@ -215,7 +217,8 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
       control_dt: seconds of a control step.
 
     Returns:
-      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, of hands with meshes, `hand_mesh_mm`: the deepest, mm.
+      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, of hands with meshes or solids, `hand_mesh_mm`, the
+        deepest, mm.
       `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over the episode's steps.
       `finger_jerk`: root mean square over joints and steps, rad/s^3. `link_force_peak` (N) of the hardest
       pressing link, `link_force` the mean of links that touch (0 where none ever does). `torque_share` and
@@ -265,14 +268,19 @@ def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarra
 
 @functools.cache
 def _surface(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
-    """The link of each point on the hand's meshes (P,), and the points (P, 3) in the wrist frame at zero.
+    """The link of each point on the hand's meshes or solids (P,), and the points (P, 3) in the wrist frame at zero.
 
     Of what lies in one cell of a grid the point farthest from its link's middle is kept, so that corners are; cells are
     `_CELL` wide, or wider where that leaves more than `_MOST` points. They begin at sqrt(area / `_MOST`), which bounds
     how many points are sampled.
     """
     names = [link.name for link in hand.links]
-    meshes = {names.index(name): mesh for name, mesh in own_meshes(hand).items()}
+    meshes = {
+        i: mesh_of([Piece(x.kind, x.size, x.position, x.quaternion) for x in link.solids])
+        for i, link in enumerate(hand.links)
+        if link.solids
+    }
+    meshes |= {names.index(name): mesh for name, mesh in own_meshes(hand).items()}
     area = sum(float(trimesh.Trimesh(*mesh, process=False).area) for mesh in meshes.values())
     cell = max(_CELL, float(np.sqrt(area / _MOST)))
     while True:

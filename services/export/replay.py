@@ -3,8 +3,9 @@
 An object of 0.1 kg floats without table and gravity, friction 0.6. The hand is at the grasp with its targets at the
 squeeze, or at the pregrasp, from which targets go to the grasp and on to the squeeze, 0.4 s each, open loop. Then the
 object is pushed for two seconds by 1 N along or against an axis of the world, each push from the start. Motors have the
-benchmark's gains and no speed feedback beside the joints' damping. What touches are Allegro's boxes as the benchmark
-has them, and of Shadow this project's shapes.
+benchmark's gains and no speed feedback beside the joints' damping, and contacts are as hard as the benchmark's and rub
+against turning as there. What touches are Allegro's boxes as the benchmark has them, and of Shadow this project's
+shapes.
 """
 
 import itertools
@@ -28,8 +29,10 @@ from common.parallel import cores
 from services.export.benchmark_hands import benchmarked
 from services.export.dexgraspbench import STATES, Grasp, State
 
-MASS, FRICTION = 0.1, 0.6
-"""kg and sliding friction of every object."""
+MASS, FRICTION, TORSION = 0.1, 0.6, 0.02
+"""kg, and sliding and torsional (m) friction of every object."""
+_HAND, _OBJECT = ((0.005, 1.0), (0.5, 0.99, 1e-4)), ((0.02, 1.0), (0.9, 0.95, 1e-3))
+"""`solref` and the first of `solimp`, of which a contact has the mean."""
 STARTS = ("grasp", "pregrasp")
 _STAGE, _PUSH, _LOOK = 40, 200, 10  # control steps: of a stage, of a push, and from one look at contacts to the next
 _TOGETHER = 32  # grasps side by side
@@ -134,8 +137,18 @@ def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:
     )
     physics.place_tables(np.zeros(6 * len(grasps), bool))
     for instance in physics.instances:
-        instance.model.opt.gravity[:] = 0.0
+        _harden(instance.model)
         mujoco.mj_forward(instance.model, instance.data)
+
+
+def _harden(model: mujoco.MjModel) -> None:
+    """No gravity, and contacts as the benchmark has them."""
+    model.opt.gravity[:] = 0.0
+    model.opt.noslip_iterations = 2
+    mine = model.geom_bodyid == model.body("object").id
+    model.geom_condim[mine], model.geom_friction[mine, 1], model.geom_solmix[:] = 4, TORSION, 1.0
+    for geoms, (solref, solimp) in ((~mine, _HAND), (mine, _OBJECT)):
+        model.geom_solref[geoms], model.geom_solimp[geoms, :3] = solref, solimp
 
 
 def _script(hand: Hand, grasps: Sequence[Grasp], stages: Sequence[str]) -> Iterator[tuple[np.ndarray, np.ndarray]]:

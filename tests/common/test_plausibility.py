@@ -1,5 +1,7 @@
 """Plausibility: capsules against distances worked out by hand and against MuJoCo, measures against simple motions."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -30,6 +32,7 @@ def posed(name: str, q: np.ndarray):
 def deepest_contact(name: str, q: np.ndarray) -> float:
     """Deepest contact in metres between the links in MuJoCo, whose hand excludes what it excludes."""
     hand, spec = get_hand(name), mujoco.MjSpec()
+    hand = dataclasses.replace(hand, links=tuple(dataclasses.replace(link, solids=()) for link in hand.links))
     spec.compiler.degree = False
     add_hand(spec, hand, self_collision=True)
     model = spec.compile()

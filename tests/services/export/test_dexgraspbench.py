@@ -177,6 +177,12 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model():
     hand = get_hand("allegro")
     motion = motion_of(hand)
     match = match_hand(motion)
+    for link, theirs in match.solids(hand.joint_links).items():  # the hand that grasps has them, too
+        for mine, solid in zip(hand.links[link].solids, theirs, strict=True):
+            assert (mine.kind, mine.size) == (solid.kind, pytest.approx(solid.size))
+            np.testing.assert_allclose(mine.position, solid.position, atol=2e-6)
+            turns = [Rotation.from_quat(x.quaternion, scalar_first=True).as_matrix() for x in (mine, solid)]
+            np.testing.assert_allclose(*(turn @ np.diag(mine.size) ** 2 @ turn.T for turn in turns), atol=1e-8)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     add_hand(spec, benchmarked(hand, match))
