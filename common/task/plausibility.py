@@ -26,7 +26,7 @@ from common.task.constraints.base import Scene
 from common.task.types import Array
 
 CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}
-"""Deepest penetrations below which an episode is clean; `hand_mesh_mm` is that of hands with meshes or solids alone."""
+"""Deepest penetrations below which an episode is clean; `hand_mesh_mm` is measured of hands with meshes alone."""
 MEASURES = (
     *CLEAN_MM,
     *(f"wrist_{of}{which}" for of in ("speed", "acceleration") for which in ("", "_mean", "_p95")),
@@ -65,12 +65,12 @@ class Sample(NamedTuple):
 
 
 class _Capsules(NamedTuple):
-    """Which of a hand's capsules must not overlap, and points on their axes in the wrist frame at zero."""
+    """Which of a hand's capsules must not overlap, and points on axes or on solids, in the wrist frame at zero."""
 
     pairs: np.ndarray  # (2, Q) capsules that must not overlap
-    axis_links: np.ndarray  # (P,) the link of each point on the axes
-    axis_points: np.ndarray  # (P, 3)
-    axis_radii: np.ndarray  # (P,)
+    links: np.ndarray  # (P,) the link of each point
+    points: np.ndarray  # (P, 3)
+    radii: np.ndarray  # (P,) 0 on solids
 
 
 def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
@@ -147,7 +147,8 @@ def hand_object(
 ) -> Array:
     """(B,) how deep in metres a link's capsule is in the object: its radius less the axis's distance from the surface.
 
-    So a finger that goes through a thin blade counts with its own thickness, not with the blade's.
+    So a finger that goes through a thin blade counts with its own thickness, not with the blade's. Of links that
+    collide by solids points on these count, with the blade's.
 
     Args:
       hand: the hand.
@@ -158,9 +159,9 @@ def hand_object(
       field: signed distances from the objects' surfaces.
     """
     capsules = _capsules(hand)
-    points = _moved(transforms, capsules.axis_links, capsules.axis_points)
+    points = _moved(transforms, capsules.links, capsules.points)
     local = rotations.inverse_transform(object_position, object_quaternion, points)
-    return jnp.maximum(jnp.max(capsules.axis_radii - field.at(index, local), -1), 0.0)
+    return jnp.maximum(jnp.max(capsules.radii - field.at(index, local), -1), 0.0)
 
 
 def hand_mesh(
@@ -171,7 +172,7 @@ def hand_mesh(
     index: Array,
     field: DistanceField,
 ) -> Array:
-    """(B,) how deep in metres points on the hand's meshes, else on its solids, are in the object; NaN without any.
+    """(B,) how deep in metres points on the hand's meshes (`common.hands.meshes`) are in the object; NaN without any.
 
     Arguments are those of `hand_object`. A finger through a thin blade counts with the blade's thickness.
     """
@@ -217,8 +218,7 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
       control_dt: seconds of a control step.
 
     Returns:
-      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, of hands with meshes or solids, `hand_mesh_mm`, the
-        deepest, mm.
+      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, of hands with meshes, `hand_mesh_mm`: the deepest, mm.
       `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over the episode's steps.
       `finger_jerk`: root mean square over joints and steps, rad/s^3. `link_force_peak` (N) of the hardest
       pressing link, `link_force` the mean of links that touch (0 where none ever does). `torque_share` and
@@ -268,19 +268,18 @@ def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarra
 
 @functools.cache
 def _surface(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
-    """The link of each point on the hand's meshes or solids (P,), and the points (P, 3) in the wrist frame at zero.
+    """The link of each point on the hand's meshes (P,), and the points (P, 3) in the wrist frame at zero."""
+    names = [link.name for link in hand.links]
+    return _spread({names.index(name): mesh for name, mesh in own_meshes(hand).items()})
+
+
+def _spread(meshes: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """The link of each point on meshes (P,), and the points (P, 3).
 
     Of what lies in one cell of a grid the point farthest from its link's middle is kept, so that corners are; cells are
     `_CELL` wide, or wider where that leaves more than `_MOST` points. They begin at sqrt(area / `_MOST`), which bounds
     how many points are sampled.
     """
-    names = [link.name for link in hand.links]
-    meshes = {
-        i: mesh_of([Piece(x.kind, x.size, x.position, x.quaternion) for x in link.solids])
-        for i, link in enumerate(hand.links)
-        if link.solids
-    }
-    meshes |= {names.index(name): mesh for name, mesh in own_meshes(hand).items()}
     area = sum(float(trimesh.Trimesh(*mesh, process=False).area) for mesh in meshes.values())
     cell = max(_CELL, float(np.sqrt(area / _MOST)))
     while True:
@@ -303,7 +302,7 @@ def _thinned(vertices: np.ndarray, faces: np.ndarray, cell: float) -> np.ndarray
 
 @functools.cache
 def _capsules(hand: Hand) -> _Capsules:
-    """Which of the hand's capsules must not overlap, and points on their axes."""
+    """Which of the hand's capsules must not overlap, and points on the axes of those that collide, or on solids."""
     links, radii = hand.capsule_links, hand.capsule_radii
     names = [link.name for link in hand.links]
     nested = {frozenset(pair) for pair in (*overlapping(hand), *((link.name, link.parent) for link in hand.links))}
@@ -312,14 +311,22 @@ def _capsules(hand: Hand) -> _Capsules:
         a != b and frozenset((names[a], names[b])) not in nested
         for a, b in zip(links[first], links[second], strict=True)
     ]
+    solid = {
+        i: mesh_of([Piece(x.kind, x.size, x.position, x.quaternion) for x in link.solids])
+        for i, link in enumerate(hand.links)
+        if link.solids
+    }
     axes = [
         np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / _SPACING)).astype(np.float32)
-        for start, end in hand.capsules
+        for (start, end), link in zip(hand.capsules, links, strict=True)
+        if link not in solid
     ]
+    round_links = [i for i, link in enumerate(links) if link not in solid]
     counts = [len(points) for points in axes]
+    solid_links, solid_points = _spread(solid)
     return _Capsules(
         np.stack([first, second])[:, apart],
-        np.repeat(links, counts),
-        np.concatenate(axes).astype(np.float32),
-        np.repeat(radii, counts),
+        np.concatenate([np.repeat(links[round_links], counts), solid_links]).astype(int),
+        np.concatenate([*axes, solid_points]).astype(np.float32),
+        np.concatenate([np.repeat(radii[round_links], counts), np.zeros(len(solid_links))]).astype(np.float32),
     )

@@ -266,12 +266,12 @@ def test_meshes_are_measured_against_the_object_beside_the_capsules(own):
     assert depth(-side, 0.0, -side) == pytest.approx(0.03 - (0.045 - 0.02 * np.sqrt(2)), abs=5e-4)
     assert depth(-0.06, 0.0, 0.0) == 0.0
     seen = np.zeros((1, 3), np.float32), upright, np.zeros(1, int), field
-    assert np.isnan(plausibility.hand_mesh(get_hand("sharpa"), transforms, *seen)).all()
+    assert np.isnan(plausibility.hand_mesh(get_hand("allegro"), transforms, *seen)).all()
     # Allegro's palm is a box whose front is at x = 11.1 mm: the ball's middle is 25 mm before it.
     allegro = get_hand("allegro")
     flat = link_transforms(allegro, np.zeros((1, len(allegro.joints)), np.float32))
     seen = np.array([[0.0111 + 0.025, -0.025, 0.0475]], np.float32), upright, np.zeros(1, int), field
-    assert float(plausibility.hand_mesh(allegro, flat, *seen)[0]) == pytest.approx(0.005, abs=5e-4)
+    assert float(plausibility.hand_object(allegro, flat, *seen)[0]) == pytest.approx(0.005, abs=5e-4)
 
 
 def test_points_on_a_large_mesh_are_bounded_before_they_are_sampled(own, tmp_path, monkeypatch):
