@@ -60,7 +60,9 @@ def feed(hub):
             update = bundle.meta["transitions"] // (BATCH * STEPS * WORLDS)
             for number in range(update * BATCH, (update + 1) * BATCH):
                 message = rollout(number, bundle)
-                while transport.query(keys.rollout("a"), message, timeout=5).meta["outcome"] != "accepted":
+                # A query whose answer came too late is repeated: its rollout had arrived.
+                arrived = ("accepted", "duplicate")
+                while transport.query(keys.rollout("a"), message, timeout=5).meta["outcome"] not in arrived:
                     time.sleep(0.005)
             known = bundle.meta["version"]
         except TransportError:
