@@ -2,7 +2,7 @@
 
 Geometry, limits and masses are those of the maker's published models (BSD-2, SimLab 2016). Wrist frame: origin at the
 palm's mounting end, fingers towards +z, closing side +x, index finger on the side of +y. What collides are the makers'
-boxes, 20 x 27 mm across a phalanx, and their round fingertips; rewards and features go by capsules inside them.
+boxes, 20 x 27 mm across a phalanx, and their round fingertips; rewards and features go by capsules of 23 mm.
 """
 
 import dataclasses
@@ -49,8 +49,7 @@ def _boxed(
 ) -> tuple[Link, ...]:
     """Links with the makers' boxes, from `points` on along the last of `axes` (3, 3), as columns; on the last link also
     a capsule `tip` (m from its joint to its middle, half length)."""
-    x, y, z, w = Rotation.from_matrix(axes).as_quat()
-    quaternion, along = (float(w), float(x), float(y), float(z)), axes[:, 2]
+    quaternion, along = _quaternion(axes), axes[:, 2]
     found = []
     for link, point, length in zip(links, points, lengths, strict=False):
         box = Solid("box", (_THICK, _WIDE, length / 2), vector(point + length / 2 * along), quaternion)
@@ -58,6 +57,12 @@ def _boxed(
     place, half = tip
     end = Solid("capsule", (_TIP_RADIUS, half, 0.0), vector(points[len(links) - 1] + place * along), quaternion)
     return (*found[:-1], dataclasses.replace(found[-1], solids=(*found[-1].solids, end)))
+
+
+def _quaternion(axes: np.ndarray) -> tuple[float, float, float, float]:
+    """(w, x, y, z) of a frame with these axes as columns (3, 3)."""
+    w, x, y, z = Rotation.from_matrix(axes).as_quat(scalar_first=True).tolist()
+    return w, x, y, z
 
 
 def _links(
@@ -97,8 +102,7 @@ def _thumb() -> tuple[Link, ...]:
     middle = root - 0.0179 * up + 0.009 * forward + 0.0145 * out
     housing = Capsule(vector(middle - 0.008 * out), vector(middle + 0.008 * out), 0.0150)
     turn = np.stack([np.cross(forward, out), forward, out], -1)
-    x, y, z, w = Rotation.from_matrix(turn).as_quat()
-    solid = Solid("box", (0.0179, 0.0170, 0.02275), vector(middle), (float(w), float(x), float(y), float(z)))
+    solid = Solid("box", (0.0179, 0.0170, 0.02275), vector(middle), _quaternion(turn))
     block = dataclasses.replace(block, capsules=(housing,), solids=(solid,))
     return (block, *_boxed(tuple(rest), points[1:], turn, _THUMB_BOXES, (0.0350, 0.008)))
 

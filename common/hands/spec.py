@@ -106,7 +106,7 @@ class Link:
     tip: Vector | None = None
     """The fingertip, on the last link of a finger."""
     solids: tuple[Solid, ...] = ()
-    """What collides in physics instead of the capsules, where the hand's own collision geometry was asked for."""
+    """What collides in physics instead of the capsules, where there are any."""
 
 
 @dataclasses.dataclass(frozen=True)

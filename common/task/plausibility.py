@@ -316,17 +316,16 @@ def _capsules(hand: Hand) -> _Capsules:
         for i, link in enumerate(hand.links)
         if link.solids
     }
-    axes = [
-        np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / _SPACING)).astype(np.float32)
-        for (start, end), link in zip(hand.capsules, links, strict=True)
-        if link not in solid
-    ]
-    round_links = [i for i, link in enumerate(links) if link not in solid]
-    counts = [len(points) for points in axes]
+    axes = {
+        k: np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / _SPACING)).astype(np.float32)
+        for k, (start, end) in enumerate(hand.capsules)
+        if links[k] not in solid
+    }
+    round_ones = np.repeat(np.array([*axes], int), [len(points) for points in axes.values()])
     solid_links, solid_points = _spread(solid)
     return _Capsules(
         np.stack([first, second])[:, apart],
-        np.concatenate([np.repeat(links[round_links], counts), solid_links]).astype(int),
-        np.concatenate([*axes, solid_points]).astype(np.float32),
-        np.concatenate([np.repeat(radii[round_links], counts), np.zeros(len(solid_links))]).astype(np.float32),
+        np.concatenate([links[round_ones], solid_links]),
+        np.concatenate([*axes.values(), solid_points]),
+        np.concatenate([radii[round_ones], np.zeros(len(solid_links), np.float32)]),
     )

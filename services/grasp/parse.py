@@ -33,7 +33,7 @@ from services.record.goals import grasp_span
 
 ABOVE = "above"
 """The heading straight down, whatever the object's pose."""
-_LARGEST = 4 << 20  # bytes of a JSON file
+_LARGEST = 4 << 20  # bytes of a JSON or CSV file
 _FAR = 1.0  # m from an object beyond which nobody grasps it
 _NEAR = 0.004  # m from a part within which a point of the surface belongs to it
 
@@ -242,7 +242,7 @@ def _trajectory(written: Written) -> dict[str, np.ndarray] | None:
         return _resampled(position, quaternion, waypoints, str(path))
     if path.suffix.lower() == ".csv":
         try:
-            position, quaternion = read_csv(path)
+            position, quaternion = read_csv(path, _LARGEST)
         except CongraspError as error:
             raise CongraspError(f"--trajectory: {error}") from None
     else:

@@ -155,15 +155,15 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
     return found, column, names
 
 
-def read_csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines, of which a first one of names counts for nothing.
 
     Raises:
-      CongraspError: the file cannot be read, or a line is not seven finite numbers.
+      CongraspError: the file has more than `largest` bytes or cannot be read, or a line is not seven finite numbers.
     """
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
-        lines = read_file(path, _LARGEST, remedy).decode("utf-8-sig").splitlines()
+        lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
     except OSError as error:
         raise CongraspError(f"{path} cannot be read: {error.strerror}.", remedy) from None
     except UnicodeDecodeError:
@@ -192,7 +192,7 @@ def _is_number(word: str) -> bool:
 
 def _csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
     """Positions, quaternions and seconds between two frames, of a CSV file."""
-    return _checked(path, *read_csv(path))
+    return _checked(path, *read_csv(path, _LARGEST))
 
 
 def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:

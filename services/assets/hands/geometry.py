@@ -81,9 +81,9 @@ def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
 
 
 def inertia_box(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """World corners of the box with a body's mass and inertia, if it has a mass and is as large as a link can be."""
+    """World corners of the box with a body's mass and inertia, if the file has them and it is as large as a link."""
     mass, (x, y, z) = model.body_mass[body], model.body_inertia[body]
-    if mass <= LEAST[0]:
+    if mass < 1e-4 or (mass, x, y, z) == (LEAST[0], *3 * (LEAST[1],)):
         return []
     half = np.sqrt(np.maximum(1.5 * np.array([y + z - x, x + z - y, x + y - z]) / mass, 0.0))
     if half.max() > _PLAUSIBLE[1] or half.max() < _PLAUSIBLE[0]:
