@@ -22,7 +22,7 @@ from common.hands.spec import Hand
 from common.task import metrics, sensing
 from common.task.constraints import blocks
 from common.task.constraints.base import Scene
-from common.task.control import decode
+from common.task.control import decode, track_load, wrist_load
 from common.task.features import features
 from common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
 from common.task.reward import reward_terms, terms
@@ -69,6 +69,8 @@ class EnvState(NamedTuple):
     """(B, F) targets of the previous step."""
     u_target: Array
     """(B, 6)."""
+    momentum: Array
+    """(B, 6) of the observer of the wrist's load (`common.task.control.track_load`)."""
     tracker: Tracker | None
     """What shows the objects' poses; None where the policy sees the true ones."""
     readings: Readings | None
@@ -139,6 +141,7 @@ class GraspEnv:
             time=index,
             q_target=reset_state.q,
             u_target=jnp.zeros((batch, 6)),
+            momentum=jnp.zeros((batch, 6)),
             **self._first_readings(initial),
             success=success.begin(reset_state.object_position[:, 2]),
             sums=sums,
@@ -207,6 +210,9 @@ class GraspEnv:
         )
         if settings.protocol is not None:
             state = state._replace(frame=protocols.frame(settings.protocol, task, state.time))
+        seen = protocols.carried(physics_state, state.reset_state.base_quaternion, state.frame)
+        momentum = track_load(self.hand, task, state.momentum, seen.u, seen.u_velocity, state.u_target)
+        state = state._replace(momentum=jnp.where(physics_state.diverged[:, None], 0.0, momentum))
         state = self.with_scene(self._sense(state, physics_state), physics_state)
         scene = self.scene_of(state)
         tracked, up = success.track(task, state.success, scene, physics_state.diverged)
@@ -261,6 +267,7 @@ class GraspEnv:
             q_initial=reset_state.q,
             object_position_initial=reset_state.object_position,
             object_quaternion_initial=reset_state.object_quaternion,
+            wrist_load=wrist_load(self.hand, self.task, state.momentum, physics_state.u, physics_state.u_velocity),
             time=state.time.astype(jnp.float32),
             table=self.table_present(state),
         )

@@ -73,6 +73,9 @@ class ControlConfig:
     """The same about its hinges, rad/s^2."""
     hold_acceleration: float = 1 / 3
     """Share of both that is left when the table is gone, but for what slows the wrist down: it trembles less so."""
+    load_rate: float = 60.0
+    """Inverse time constant (1/s) of the observer of the wrist's load, which its targets carry when the table is gone,
+    so that the limits on acceleration are none on weight; 0: they carry nothing."""
     lookahead: int = 1
     """Waypoints ahead of the nearest one that the guidance aims at (0 is the paper's ablation without feed-forward)."""
     follow_object: bool = False
@@ -409,7 +412,7 @@ def with_older_physics(task: Any) -> Any:
     control = task.get("control", {}) if isinstance(task, dict) else None
     if not isinstance(control, dict):
         return task
-    then = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0, "hold_acceleration": 1.0}
+    then = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0, "hold_acceleration": 1.0, "load_rate": 0.0}
     return {"contact_time": 0.016, **task, "control": {**then, **control}}
 
 

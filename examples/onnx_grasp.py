@@ -113,6 +113,7 @@ class Grasp:
         mujoco.mju_mat2Quat(base.quat, turn.ravel())
         self.q_target, self.u_target, self.time = data.qpos[self.fingers].copy(), np.zeros(6), 0
         self.readings = []  # of the control steps before this one, newest first
+        self.momentum = np.zeros(6)  # of the observer of what the wrist carries
         mujoco.mj_forward(model, data)
 
     def guidance(self, center):
@@ -227,8 +228,31 @@ class Grasp:
             limit = self.control[servo["limit"]]
             slowing = servo["kp"] / servo["kv"] * np.linalg.norm(speed[part])
             hardest = servo["inertia"] / servo["kp"] * (np.clip(slowing, share * limit, limit) or np.inf)
-            found.append(steady + shorten(wanted - steady, hardest))
+            carried = 0.0 if table else shorten(-self.load()[part] * servo["inertia"] / servo["kp"], most)
+            found.append(steady + shorten(wanted - steady, hardest) + carried)
         return np.concatenate(found)
+
+    def load(self):
+        """(6,) m/s^2 and rad/s^2 that everything but its servos gives the wrist."""
+        return self.control["load_rate"] * (self.generalised_speed() - self.momentum)
+
+    def generalised_speed(self):
+        """(6,) the wrist's speed plus its servos' damping times its joints."""
+        _, damping = self.servos()
+        return self.data.qvel[self.wrist_speeds] + damping * self.data.qpos[self.wrist]
+
+    def servos(self):
+        """(2, 6) stiffness (1/s^2) and damping (1/s) of the wrist's servos."""
+        kinds = [self.meta["wrist"][kind] for kind in ("position", "rotation")]
+        return np.repeat([[kind[gain] / kind["inertia"] for kind in kinds] for gain in ("kp", "kv")], 3, 1)
+
+    def track_load(self):
+        """Updates the momentum of the load observer after a control step."""
+        stiffness, _ = self.servos()
+        gained = stiffness * (self.u_target - self.data.qpos[self.wrist])
+        decay = self.task["control_dt"] * self.control["load_rate"]
+        gained = self.task["control_dt"] * gained + decay * self.generalised_speed()
+        self.momentum = (self.momentum + gained) / (1 + decay)
 
     def step(self):
         """Asks the policy, turns its action into joint targets, and steps the physics."""
@@ -264,6 +288,7 @@ class Grasp:
             self.data.mocap_pos[self.model.body("table").mocapid[0]] = self.meta["scene"]["table_away"]
         mujoco.mj_step(self.model, self.data, self.task["substeps"])
         mujoco.mj_forward(self.model, self.data)
+        self.track_load()
         self.time += 1
 
 

@@ -119,6 +119,7 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
         q_initial=joints(),
         object_position_initial=start,
         object_quaternion_initial=unit(4),
+        wrist_load=within(6, most=MAX_SPEED),
         time=rng.integers(0, task.approach_steps + task.hold_steps_max + 1, _STATES).astype(np.float32),
         table=rng.random(_STATES) < 0.5,
     )

@@ -55,6 +55,7 @@ def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
         q_initial=np.tile(HAND.q_open, (batch, 1)),
         object_position_initial=object_position + normal(3, scale=0.02),
         object_quaternion_initial=quaternions(rng, batch),
+        wrist_load=np.zeros((batch, 6), np.float32),
         time=np.full(batch, 20.0, np.float32),
         table=np.ones(batch, bool),
     )

@@ -266,6 +266,16 @@ class Hand:
         mass = sum(link.mass for link in self.links)
         return np.array([mass + self.wrist.slide_armature, mass * _GYRATION**2 + self.wrist.hinge_armature])
 
+    @functools.cached_property
+    def wrist_servos(self) -> np.ndarray:
+        """(2, 6) stiffness kp / m (1/s^2) and damping kv / m (1/s) of the wrist joints' servos."""
+        gains, (mass, inertia) = self.wrist, self.wrist_inertia
+        slide, hinge = (
+            (gains.slide_kp / mass, gains.slide_kv / mass),
+            (gains.hinge_kp / inertia, gains.hinge_kv / inertia),
+        )
+        return np.repeat(np.array([slide, hinge], np.float32).T, 3, axis=1)
+
     def _pose(self, angles: dict[str, float]) -> np.ndarray:
         """(F,) angles in the order of the joints; those that follow others are where these put them."""
 

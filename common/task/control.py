@@ -5,12 +5,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from common.config import ControlConfig
+from common.config import ControlConfig, TaskConfig
 from common.hands.motors import joint_positions, motor_limits, motor_positions
+from common.hands.spec import Hand
 from common.task.constraints import known
 from common.task.constraints.base import Scene
 from common.task.geometry import wrist_to_joints
-from common.task.types import Action, Array
+from common.task.types import Action, Array, SceneState
 
 jax.tree_util.register_dataclass(
     ControlConfig,
@@ -24,7 +25,7 @@ jax.tree_util.register_dataclass(
         "wrist_angular_acceleration",
         "hold_acceleration",
     ],
-    meta_fields=["lookahead", "follow_object", "finger_guidance"],
+    meta_fields=["load_rate", "lookahead", "follow_object", "finger_guidance"],
 )
 
 
@@ -48,7 +49,8 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     """Joint targets of a residual action (B, M + 6), of the M finger motors and the wrist.
 
     m_tgt = clamp(m_tgt_prev + alpha_f a_f, limits) of the motors, which put joints at q_tgt; u_tgt = u_g + alpha_w a_w,
-    nearer to the wrist where it would else become faster or be accelerated harder than the limits allow (`_lead`).
+    nearer to the wrist where it would else become faster or be accelerated harder than the limits allow (`_lead`). When
+    the table is gone, u_tgt also leads by what carries the load (`wrist_load`), around which the limits then hold.
     """
     hand, state = scene.hand, scene.state
     fingers = len(hand.motors)
@@ -57,25 +59,62 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
         motors += _finger_guidance(scene, control.finger_guidance)
     q_target = joint_positions(hand, jnp.clip(motors, *motor_limits(hand)))
     ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
-    gains, (mass, inertia) = hand.wrist, hand.wrist_inertia
-    slides = _Servo(
-        gains.slide_kp / mass, gains.slide_kv / mass, control.guidance_position_limit, control.wrist_acceleration
-    )
-    hinges = _Servo(
-        gains.hinge_kp / inertia,
-        gains.hinge_kv / inertia,
-        control.guidance_rotation_limit,
-        control.wrist_angular_acceleration,
-    )
+    return Action(q_target, wrist_target(hand, control, state, ahead, action[..., fingers:]))
+
+
+def wrist_target(hand: Hand, control: ControlConfig, state: SceneState, ahead: Array, residual: Array) -> Array:
+    """u_tgt (B, 6), see `decode`.
+
+    Args:
+      hand: its servos.
+      control: limits and scales.
+      state: the present control step.
+      ahead: (B, 6) m and rad from the wrist to its guidance.
+      residual: (B, 6) the wrist's part of the action.
+    """
     share = jnp.where(state.table, 1.0, control.hold_acceleration)
-    leads = [
-        _lead(servo, ahead[..., part], scale * action[..., fingers:][..., part], state.u_velocity[..., part], share)
-        for servo, scale, part in (
-            (slides, control.wrist_position_scale, slice(0, 3)),
-            (hinges, control.wrist_rotation_scale, slice(3, 6)),
-        )
-    ]
-    return Action(q_target, state.u + jnp.concatenate(leads, -1))
+    carried = jnp.where(state.table[..., None], 0.0, -state.wrist_load)
+    leads = []
+    for part, scale, farthest, hardest in (
+        (slice(0, 3), control.wrist_position_scale, control.guidance_position_limit, control.wrist_acceleration),
+        (
+            slice(3, 6),
+            control.wrist_rotation_scale,
+            control.guidance_rotation_limit,
+            control.wrist_angular_acceleration,
+        ),
+    ):
+        stiffness, damping = hand.wrist_servos[:, part.start]
+        servo = _Servo(stiffness, damping, farthest, hardest)
+        lead = _lead(servo, ahead[..., part], scale * residual[..., part], state.u_velocity[..., part], share)
+        leads.append(lead + _limit(carried[..., part] / stiffness, farthest))
+    return state.u + jnp.concatenate(leads, -1)
+
+
+def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array, u_target: Array) -> Array:
+    """Momentum z (B, 6) of the load observer after a control step, m/s and rad/s; zero when an episode begins.
+
+    With w = v + damping u, the servos' law is dw/dt = stiffness (u_tgt - u) + d, where d is what everything else
+    gives the wrist. The observer integrates dz/dt = stiffness (u_tgt - u) + rate (w - z), so that rate (w - z) is d
+    behind a low-pass of time constant 1 / rate (De Luca and Mattone 2003, doi 10.1109/ROBOT.2003.1241662).
+
+    Args:
+      hand: its servos.
+      task: length of a control step, and the rate.
+      momentum: (B, 6) z before the step.
+      u: (B, 6) wrist joints after the step.
+      u_velocity: (B, 6).
+      u_target: (B, 6) the step's targets.
+    """
+    stiffness, damping = hand.wrist_servos
+    decay = task.control_dt * task.control.load_rate
+    gained = task.control_dt * stiffness * (u_target - u) + decay * (u_velocity + damping * u)
+    return (momentum + gained) / (1.0 + decay)
+
+
+def wrist_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array) -> Array:
+    """d (B, 6), m/s^2 and rad/s^2, that everything but its servos gives the wrist; see `track_load`."""
+    return task.control.load_rate * (u_velocity + hand.wrist_servos[1] * u - momentum)
 
 
 class _Servo(NamedTuple):

@@ -57,6 +57,8 @@ class SceneState(NamedTuple):
     """(B, 3) object's position at the start of the episode."""
     object_quaternion_initial: Array
     """(B, 4)."""
+    wrist_load: Array
+    """(B, 6) m/s^2 and rad/s^2 that what the hand carries gives the wrist joints (`common.task.control.wrist_load`)."""
     time: Array
     """(B,) control steps since the episode began, float."""
     table: Array

@@ -47,6 +47,7 @@ _OPTIONAL_STATE = (
     "contact_force",
     "contact_position",
     "contact_found",
+    "wrist_load",
 )
 
 
@@ -74,7 +75,7 @@ class Layout:
         contacts = (links, CONTACTS_PER_LINK)
         special: dict[str, tuple[int, ...]] = {
             **dict.fromkeys(("q", "q_velocity", "q_target", "q_initial"), (fingers,)),
-            **dict.fromkeys(("u", "u_velocity", "u_target"), (6,)),
+            **dict.fromkeys(("u", "u_velocity", "u_target", "wrist_load"), (6,)),
             **dict.fromkeys(("contact_force", "contact_position"), (*contacts, 3)),
             **dict.fromkeys(("time", "table"), ()),
             "contact_found": contacts,

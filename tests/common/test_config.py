@@ -24,7 +24,7 @@ def test_a_run_of_before_a_setting_keeps_what_held_then():
     config = RunConfig()
     older = json.loads(to_json(config))
     del older["task"]["contact_time"]
-    then = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0, "hold_acceleration": 1.0}
+    then = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0, "hold_acceleration": 1.0, "load_rate": 0.0}
     for name in then:
         del older["task"]["control"][name]
     control = dataclasses.replace(config.task.control, **then)

@@ -161,6 +161,7 @@ def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
         q_initial=hand.q_open,
         object_position_initial=grasp.object_position,
         object_quaternion_initial=turn(grasp.object_matrix),
+        wrist_load=np.zeros(6),
         time=np.float32(grasp.time),
         table=np.bool_(grasp.time < task.approach_steps),
     )
