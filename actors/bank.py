@@ -24,9 +24,9 @@ from common.task.sampling.approach_paths import make_trajectories
 from common.task.sampling.closed_poses import Poses, closed_poses
 from common.task.sampling.headings import (
     INWARD,
-    MAX_WIDTH,
     Headings,
     above,
+    max_width,
     sample_headings,
     within_reach,
 )
@@ -139,8 +139,6 @@ def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints
 def height_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
     """(M, R) m, how high the lowest of a hand's capsules stays over the table on the way to each of M reference poses.
 
-    With the pose's fingers all along, and with open ones at the start.
-
     Args:
       hand: the hand.
       q: (M, F) finger angles of the poses.
@@ -153,16 +151,11 @@ def height_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Arr
 
 def _height_on_the_way(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
     """(R,) m, `height_over_table` of one reference."""
-
-    def lowest(q: Array, path: Array, turns: Array) -> Array:
-        """(R,) m over the table."""
-        ends = kinematics.capsules(hand, kinematics.link_transforms(hand, q)).reshape(-1, 3)
-        ends = rotations.transform(path, turns, jnp.broadcast_to(ends, (len(path), *ends.shape)))
-        up = rotations.to_matrix(rest[:, 3:])[:, None, None, 2]
-        height = jnp.sum(up * ends, -1) + rest[:, None, None, 2] - np.repeat(hand.capsule_radii, 2)
-        return jnp.min(height, (1, 2))
-
-    return jnp.minimum(lowest(q, path, turns), lowest(jnp.array(hand.q_open), path[:1], turns[:1]))
+    ends = kinematics.capsules(hand, kinematics.link_transforms(hand, q)).reshape(-1, 3)
+    ends = rotations.transform(path, turns, jnp.broadcast_to(ends, (len(path), *ends.shape)))
+    up = rotations.to_matrix(rest[:, 3:])[:, None, None, 2]
+    height = jnp.sum(up * ends, -1) + rest[:, None, None, 2] - np.repeat(hand.capsule_radii, 2)
+    return jnp.min(height, (1, 2))
 
 
 def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> Array:
@@ -220,14 +213,14 @@ def headings_of(
       CongraspError: it has no heading that the hand can reach in any resting pose.
     """
     rng = np.random.default_rng(seed)
-    inward, width = scale * INWARD, scale * MAX_WIDTH
+    inward, width = scale * INWARD, max_width(hand, scale)
     whole, graspable = (
         given or sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width)
         for use in (False, True)
     )
     assert whole is not None, "only the graspable region may be out of reach"
     sets = [whole, graspable or whole]
-    found = [within_reach(headings, obj.points, obj.rest_poses, hand, task.back_off) for headings in sets]
+    found = [within_reach(headings, obj.points, obj.rest_poses, hand) for headings in sets]
     reachable = np.stack([fine for _, fine in found])
     if task.headings == "above" and reachable[0].any():
         steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
@@ -236,7 +229,7 @@ def headings_of(
     if len(usable) == 0:
         raise CongraspError(
             f"The object '{obj.name}' cannot be approached in any of its resting poses.",
-            f"Scale it so that some part is narrower than {100 * scale * MAX_WIDTH:.0f} cm, or leave it out.",
+            f"Scale it so that some part is narrower than {100 * width:.0f} cm, or leave it out.",
         )
     reachable, rest = reachable[:, usable], obj.rest_poses[usable]
     index = np.array([[_repeated(row) for row in region] for region in reachable])

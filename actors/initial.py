@@ -12,12 +12,18 @@ import numpy as np
 from actors.physics.engine import ResetState
 from common import rotations
 from common.config import SensingConfig, TaskConfig
+from common.hands import kinematics
+from common.hands.closure import MARGIN, preshape
 from common.hands.spec import Hand
 from common.task.bank import ConstraintBank, Draw
 from common.task.constraints import known, optional
 from common.task.constraints.priority import Resolution, resolve
+from common.task.sampling.headings import Headings, local_width
 from common.task.sensing import Sensors, draw_sensors
 from common.task.types import Array, Goal, Surface
+
+_CLEARANCE = 0.005
+"""Metres over the table that a hand begins with at least."""
 
 
 class InitialConditions(NamedTuple):
@@ -35,6 +41,17 @@ class InitialConditions(NamedTuple):
     """(B,) int: control steps without the table before the episode ends."""
     sensors: Sensors
     """What shows the objects' poses to policies that do not see the true ones."""
+
+
+class Approach(NamedTuple):
+    """How B approaches begin, beside what their constraints say."""
+
+    back_off: Array
+    """(B,) m from the aligned wrist back, where the heading guides it."""
+    margin: Array
+    """(B,) m that the fingers are opened wider than the object."""
+    speed: Array
+    """(B,) m/s of the wrist along the heading."""
 
 
 class RequestedEpisodes(NamedTuple):
@@ -74,7 +91,22 @@ def sample(
         for c in optional(task)
     }
     draw = Draw(bank, objects, rests, disturbance=_disturbance(task, own_key(key, "disturbance", 0), batch))
-    return _drawn(hand, task, draw, next(keys), wanted, stationary)
+    approach = _varied(task, own_key(key, "approach", 0), batch)
+    return _drawn(hand, task, draw, next(keys), wanted, stationary, approach)
+
+
+def _varied(task: TaskConfig, key: Array, batch: int) -> Approach:
+    """Approaches as training begins them: from near and far, at rest or in motion, opened more or less widely."""
+    distance, margin, speed = jax.random.uniform(key, (3, batch))
+    near, far = task.back_off_range
+    narrow, wide = task.preshape_margin
+    back_off = near + (far - near) * distance
+    return Approach(back_off, narrow + (wide - narrow) * margin, speed * task.initial_speed * back_off / far)
+
+
+def _nominal(task: TaskConfig, batch: int) -> Approach:
+    """Approaches as the exam and requests begin them."""
+    return Approach(jnp.full(batch, task.back_off), jnp.full(batch, MARGIN), jnp.zeros(batch))
 
 
 def _disturbance(task: TaskConfig, key: Array, batch: int) -> Array | None:
@@ -117,7 +149,8 @@ def planned(
     def one(episode: PlannedEpisodes) -> InitialConditions:
         own = jax.random.fold_in(jax.random.fold_in(key, episode.names), episode.numbers)
         draw = Draw(bank, episode.objects[None], episode.rests[None])
-        return _drawn(hand, task, draw, own, {c.name: jnp.array([c.name in asked]) for c in optional(task)}, False)
+        wanted = {c.name: jnp.array([c.name in asked]) for c in optional(task)}
+        return _drawn(hand, task, draw, own, wanted, False, _nominal(task, 1))
 
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(one)(plan))
 
@@ -151,6 +184,7 @@ def _drawn(
     key: Array,
     wanted: Mapping[str, Array],
     stationary: Array | bool,
+    approach: Approach,
 ) -> InitialConditions:
     """What is left to draw of B episodes of given objects, resting poses and (where they can be had) constraints."""
     bank, batch = draw.bank, draw.objects.shape
@@ -167,7 +201,9 @@ def _drawn(
         hand,
         task,
         goal,
+        surface,
         bank.rest[draw.objects, draw.rests],
+        approach,
         objects=draw.objects,
         mass_scale=low + (high - low) * mass,
         friction=friction_low + (friction_high - friction_low) * friction,
@@ -233,7 +269,9 @@ def given(hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int) -
         hand,
         task,
         resolution.goal,
+        request.surface,
         request.rest,
+        _nominal(task, batch),
         objects=index,
         mass_scale=nominal,
         friction=nominal,
@@ -249,7 +287,9 @@ def start(
     hand: Hand,
     task: TaskConfig,
     goal: Goal,
+    surface: Surface,
     rest: Array,
+    approach: Approach,
     *,
     objects: Array,
     mass_scale: Array,
@@ -258,7 +298,9 @@ def start(
     stationary: Array,
 ) -> ResetState:
     """The hand where its constraints let it begin, beside the objects in their resting poses (B, 7)."""
-    q, base_position, base_quaternion = initial_hand(hand, task, goal, rest)
+    q, base_position, base_quaternion = initial_hand(hand, task, goal, surface, rest, approach)
+    along = rotations.rotate(rest[:, 3:], goal["heading"].direction)
+    velocity = rotations.rotate(rotations.conjugate(base_quaternion), approach.speed[:, None] * along)
     return ResetState(
         object_index=objects,
         mass_scale=mass_scale,
@@ -266,6 +308,7 @@ def start(
         gain_scale=gain_scale,
         base_position=base_position,
         base_quaternion=base_quaternion,
+        u_velocity=jnp.pad(velocity, ((0, 0), (0, 3))),
         q=q,
         object_position=rest[:, :3],
         object_quaternion=rest[:, 3:],
@@ -273,22 +316,41 @@ def start(
     )
 
 
-def initial_hand(hand: Hand, task: TaskConfig, goal: Goal, rest: Array) -> tuple[Array, Array, Array]:
+def initial_hand(
+    hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: Array, approach: Approach | None = None
+) -> tuple[Array, Array, Array]:
     """Finger angles (B, F) and world wrist poses (B, 3), (B, 4) at the start, as the constraints have it.
+
+    The fingers are opened to the object's width at the heading, and a hand that would be in the table begins as much
+    higher.
 
     Args:
       hand: the hand.
       task: geometry of the approach.
       goal: after the priority rules.
+      surface: of the objects.
       rest: (B, 7) the objects' resting poses.
+      approach: how it begins; nominally by default.
     """
+    approach = approach or _nominal(task, len(rest))
     q = jnp.broadcast_to(jnp.array(hand.q_open), (rest.shape[0], len(hand.joints)))
+    if task.preshape:
+        heading = Headings(*(axis[:, None] for axis in goal["heading"]))
+        q = preshape(hand, local_width(heading, surface.points)[:, 0], approach.margin)
     for constraint in known(task):
         if (fingers := constraint.initial_fingers(goal)) is not None:
             q = jnp.where(fingers[0][:, None], fingers[1], q)
     position, quaternion = jnp.zeros_like(rest[:, :3]), jnp.zeros_like(rest[:, 3:])
     for constraint in known(task):
-        if (wrist := constraint.initial_wrist(hand, task, goal, q)) is not None:
+        if (wrist := constraint.initial_wrist(hand, approach.back_off, goal, q)) is not None:
             where = wrist[0][:, None]
             position, quaternion = jnp.where(where, wrist[1], position), jnp.where(where, wrist[2], quaternion)
-    return q, *rotations.compose_pose(rest[:, :3], rest[:, 3:], position, quaternion)
+    position, quaternion = rotations.compose_pose(rest[:, :3], rest[:, 3:], position, quaternion)
+    return q, position.at[:, 2].add(jnp.maximum(_CLEARANCE - _lowest(hand, q, position, quaternion), 0.0)), quaternion
+
+
+def _lowest(hand: Hand, q: Array, position: Array, quaternion: Array) -> Array:
+    """(B,) m over the table of the lowest point of hands at wrist poses (B, 3), (B, 4), world frame."""
+    ends = kinematics.capsules(hand, kinematics.link_transforms(hand, q)).reshape(len(q), -1, 3)
+    height = jnp.sum(rotations.to_matrix(quaternion)[:, None, 2] * ends, -1) + position[:, 2:]
+    return jnp.min(height - np.repeat(hand.capsule_radii, 2), -1)

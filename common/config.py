@@ -64,6 +64,10 @@ class ControlConfig:
     """alpha_w of the three hinges, rad per unit of action."""
     guidance_position_limit: float = 0.04
     """The wrist's target is at most this far ahead of it, m: at kp/kv = 20/s a speed of 0.8 m/s."""
+    closing_position_limit: float = 0.015
+    """The same within `closing_distance` of the object, as long as the table is there: 0.3 m/s."""
+    closing_distance: float = 0.04
+    """Metres between the hand's keypoints and the object within which it closes in slowly."""
     guidance_rotation_limit: float = 0.3
     """The wrist's target is at most this far ahead of it, rad: 5 rad/s."""
     wrist_acceleration: float = 15.0
@@ -118,8 +122,8 @@ class TaskConfig(_Shares):
     """Seconds between two actions."""
     substeps: int = 4
     """Physics steps in one control step."""
-    approach_steps: int = 50
-    """Control steps before the table is removed."""
+    approach_steps: int = 100
+    """Control steps before the table is removed; 50 in the paper."""
     hold_steps: int = 25
     """Control steps without the table that count for success (and the least in training)."""
     hold_steps_max: int = 25
@@ -137,6 +141,15 @@ class TaskConfig(_Shares):
     """Time constant of the hand's contacts, s; at least two physics steps. At 0.006 a grasp's are about 1 mm deep."""
     back_off: float = 0.15
     """Metres from the aligned wrist to its start, against the heading direction."""
+    back_off_range: tuple[float, float] = (0.05, 0.25)
+    """The same in training, uniform at every reset."""
+    initial_speed: float = 0.8
+    """Training begins with a wrist that moves along the heading with up to this speed, m/s, at the far end of
+    `back_off_range`, and proportionally less nearer by; 0: at rest."""
+    preshape: bool = True
+    """Fingers begin opened to the object's width at the heading (`common.hands.closure`); else in the open pose."""
+    preshape_margin: tuple[float, float] = (0.015, 0.06)
+    """Metres that the fingers are opened wider than the object in training, uniform at every reset."""
     surface_points: int = 256
     """Surface points of an object that the policy senses (at most 512)."""
     trajectory_points: int = 15
@@ -412,8 +425,16 @@ def with_older_physics(task: Any) -> Any:
     control = task.get("control", {}) if isinstance(task, dict) else None
     if not isinstance(control, dict):
         return task
-    then = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0, "hold_acceleration": 1.0, "load_rate": 0.0}
-    return {"contact_time": 0.016, **task, "control": {**then, **control}}
+    then = {
+        "wrist_acceleration": 0.0,
+        "wrist_angular_acceleration": 0.0,
+        "hold_acceleration": 1.0,
+        "load_rate": 0.0,
+        "closing_position_limit": control.get("guidance_position_limit", 0.04),
+    }
+    back_off = task.get("back_off", 0.15)
+    begun = {"preshape": False, "initial_speed": 0.0, "back_off_range": [back_off, back_off]}
+    return {"contact_time": 0.016, **begun, **task, "control": {**then, **control}}
 
 
 def _no_constant(name: str) -> float:

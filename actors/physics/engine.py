@@ -29,6 +29,8 @@ class ResetState(NamedTuple):
     """(B, 3) initial wrist position: the wrist joints are zero there."""
     base_quaternion: Array
     """(B, 4)."""
+    u_velocity: Array
+    """(B, 6) initial velocity of the wrist joints, m/s and rad/s."""
     q: Array
     """(B, F) initial finger angles."""
     object_position: Array

@@ -14,7 +14,7 @@ import numpy as np
 from mujoco import mjx
 
 from actors.physics.engine import PhysicsState, ResetState, where_environments
-from actors.physics.physics_state import has_diverged, initial_qpos, physics_state
+from actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
 from actors.physics.scene import GAINS, SENSOR_WIDTH, TABLE_AWAY, addresses
 from actors.physics.slots import Pool
 from common.config import TaskConfig
@@ -166,7 +166,7 @@ class MjxPhysics:
         qpos = initial_qpos(where, self._nq, reset_state)
         data = data.replace(
             qpos=qpos,
-            qvel=jnp.zeros((batch, self._nv)),
+            qvel=initial_qvel(where, self._nv, reset_state),
             ctrl=jnp.zeros((batch, self._nu)),
             qacc_warmstart=jnp.zeros((batch, self._nv)),
             mocap_pos=data.mocap_pos.at[:, where.table_mocap]

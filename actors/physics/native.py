@@ -168,6 +168,7 @@ class NativePhysics:
         for name in GAINS:
             getattr(model, name)[where.motors] = getattr(scene.model, name)[where.motors] * reset_state.gain_scale[i]
         data.qpos[where.finger_qpos] = reset_state.q[i]
+        data.qvel[where.wrist_qvel] = reset_state.u_velocity[i]
         data.qpos[where.object_qpos] = np.concatenate(
             [reset_state.object_position[i], reset_state.object_quaternion[i]]
         )

@@ -20,6 +20,11 @@ def initial_qpos(where: Addresses, nq: int, reset_state: ResetState) -> Array:
     )
 
 
+def initial_qvel(where: Addresses, nv: int, reset_state: ResetState) -> Array:
+    """(B, nv) of environments that start, as a JAX array: the wrist alone moves."""
+    return jnp.zeros((len(reset_state.q), nv)).at[:, where.wrist_qvel].set(reset_state.u_velocity)
+
+
 def has_diverged(xp: types.ModuleType, qpos: Array, qvel: Array) -> Array:
     """(B,) bool: environments with values that are not finite, too fast or too far away."""
     # Comparisons with NaN are false, so that NaN also fails them.

@@ -15,7 +15,7 @@ import warp as wp
 
 from actors.physics.catalogue import Catalogue
 from actors.physics.engine import PhysicsState, ResetState, where_environments
-from actors.physics.physics_state import has_diverged, initial_qpos, physics_state
+from actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
 from actors.physics.scene import SENSOR_WIDTH, addresses
 from actors.physics.warp_buffers import WarpBuffers, control_step, meshes_on, objects_on, register
 from common.config import TaskConfig
@@ -181,5 +181,9 @@ class WarpPhysics:
         index, stationary = jnp.asarray(reset_state.object_index, jnp.int32), jnp.asarray(reset_state.stationary, bool)
         reset_state = ResetState(*(jnp.asarray(leaf, jnp.float32) for leaf in reset_state))
         reset_state = reset_state._replace(object_index=index, stationary=stationary)
-        none = jnp.zeros((len(index), self._catalogue.model.nv))
-        return WarpState(initial_qpos(self._where, self._catalogue.model.nq, reset_state), none, none, reset_state)
+        model = self._catalogue.model
+        qpos, qvel = (
+            initial_qpos(self._where, model.nq, reset_state),
+            initial_qvel(self._where, model.nv, reset_state),
+        )
+        return WarpState(qpos, qvel, jnp.zeros_like(qvel), reset_state)

@@ -8,10 +8,8 @@ import jax
 import numpy as np
 
 from common.hands import kinematics
+from common.hands.closure import CLOSURES, closure_pose, table_of_gaps
 from common.hands.spec import Hand
-
-CLOSURES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
-"""Shares of the way from the open to the closed pose: open, and less and less so, down to thin things."""
 
 
 class Outline(NamedTuple):
@@ -25,7 +23,7 @@ class Outline(NamedTuple):
     radii: np.ndarray
     """(E,) m."""
     openings: np.ndarray
-    """(S,) m between the thumb's tip and the middle of the others, along w."""
+    """(S,) m between the skins of the thumb's and the nearest other fingertip, along w (`common.hands.closure`)."""
 
 
 CENTER = Outline(np.zeros((1, 1, 3)), np.array([0.01]), np.array([np.inf]))
@@ -37,14 +35,12 @@ def outline(hand: Hand) -> Outline:
     """The hand's capsules in the poses of `CLOSURES`."""
     frame = kinematics.grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
-    q = np.stack([hand.q_open + share * (hand.q_closed - hand.q_open) for share in CLOSURES])
     # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        ends, center, across = (
-            np.asarray(part, np.float64) for part in thread.submit(_posed, hand, np.float32(q)).result()
-        )
+        q = thread.submit(closure_pose, hand, CLOSURES[:, None].astype(np.float32)).result()
+        ends, center = (np.asarray(part, np.float64) for part in thread.submit(_posed, hand, q).result())
     radii = np.repeat(hand.capsule_radii, 2).astype(np.float64)
-    return Outline((ends - center[:, None]) @ axes.T, radii, across @ frame.cross)
+    return Outline((ends - center[:, None]) @ axes.T, radii, table_of_gaps(hand))
 
 
 def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
@@ -58,11 +54,8 @@ def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _posed(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of the hand at finger angles (S, F), wrist frame: the ends (S, E, 3) of its capsules, its centre (S, 3), and the
-    way (S, 3) from the thumb's tip to the middle of the others."""
+def _posed(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The ends (S, E, 3) of the hand's capsules at finger angles (S, F), and its centre (S, 3), in the wrist frame."""
     transforms = kinematics.link_transforms(hand, q)
-    ends, points = kinematics.capsules(hand, transforms), kinematics.keypoints(hand, transforms)
-    tips = points[..., len(hand.links) :, :]
-    across = tips[..., 1:, :].mean(-2) - tips[..., 0, :]
-    return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(hand, points), across
+    ends = kinematics.capsules(hand, transforms)
+    return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(hand, kinematics.keypoints(hand, transforms))

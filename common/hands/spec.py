@@ -139,6 +139,8 @@ class Hand:
     closed_pose: dict[str, float]
     """Finger angles of a fist, for pictures and for closing around an object."""
     wrist: WristGains
+    wide_pose: dict[str, float] | None = None
+    """Finger angles of the widest pose that still faces an object (`common.hands.closure`); searched for if absent."""
     object_scale: float = 1.0
     """Factor on object sizes in the paper's comparison of hands."""
     couplings: tuple[Coupling, ...] = ()
@@ -187,12 +189,12 @@ class Hand:
     @functools.cached_property
     def q_open(self) -> np.ndarray:
         """(F,) the partially open pose."""
-        return self._pose(self.open_pose)
+        return self.posed(self.open_pose)
 
     @functools.cached_property
     def q_closed(self) -> np.ndarray:
         """(F,) the fist."""
-        return self._pose(self.closed_pose)
+        return self.posed(self.closed_pose)
 
     @functools.cached_property
     def tip_links(self) -> tuple[int, ...]:
@@ -276,7 +278,7 @@ class Hand:
         )
         return np.repeat(np.array([slide, hinge], np.float32).T, 3, axis=1)
 
-    def _pose(self, angles: dict[str, float]) -> np.ndarray:
+    def posed(self, angles: dict[str, float]) -> np.ndarray:
         """(F,) angles in the order of the joints; those that follow others are where these put them."""
 
         follow = {x.joint: x.offset + x.ratio * angles.get(x.leader, 0.0) for x in self.couplings}

@@ -20,6 +20,8 @@ jax.tree_util.register_dataclass(
         "wrist_position_scale",
         "wrist_rotation_scale",
         "guidance_position_limit",
+        "closing_position_limit",
+        "closing_distance",
         "guidance_rotation_limit",
         "wrist_acceleration",
         "wrist_angular_acceleration",
@@ -59,16 +61,32 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
         motors += _finger_guidance(scene, control.finger_guidance)
     q_target = joint_positions(hand, jnp.clip(motors, *motor_limits(hand)))
     ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
-    return Action(q_target, wrist_target(hand, control, state, ahead, action[..., fingers:]))
+    limit = _position_limit(scene, control)
+    return Action(q_target, wrist_target(hand, control, state, limit, ahead, action[..., fingers:]))
 
 
-def wrist_target(hand: Hand, control: ControlConfig, state: SceneState, ahead: Array, residual: Array) -> Array:
+def _position_limit(scene: Scene, control: ControlConfig) -> Array:
+    """(B,) m, the farthest that the wrist's target is ahead of it.
+
+    While the table is there it rises from `closing_position_limit` at `closing_distance` from the object to
+    `guidance_position_limit` at twice that: fast transport, slow closing.
+    """
+    gap = jnp.min(jnp.linalg.norm(scene.features.nearest, axis=-1), -1)
+    slow, fast = control.closing_position_limit, control.guidance_position_limit
+    share = jnp.clip(gap / control.closing_distance - 1.0, 0.0, 1.0)
+    return jnp.where(scene.state.table, slow + share * (fast - slow), fast)
+
+
+def wrist_target(
+    hand: Hand, control: ControlConfig, state: SceneState, limit: Array, ahead: Array, residual: Array
+) -> Array:
     """u_tgt (B, 6), see `decode`.
 
     Args:
       hand: its servos.
       control: limits and scales.
       state: the present control step.
+      limit: (B,) m, the farthest that the target is ahead of the wrist.
       ahead: (B, 6) m and rad from the wrist to its guidance.
       residual: (B, 6) the wrist's part of the action.
     """
@@ -76,7 +94,7 @@ def wrist_target(hand: Hand, control: ControlConfig, state: SceneState, ahead: A
     carried = jnp.where(state.table[..., None], 0.0, -state.wrist_load)
     leads = []
     for part, scale, farthest, hardest in (
-        (slice(0, 3), control.wrist_position_scale, control.guidance_position_limit, control.wrist_acceleration),
+        (slice(0, 3), control.wrist_position_scale, limit[:, None], control.wrist_acceleration),
         (
             slice(3, 6),
             control.wrist_rotation_scale,
@@ -87,7 +105,7 @@ def wrist_target(hand: Hand, control: ControlConfig, state: SceneState, ahead: A
         stiffness, damping = hand.wrist_servos[:, part.start]
         servo = _Servo(stiffness, damping, farthest, hardest)
         lead = _lead(servo, ahead[..., part], scale * residual[..., part], state.u_velocity[..., part], share)
-        leads.append(lead + _limit(carried[..., part] / stiffness, farthest))
+        leads.append(lead + carried[..., part] / stiffness)
     return state.u + jnp.concatenate(leads, -1)
 
 
@@ -124,8 +142,8 @@ class _Servo(NamedTuple):
     """kp / m, 1/s^2."""
     damping: Array | float
     """kv / m, 1/s."""
-    farthest: float
-    """Greatest lead of the target, m or rad."""
+    farthest: Array | float
+    """Greatest lead (B, 1) of the target, m or rad."""
     hardest: float
     """Greatest acceleration, m/s^2 or rad/s^2; 0 for any."""
 

@@ -129,6 +129,7 @@ def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:
             gain_scale=np.ones(6 * len(grasps)),
             base_position=six([state.position for state in states]),
             base_quaternion=six([state.rotation.as_quat(scalar_first=True) for state in states]),
+            u_velocity=np.zeros((6 * len(grasps), 6)),
             q=six([state.q for state in states]),
             object_position=six([position for position, _ in objects]),
             object_quaternion=six([quaternion for _, quaternion in objects]),

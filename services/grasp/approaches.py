@@ -14,7 +14,7 @@ from common.task.sampling.headings import above, sample_headings, within_reach
 
 
 def headings(
-    hand: Hand, obj: GraspObject, request: GraspRequest, batch: int, back_off: float, rng: np.random.Generator
+    hand: Hand, obj: GraspObject, request: GraspRequest, batch: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of attempts that the table allows.
 
@@ -32,7 +32,7 @@ def headings(
         )
     options, weights = [], []
     for r, (cleared, room) in enumerate(
-        zip(*within_reach(found, obj.points, obj.rest_poses, outline(hand), back_off), strict=True)
+        zip(*within_reach(found, obj.points, obj.rest_poses, outline(hand)), strict=True)
     ):
         if request.rest not in (None, r):
             continue

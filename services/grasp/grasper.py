@@ -190,7 +190,7 @@ class Grasper:
         episodes = repeated(self.hand, self.task, labelled, request, batch)
         path = prescribed(request)
         if path is None:
-            position, direction, cross, rests = headings(self.hand, labelled, request, batch, self.task.back_off, rng)
+            position, direction, cross, rests = headings(self.hand, labelled, request, batch, rng)
             found = {"position": position, "direction": direction, "cross": cross}
             found = {name: value.astype(np.float32) for name, value in found.items()}
             episodes = episodes._replace(goal=episodes.goal.replace("heading", **found))

@@ -23,7 +23,9 @@ def main() -> None:
     one, zero, level = jnp.ones(1), jnp.zeros((1, 3)), jnp.array([[1.0, 0.0, 0.0, 0.0]])
     fingers = jnp.zeros((1, len(hand.joints)))
     index = jnp.zeros(1, int)
-    state = physics.start(ResetState(index, one, one, one, zero, level, fingers, zero, level, index > 0))
+    state = physics.start(
+        ResetState(index, one, one, one, zero, level, jnp.zeros((1, 6)), fingers, zero, level, index > 0)
+    )
     state, after = physics.step(state, jnp.zeros((1, 6 + len(hand.joints))), index == 0)
     leaves = [leaf for leaf in jax.tree.leaves((state, after)) if isinstance(leaf, jax.Array)]
     print(sorted({device.process_index for leaf in leaves for device in leaf.devices()}), len(leaves) > 20)

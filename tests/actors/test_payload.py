@@ -32,7 +32,8 @@ def test_a_load_of_one_and_a_half_kilograms_sinks_less_than_five_millimetres(nam
     def law(momentum, u, v):
         load = wrist_load(hand, task, momentum, u, v)
         state = scene(0, batch=1)[0]._replace(u=u, u_velocity=v, wrist_load=load, table=jnp.zeros(1, bool))
-        return wrist_target(hand, task.control, state, -u, jnp.zeros((1, 6)))
+        far = jnp.full(1, task.control.guidance_position_limit)
+        return wrist_target(hand, task.control, state, far, -u, jnp.zeros((1, 6)))
 
     after = jax.jit(lambda momentum, u, v, target: track_load(hand, task, momentum, u, v, target))
     sunk, speed = [], []

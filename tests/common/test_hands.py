@@ -174,6 +174,7 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
         gain_scale=np.ones(1),
         base_position=np.array([[0.0, 0.0, 1.0]]),
         base_quaternion=down.as_quat(scalar_first=True)[None],
+        u_velocity=np.zeros((1, 6)),
         q=hand.q_open[None],
         object_position=np.array([[0.0, 0.0, 1.0]]) + down.apply(center),
         object_quaternion=quaternion[None],

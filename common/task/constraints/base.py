@@ -193,12 +193,12 @@ class Constraint:
         """(B,) bool where an episode begins with other finger angles than the open hand's, and these (B, F)."""
         return None
 
-    def initial_wrist(self, hand: Hand, task: "TaskConfig", goal: Goal, q: Array) -> tuple[Array, Array, Array] | None:
+    def initial_wrist(self, hand: Hand, back_off: Array, goal: Goal, q: Array) -> tuple[Array, Array, Array] | None:
         """(B,) bool where it says at which wrist pose an episode begins, and the pose (B, 3), (B, 4), object frame.
 
         Args:
           hand: the hand.
-          task: geometry of the approach.
+          back_off: (B,) m from the aligned wrist back, where nothing else says where the wrist begins.
           goal: after the priority rules.
           q: (B, F) finger angles at the start.
         """

@@ -96,11 +96,11 @@ class Heading(Constraint):
         direction = bank.heading_direction[index]
         return HeadingGoal(bank.heading_position[index] - back * direction, direction, bank.heading_cross[index])
 
-    def initial_wrist(self, hand: Hand, task: "TaskConfig", goal: Goal, q: Array) -> tuple[Array, Array, Array]:
+    def initial_wrist(self, hand: Hand, back_off: Array, goal: Goal, q: Array) -> tuple[Array, Array, Array]:
         """Aligned with the heading and backed off (paper, section Hand Initialization)."""
         center = kinematics.hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)))
         position, quaternion = heading_wrist_pose(hand, goal["heading"], center)
-        position = position - task.back_off * goal["heading"].direction
+        position = position - back_off[:, None] * goal["heading"].direction
         return jnp.ones(position.shape[0], bool), position, quaternion
 
     def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> HeadingFeatures:

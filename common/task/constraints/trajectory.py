@@ -103,7 +103,7 @@ class Trajectory(Constraint):
         """The waypoints."""
         return np.asarray(own["position"]), np.asarray(own["quaternion"])[-1]
 
-    def initial_wrist(self, hand: Hand, task: "TaskConfig", goal: Goal, q: Array) -> tuple[Array, Array, Array]:
+    def initial_wrist(self, hand: Hand, back_off: Array, goal: Goal, q: Array) -> tuple[Array, Array, Array]:
         """The first waypoint (paper, section Hand Initialization)."""
         own = goal["trajectory"]
         return goal.active["trajectory"], own.position[:, 0], own.quaternion[:, 0]

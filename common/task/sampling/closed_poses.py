@@ -1,7 +1,7 @@
 """Reference poses made by closing the hand around an object without physics.
 
 They stand in for final states of a trained policy's grasps until there is one: the wrist is put where the heading wants
-it, and every finger closes until its skin meets the surface.
+it, and every finger closes from the widest pose until its skin meets the surface.
 """
 
 import functools
@@ -13,13 +13,14 @@ import numpy as np
 
 from common import rotations
 from common.hands import kinematics
+from common.hands.closure import closure_pose
 from common.hands.motors import transmission
 from common.hands.spec import Hand, chain_of
 from common.task.constraints.heading import HeadingGoal, heading_wrist_pose
 from common.task.geometry import squared_distances
 from common.task.types import Array
 
-_STEPS = 24
+_STEPS = 40
 
 
 class Poses(NamedTuple):
@@ -66,7 +67,6 @@ def closed_poses(
     count = direction.shape[0]
     joint_finger, point_finger, fingers = _fingers(hand)
     radii = jnp.array(hand.keypoint_radii)
-    q_open, q_closed = jnp.array(hand.q_open), jnp.array(hand.q_closed)
     goal = HeadingGoal(heading_position, direction, cross)
 
     def close(center: Array) -> Array:
@@ -75,7 +75,7 @@ def closed_poses(
 
         def clear(fraction: Array) -> Array:
             """(M, fingers) bool: fingers at this fraction of their way do not reach into the object."""
-            q = q_open + fraction * (q_closed - q_open)
+            q = closure_pose(hand, fraction[None])
             own = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
             here = rotations.transform(position, quaternion, jnp.broadcast_to(own, (count, *own.shape)))
             nearest = jnp.argmin(squared_distances(here, jnp.broadcast_to(points, (count, *points.shape))), -1)
@@ -84,11 +84,11 @@ def closed_poses(
             gap = jnp.where(inside, -1.0, jnp.linalg.norm(offset, axis=-1)) - radii
             return jnp.stack([jnp.all(jnp.where(point_finger == k, gap, 1.0) > 0, -1) for k in range(fingers)], -1)
 
-        fractions = jnp.linspace(0.0, 1.0, _STEPS)
+        fractions = jnp.linspace(-1.0, 1.0, _STEPS)
         free = jax.lax.map(clear, fractions)
         closed = jnp.sum(jnp.cumprod(free, 0), 0)  # steps before the first touch
-        fraction = fractions[jnp.clip(closed, 0, _STEPS - 1)]
-        return q_open + fraction[:, joint_finger] * (q_closed - q_open)
+        fraction = fractions[jnp.clip(closed, 0, _STEPS - 1)][:, joint_finger]
+        return closure_pose(hand, fraction)
 
     open_center = jnp.broadcast_to(jnp.array(kinematics.grasp_frame(hand).center), (count, 3))
     q = close(open_center)

@@ -16,6 +16,7 @@ MAX_WIDTH = 0.12
 """Metres; the object may not be wider along the cross-finger axis."""
 BACK_OFF = 0.15
 """Metres from the heading position back to the start of the approach."""
+_SKIN = 0.004  # m that the widest pose is wider than the object on either side
 _BREADTH = 0.03  # half the breadth of the slab in which the local width is measured: a hand is some 6 cm broad
 _BEYOND = 0.01  # the slab ends this far beyond the heading position, where the fingertips close
 _TUBE = 0.01  # radius around the approach in which nothing may stand before the surface point
@@ -177,7 +178,7 @@ def clear_table(
       width: (H,) m, see `feasible`.
       farthest: longest way back, m.
     """
-    room, direction_z, _ = _room(headings, rest_pose, outline, width)
+    room, direction_z = _room(headings, rest_pose, outline, width)
     needed = np.maximum(-room, 0.0) / np.maximum(-direction_z, 1e-6)
     back = np.where(needed <= farthest, needed, 0.0)
     # A micrometre more, so that rounding does not leave a hand that just touches.
@@ -191,29 +192,28 @@ def feasible(
     outline: Outline = CENTER,
     width: np.ndarray | float = 0.0,
     *,
-    back_off: float = BACK_OFF,
     steepest_up: float = 0.1,
 ) -> np.ndarray:
     """(H,) bool, which headings can be followed while the object lies on the table in a resting pose.
 
     The approach must come from above or level (its direction rises by at most `steepest_up` per metre), and the hand
-    must be over the table: at its start open, at the heading position in one of the outline's poses that are open wide
-    enough for the object. It may be false for all headings of a thin object: see `clear_table`.
+    must be over the table at the heading position in one of the poses that are open wide enough for the object
+    (`actors.initial` lifts the start of an approach over the table). It may be false for all headings of a thin
+    object: see `clear_table`.
 
     Args:
       headings: in the object frame.
       rest_pose: (7,) the object's pose, with the table's top at z = 0.
       outline: of the hand.
       width: (H,) m, the object's along the cross-finger axes (`local_width`).
-      back_off: length of the approach, m.
       steepest_up: largest upward component of a direction.
     """
-    room, direction_z, start = _room(headings, rest_pose, outline, width, back_off)
-    return (direction_z <= steepest_up) & (room >= 0) & (start >= 0)
+    room, direction_z = _room(headings, rest_pose, outline, width)
+    return (direction_z <= steepest_up) & (room >= 0)
 
 
 def within_reach(
-    headings: Headings, points: np.ndarray, rest_poses: np.ndarray, outline: Outline, back_off: float = BACK_OFF
+    headings: Headings, points: np.ndarray, rest_poses: np.ndarray, outline: Outline
 ) -> tuple[list[Headings], np.ndarray]:
     """The headings clear of the table in each of R resting poses (R, 7), and (R, H) bool whether they can be followed.
 
@@ -226,29 +226,39 @@ def within_reach(
       points: (P, 3) the object's surface points, m.
       rest_poses: (R, 7) poses of the object, with the table's top at z = 0.
       outline: of the hand.
-      back_off: length of the approach, m.
     """
     width = local_width(headings, points)
     for own, farthest in ((outline, _BACK), (outline, _FARTHEST_BACK), (CENTER, _FARTHEST_BACK)):
         cleared = [clear_table(headings, rest, own, width, farthest) for rest in rest_poses]
         pairs = zip(cleared, rest_poses, strict=True)
-        reachable = np.array([feasible(moved, rest, own, width, back_off=back_off) for moved, rest in pairs])
+        reachable = np.array([feasible(moved, rest, own, width) for moved, rest in pairs])
         if reachable.any():
             break
     return cleared, reachable
 
 
 def local_width(headings: Headings, points: np.ndarray) -> np.ndarray:
-    """(H,) m, how wide an object with surface points (P, 3) is along the cross-finger axes where fingers close.
+    """(..., H) m, how wide objects are along the cross-finger axes where fingers close.
 
-    That is in the slab of `sample_headings`; where none of the points lies in it, 0.
+    That is in the slab of `sample_headings`; where no surface point lies in it, 0.
+
+    Args:
+      headings: fields (..., H, 3), NumPy's or JAX's.
+      points: (..., P, 3) surface points, of which the first 256 are taken, m.
     """
+    xp = headings.position.__array_namespace__()
     along, aside, depth = (
-        axis @ points[:_WIDTH_POINTS].T - (axis * headings.position).sum(-1, keepdims=True)
-        for axis in (headings.cross, np.cross(headings.direction, headings.cross), headings.direction)
+        axis @ points[..., :_WIDTH_POINTS, :].mT - (axis * headings.position).sum(-1)[..., None]
+        for axis in (headings.cross, xp.cross(headings.direction, headings.cross), headings.direction)
     )
-    low, high = _extent(along, (np.abs(aside) < _BREADTH) & (depth < _BEYOND))
-    return np.maximum(high - low, 0.0)
+    inside = (xp.abs(aside) < _BREADTH) & (depth < _BEYOND)
+    low, high = xp.where(inside, along, xp.inf).min(-1), xp.where(inside, along, -xp.inf).max(-1)
+    return xp.maximum(high - low, 0.0)
+
+
+def max_width(outline: Outline, scale: float) -> float:
+    """Metres, the widest that an object may be for a hand: the paper's 12 cm times its scale, or what it opens to."""
+    return min(scale * MAX_WIDTH, float(outline.openings[0]) - 2 * _SKIN)
 
 
 def above(headings: Headings, rest_pose: np.ndarray, cone: float = np.radians(30)) -> np.ndarray:
@@ -257,21 +267,17 @@ def above(headings: Headings, rest_pose: np.ndarray, cone: float = np.radians(30
 
 
 def _room(
-    headings: Headings,
-    rest_pose: np.ndarray,
-    outline: Outline,
-    width: np.ndarray | float,
-    back_off: float = BACK_OFF,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heights (H,) of the hand over the table at the positions, z of the directions, and heights at the starts."""
+    headings: Headings, rest_pose: np.ndarray, outline: Outline, width: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Heights (H,) of the hand over the table at the positions, and z of the directions."""
     up = matrix(rest_pose[3:])[2]
     height = headings.position @ up + rest_pose[2]
     direction_z, cross_z = headings.direction @ up, headings.cross @ up
     local = np.stack([direction_z, cross_z, np.cross(headings.direction, headings.cross) @ up], -1)
     below = depth_below(outline, local)
     wide = outline.openings[:, None] >= np.broadcast_to(width, height.shape) + 2 * _MARGIN
-    wide[0] = True  # wider than open goes no hand
-    return height - np.where(wide, below, np.inf).min(0), direction_z, height - back_off * direction_z - below[0]
+    wide[0] = True  # no pose is wider
+    return height - np.where(wide, below, np.inf).min(0), direction_z
 
 
 def _in_cone(axes: np.ndarray, cone: float, rng: np.random.Generator) -> np.ndarray:

@@ -123,6 +123,7 @@ def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
         gain_scale=ones,
         base_position=-(frame.center - depth[:, None] * frame.heading) @ own.T,
         base_quaternion=np.tile(turn, (count, 1)),
+        u_velocity=np.zeros((count, 6)),
         q=np.tile(hand.q_open, (count, 1)),
         object_position=np.zeros((count, 3)),
         object_quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),

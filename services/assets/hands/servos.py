@@ -76,6 +76,7 @@ def _states(hand: Hand, task: TaskConfig, targets: np.ndarray, threads: int) -> 
         gain_scale=ones,
         base_position=np.zeros((count, 3)),
         base_quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        u_velocity=np.zeros((count, 6)),
         q=np.tile(hand.q_open, (count, 1)),
         object_position=np.tile(_FAR, (count, 1)),
         object_quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),

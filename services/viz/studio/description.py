@@ -16,7 +16,8 @@ from common.hands.spec import Hand
 from common.objects.resting import rest_tilts
 from common.task.constraints import get_constraint, optional
 from common.task.sampling.closed_poses import Poses
-from common.task.types import Goal
+from common.task.types import Goal, Surface
+from services.grasp.grasper import surface_of
 from services.viz.studio.state import Studio
 
 
@@ -49,7 +50,7 @@ def describe(studio: Studio) -> dict[str, Any]:
         },
         "explanation": studio.explanation,
         "trouble": studio.trouble,
-        "start": _frames(_start(hand, studio.task, *_batch_of_one(goal, obj.rest_poses[studio.rest]))),
+        "start": _frames(_start(hand, studio.task, *_batch_of_one(studio, goal))),
         "pose": None if studio.pose is None else _ghost(hand, studio.pose),
         "path": None if studio.path is None else np.asarray(studio.path.position).tolist(),
         "painted": studio.canvas.paint.version,
@@ -75,15 +76,16 @@ def _frames(links: tuple[jax.Array, jax.Array]) -> dict[str, Any]:
     return {"position": np.asarray(links[0]).tolist(), "quaternion": np.asarray(links[1]).tolist()}
 
 
-def _batch_of_one(goal: Goal, rest: np.ndarray) -> tuple[Goal, np.ndarray]:
-    """A goal and a resting pose (7,) with a batch axis."""
-    return jax.tree.map(lambda array: np.asarray(array)[None], goal), np.asarray(rest, np.float32)[None]
+def _batch_of_one(studio: Studio, goal: Goal) -> tuple[Goal, Surface, np.ndarray]:
+    """The goal, the object's surface and its resting pose (7,), with a batch axis."""
+    rest = np.asarray(studio.obj.rest_poses[studio.rest], np.float32)
+    return jax.tree.map(lambda array: np.asarray(array)[None], (goal, surface_of(studio.task, studio.obj), rest))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _start(hand: Hand, task: TaskConfig, goal: Goal, rest: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _start(hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Link frames (L, 3), (L, 4) in the world from which a grasp begins."""
-    q, position, quaternion = initial_hand(hand, task, goal, rest)
+    q, position, quaternion = initial_hand(hand, task, goal, surface, rest)
     return _links(hand, q[0], position[0], quaternion[0])
 
 

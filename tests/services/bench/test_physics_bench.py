@@ -25,6 +25,7 @@ def test_replays_end_in_the_very_states_of_the_recording():
         gain_scale=np.ones(WORLDS),
         base_position=one * [0.0, -0.05, 0.5],
         base_quaternion=one * [0.0, 1.0, 0.0, 0.0],  # palm up, under the object
+        u_velocity=np.zeros((WORLDS, 6)),
         q=np.zeros((WORLDS, len(HAND.joints))),
         object_position=one * [0.0, 0.0, 0.52 + height],
         object_quaternion=one * [1.0, 0.0, 0.0, 0.0],

@@ -1,0 +1,110 @@
+"""Closures: a one-parameter family of finger poses, from the widest over the open one to the fist.
+
+A closure c in [-1, 1] is q_open + c (q_closed - q_open) where it is positive, and q_open - c (q_wide - q_open) where it
+is negative. The gap of a pose is the free space between the skins of the thumb's and the nearest other fingertip along
+the cross-finger axis.
+"""
+
+import concurrent.futures
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+
+from common.hands import kinematics
+from common.hands.kinematics import grasp_frame
+from common.hands.motors import joint_positions, motor_limits, motor_positions
+from common.hands.spec import Hand
+from common.task.types import Array
+
+CLOSURES = np.round(np.arange(-1.0, 0.51, 0.1), 6)
+"""Closures at which gaps and outlines are tabulated: down to where fingers close on thin things."""
+MARGIN = 0.03
+"""Metres that the gap of a preshaped hand is wider than the object."""
+WIDEST = 0.14
+"""Gap in metres, for objects of the human hand's size, beyond which no hand has to open: 12 cm, the widest object that
+headings are made for, and a centimetre on either side."""
+_OFFSET, _TURN = 0.5, 2e-6  # weights of an offset (m^2) and of a motor's turn (rad^2), in the unit of the gap's (m^2)
+
+
+def closure_pose(hand: Hand, closure: Array) -> Array:
+    """(..., F) finger angles at closures (..., 1), or (..., F) with one for each joint."""
+    c = jnp.asarray(closure)
+    q_wide, q_open, q_closed = (jnp.asarray(q) for q in (wide_angles(hand), hand.q_open, hand.q_closed))
+    return q_open + jnp.maximum(c, 0.0) * (q_closed - q_open) + jnp.maximum(-c, 0.0) * (q_wide - q_open)
+
+
+def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
+    """(B, F) finger angles whose gap is `margin` wider than objects (B,), or as wide as the hand opens; m."""
+    gaps = table_of_gaps(hand)
+    return closure_pose(hand, jnp.interp(width + margin, gaps[::-1], CLOSURES[::-1])[..., None])
+
+
+@functools.cache
+def table_of_gaps(hand: Hand) -> np.ndarray:
+    """(S,) gaps in metres at `CLOSURES`, made to fall strictly where the hand's own do not."""
+    # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
+    with concurrent.futures.ThreadPoolExecutor(1) as thread:
+        q = thread.submit(lambda: closure_pose(hand, CLOSURES[:, None].astype(np.float32))).result()
+        gaps = np.asarray(thread.submit(lambda: jnp.min(_gaps(hand, _tips(hand, q)), -1)).result(), np.float64)
+    return np.minimum.accumulate(gaps) - 1e-6 * np.arange(len(gaps))
+
+
+@functools.cache
+def wide_angles(hand: Hand) -> np.ndarray:
+    """(F,) finger angles of the hand's widest pose; searched for where the hand's data names none."""
+    if hand.wide_pose is not None:
+        return hand.posed(hand.wide_pose)
+    with concurrent.futures.ThreadPoolExecutor(1) as thread:
+        return hand.posed(thread.submit(widest_pose, hand).result())
+
+
+def widest_gap(hand: Hand) -> float:
+    """Metres between thumb and fingers of the hand's widest pose."""
+    return float(table_of_gaps(hand)[0])
+
+
+def widest_pose(hand: Hand) -> dict[str, float]:
+    """Finger angles of the pose nearest to the open one that has all gaps of `WIDEST`, or the most that limits allow.
+
+    It faces the object as the open pose does: the fingertips keep their offsets from the thumb's along the heading axis
+    and along the axis orthogonal to it and the cross-finger axis. The motors minimise (L-BFGS-B, from the open pose)
+    the sum over the other fingers of missing gap and changed offsets, squared.
+    """
+    lower, upper = motor_limits(hand)
+    start = np.asarray(motor_positions(hand, hand.q_open), float)
+    program = jax.jit(jax.value_and_grad(functools.partial(_cost, hand)))
+
+    def cost(motors: np.ndarray) -> list[np.ndarray]:
+        # L-BFGS-B's own tolerances are made for costs around one.
+        return [np.asarray(part, float) / _TURN for part in program(jnp.asarray(motors, jnp.float32))]
+
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=np.stack([lower, upper], -1)).x
+    q = np.asarray(joint_positions(hand, jnp.asarray(found, jnp.float32)))
+    followers = {coupling.joint for coupling in hand.couplings}
+    return {j.name: round(float(x), 3) for j, x in zip(hand.joints, q, strict=True) if j.name not in followers}
+
+
+def _cost(hand: Hand, motors: Array) -> Array:
+    """() m^2, what `widest_pose` minimises."""
+    started = motor_positions(hand, jnp.asarray(hand.q_open))
+    tips, open_tips = (_tips(hand, q) for q in (joint_positions(hand, motors), jnp.asarray(hand.q_open)))
+    missing = jnp.maximum(WIDEST * hand.object_scale - _gaps(hand, tips), 0.0)
+    moved = (tips[1:] - tips[0]) - (open_tips[1:] - open_tips[0])
+    return jnp.sum(missing**2) + _OFFSET * jnp.sum(moved[:, ::2] ** 2) + _TURN * jnp.sum((motors - started) ** 2)
+
+
+def _tips(hand: Hand, q: Array) -> Array:
+    """(..., G, 3) fingertips, thumb first, along the grasp frame's axes v, w and v x w."""
+    frame = grasp_frame(hand)
+    axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
+    points = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
+    return points[..., len(hand.links) :, :] @ jnp.asarray(axes.T, jnp.float32)
+
+
+def _gaps(hand: Hand, tips: Array) -> Array:
+    """(..., G - 1) m between the skins of each other fingertip and the thumb's, along w."""
+    radii = hand.keypoint_radii[len(hand.links) :]
+    return tips[..., 1:, 1] - tips[..., :1, 1] - radii[1:] - radii[0]
