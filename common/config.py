@@ -117,7 +117,9 @@ class TaskConfig(_Shares):
     method: str = "ours"
     """Name of the method that its policy is of (`common.task.methods`): `congrasp train --method` makes its changes."""
     object_scale: float = 0.0
-    """Factor on the objects' lengths, at the same density; 0 takes the hand's own (1.4 for Allegro, 1.1 for Sharpa)."""
+    """Factor on the objects' lengths; 0 takes the hand's own (1.4 for Allegro, 1.1 for Sharpa)."""
+    constant_mass: bool = True
+    """An object keeps its mass when its lengths are scaled; else its density."""
     control_dt: float = 0.01
     """Seconds between two actions."""
     substeps: int = 4
@@ -139,6 +141,11 @@ class TaskConfig(_Shares):
     """Whether the hand's links collide with one another."""
     contact_time: float = CONTACT_TIME
     """Time constant of the hand's contacts, s; at least two physics steps. At 0.006 a grasp's are about 1 mm deep."""
+    torsional_friction: float = 0.004
+    """Metres, of contacts of fingertips with the object (condim 4): the sliding friction times about two thirds of the
+    contact patch's radius; 0: point contacts. The engine `jax` knows point contacts alone."""
+    object_damping: float = 5e-5
+    """Damping of the free object, N.s/m and N.m.s/rad: what pivots between two fingers swings for about a second."""
     back_off: float = 0.15
     """Metres from the aligned wrist to its start, against the heading direction."""
     back_off_range: tuple[float, float] = (0.05, 0.25)
@@ -433,7 +440,14 @@ def with_older_physics(task: Any) -> Any:
         "closing_position_limit": control.get("guidance_position_limit", 0.04),
     }
     back_off = task.get("back_off", 0.15)
-    begun = {"preshape": False, "initial_speed": 0.0, "back_off_range": [back_off, back_off]}
+    begun = {
+        "constant_mass": False,
+        "torsional_friction": 0.0,
+        "object_damping": 5e-4,
+        "preshape": False,
+        "initial_speed": 0.0,
+        "back_off_range": [back_off, back_off],
+    }
     return {"contact_time": 0.016, **begun, **task, "control": {**then, **control}}
 
 

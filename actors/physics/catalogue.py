@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, finish_spec, scene_spec
+from actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, finish_spec, object_contact, scene_spec
 from actors.physics.slots import empty_slots, fill_body, fill_primitives
 from common.config import TaskConfig
 from common.errors import CongraspError
@@ -35,7 +35,7 @@ class Catalogue:
         primitives = empty_slots()
         meshes = [Piece("mesh", (0.0, 0.0, 0.0), vertices=_PLACEHOLDER)] * mesh_slots
         shared = dataclasses.replace(example, pieces=(*primitives, *meshes))
-        body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE)
+        body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
         body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which the other objects may not have
         finish_spec(spec, hand)
         self.model: mujoco.MjModel = spec.compile()

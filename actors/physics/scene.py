@@ -8,7 +8,7 @@ import numpy as np
 from common.config import TaskConfig
 from common.hands.mjcf import HAND_CONTYPE, WRIST_JOINTS, add_hand
 from common.hands.spec import Hand
-from common.objects.mjcf import CONTACT, add_object
+from common.objects.mjcf import CONTACT, ContactSettings, add_object
 from common.objects.spec import GraspObject
 from common.task.types import CONTACTS_PER_LINK
 
@@ -65,7 +65,13 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     # A hundredth of a millimetre: in single precision the default of a micrometre is hardly ever reached.
     spec.option.ccd_tolerance = 1e-5
     spec.option.ccd_iterations = 16
-    add_hand(spec, hand, self_collision=task.hand_self_collision, contact_time=task.contact_time)
+    add_hand(
+        spec,
+        hand,
+        self_collision=task.hand_self_collision,
+        contact_time=task.contact_time,
+        torsional_friction=task.torsional_friction,
+    )
     table = spec.worldbody.add_body(name="table", mocap=True)
     table.add_geom(
         name="table",
@@ -79,6 +85,11 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     )
     spec.worldbody.add_body(name="anchor", mocap=True)
     return spec
+
+
+def object_contact(task: TaskConfig) -> ContactSettings:
+    """Contact settings of the task's objects."""
+    return dataclasses.replace(CONTACT, free_damping=task.object_damping)
 
 
 def finish_spec(spec: mujoco.MjSpec, hand: Hand) -> None:
@@ -109,7 +120,7 @@ def finish_spec(spec: mujoco.MjSpec, hand: Hand) -> None:
 def compile_scene(hand: Hand, task: TaskConfig, obj: GraspObject) -> mujoco.MjModel:
     """The scene with one object, as `native` uses it."""
     spec = scene_spec(hand, task)
-    add_object(spec, obj, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE)
+    add_object(spec, obj, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
     finish_spec(spec, hand)
     return spec.compile()
 

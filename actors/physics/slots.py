@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, finish_spec, scene_spec
+from actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, finish_spec, object_contact, scene_spec
 from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands.spec import Hand
@@ -59,7 +59,7 @@ class Pool:
             pieces += meshes
             self._owners += [n] * len(meshes)
         shared = dataclasses.replace(objects[0], pieces=tuple(pieces))
-        body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE)
+        body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
         body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which the other objects may not have
         finish_spec(spec, hand)
         self.model: mujoco.MjModel = spec.compile()

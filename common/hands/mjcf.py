@@ -18,7 +18,12 @@ WRIST_JOINTS = ("wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_
 
 
 def add_hand(
-    spec: mujoco.MjSpec, hand: Hand, *, self_collision: bool = False, contact_time: float = CONTACT_TIME
+    spec: mujoco.MjSpec,
+    hand: Hand,
+    *,
+    self_collision: bool = False,
+    contact_time: float = CONTACT_TIME,
+    torsional_friction: float = 0.0,
 ) -> mujoco.MjsBody:
     """Adds the hand under a fixed body `hand_base` and returns that body.
 
@@ -27,7 +32,8 @@ def add_hand(
     compensated, because the wrist is a virtual mount.
 
     With `self_collision` links collide with one another, without friction, except neighbours and `overlapping` pairs.
-    All contacts of the hand have the time constant `contact_time` in seconds, whatever they are with.
+    All contacts of the hand have the time constant `contact_time` in seconds, whatever they are with. Those of
+    fingertips resist turning about their normal by `torsional_friction` metres times the normal force.
     """
     base = spec.worldbody.add_body(name="hand_base")
     bodies: dict[str, mujoco.MjsBody] = {}
@@ -52,7 +58,7 @@ def add_hand(
                 damping=joint.damping,
                 armature=joint.armature,
             )
-        _add_shapes(body, link, origin, self_collision, contact_time)
+        _add_shapes(body, link, origin, self_collision, contact_time, torsional_friction if link.tip else 0.0)
     _add_transmission(spec, hand)
     if self_collision:
         for first, second in overlapping(hand):
@@ -75,7 +81,7 @@ def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
             body.add_freejoint()
         for joint in link.joints:
             body.add_joint(name=joint.name, axis=joint.axis, pos=joint.anchor)
-        _add_shapes(body, link, np.zeros(3), True, CONTACT_TIME)
+        _add_shapes(body, link, np.zeros(3), True, CONTACT_TIME, 0.0)
     model = spec.compile()
     data = mujoco.MjData(model)
     found: set[tuple[int, int]] = set()
@@ -146,7 +152,7 @@ def _add_position_actuator(
 
 
 def _add_shapes(
-    body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_collision: bool, contact_time: float
+    body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_collision: bool, contact_time: float, torsion: float
 ) -> None:
     """Adds a link's solids, or the capsules of one without; they share its mass by their volumes."""
     found = [_solid(solid, origin) for solid in link.solids] or [_capsule(x, origin) for x in link.capsules]
@@ -158,10 +164,10 @@ def _add_shapes(
             mass=link.mass * share,
             contype=HAND_CONTYPE,
             conaffinity=HAND_CONTYPE if self_collision else 0,
-            condim=1,  # between links; against the object the greater of two decides, which is the object's
+            condim=4 if torsion else 1,  # the greater of two decides: between links 1, against the object its 3
             solref=(contact_time, 1.0),
             solmix=1000.0,  # against others' 1, so that it decides
-            friction=(0.1, 0.005, 0.0001),  # MuJoCo takes the greater of two: the object's friction decides
+            friction=(0.1, torsion, 0.0),  # MuJoCo takes the greater of two: the object's sliding friction decides
         )
 
 

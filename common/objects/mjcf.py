@@ -12,12 +12,12 @@ from common.objects.spec import GraspObject
 class ContactSettings:
     """How geoms of hand, object and table touch.
 
-    Contacts have three dimensions (no torsional or rolling friction), which halves the constraint rows against
-    condim 4. What keeps a ball from rolling for ever is the damping of the object's free joint instead: it acts in
-    the same way in every engine and costs nothing.
+    Contacts have three dimensions, but for those of fingertips (`common.hands.mjcf`): no torsional and no rolling
+    friction. What keeps a ball from rolling for ever is the damping of the object's free joint: it acts in the same
+    way in every engine and costs nothing.
     """
 
-    friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
+    friction: tuple[float, float, float] = (1.0, 0.0, 0.0)
     """Sliding (dimensionless), torsional (m) and rolling (m) friction."""
     condim: int = 3
     """Dimensions of a contact."""

@@ -44,7 +44,7 @@ def object_scale(hand: Hand, task: TaskConfig) -> float:
 
 def scale_objects(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> list[GraspObject]:
     """Objects in the size in which this hand grasps them."""
-    return [obj.scaled(object_scale(hand, task)) for obj in objects]
+    return [obj.scaled(object_scale(hand, task), constant_mass=task.constant_mass) for obj in objects]
 
 
 def first_seed(config: ObjectsConfig, shift: int) -> int:

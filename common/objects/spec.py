@@ -87,10 +87,11 @@ class GraspObject:
         """(512,) whether each surface point belongs to the avoid region."""
         return ~self.graspable[self.labels]
 
-    def scaled(self, factor: float) -> "GraspObject":
-        """The object of the same density with every length times `factor`."""
+    def scaled(self, factor: float, *, constant_mass: bool = False) -> "GraspObject":
+        """The object with every length times `factor`, of the same density or, with `constant_mass`, mass."""
         if factor == 1.0:
             return self
+        heavier = 1.0 if constant_mass else factor**3
 
         def longer(vector: tuple[float, float, float]) -> tuple[float, float, float]:
             """A vector times the factor."""
@@ -109,8 +110,8 @@ class GraspObject:
         return dataclasses.replace(
             self,
             pieces=pieces,
-            mass=factor**3 * self.mass,
-            inertia=factor**5 * self.inertia,
+            mass=heavier * self.mass,
+            inertia=heavier * factor**2 * self.inertia,
             points=factor * self.points,
             rest_poses=self.rest_poses * np.array([factor] * 3 + [1.0] * 4),
             visual_vertices=factor * self.visual_vertices,

@@ -12,7 +12,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, TABLE_AWAY, scene_spec
+from actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, TABLE_AWAY, object_contact, scene_spec
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands import get_hand
@@ -20,7 +20,6 @@ from common.hands.kinematics import grasp_frame
 from common.hands.mjcf import WRIST_JOINTS
 from common.hands.motors import transmission
 from common.hands.spec import Hand, link_origin
-from common.objects.mjcf import CONTACT
 from common.policy.bundle import PolicyBundle, content_hash, mean_action
 from common.policy.network import gated
 from common.task import observation
@@ -71,7 +70,7 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
             "mjcf": scene_spec(hand, task).to_xml(),
             "hand_contype": HAND_CONTYPE,
             "object_contype": OBJECT_CONTYPE,
-            "object_contact": dataclasses.asdict(CONTACT),
+            "object_contact": dataclasses.asdict(object_contact(task)),
             "table_away": list(TABLE_AWAY),
         },
     }

@@ -25,7 +25,7 @@ from common.objects.spec import GraspObject
 from tests import draws
 
 HAND = get_hand("human")
-TASK = TaskConfig(p_pose=0.0, p_trajectory=0.0, p_affordance=0.0)
+TASK = TaskConfig(p_pose=0.0, p_trajectory=0.0, p_affordance=0.0, initial_speed=0.0, preshape=False)
 OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "cylinder", "mug"])]
 ENVIRONMENTS = 3
 

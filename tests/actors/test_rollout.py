@@ -22,7 +22,7 @@ from common.task.types import CONTACTS_PER_LINK, Action
 from tests import draws
 
 HAND = get_hand("human")
-TASK = TaskConfig()
+TASK = TaskConfig(approach_steps=50, back_off_range=(0.15, 0.15), initial_speed=0.0, preshape=False)
 OBJECTS = procedural.generate_many(4, 0, ("box", "cylinder", "mug", "hammer"))
 BATCH = 8  # of most workers here, so that their programs are compiled once
 DRAWN = 4000

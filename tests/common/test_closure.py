@@ -1,0 +1,78 @@
+"""The one-parameter family of finger poses."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.hands import get_hand
+from common.hands.closure import (
+    CLOSURES,
+    WIDEST,
+    closure_pose,
+    preshape,
+    table_of_gaps,
+    wide_angles,
+    widest_gap,
+    widest_pose,
+)
+from common.hands.kinematics import grasp_frame, keypoints, link_transforms
+
+HANDS = ("human", "allegro", "sharpa")
+
+
+def _tips(hand, q):
+    return np.asarray(keypoints(hand, link_transforms(hand, jnp.asarray(q))))[len(hand.links) :]
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_the_shipped_wide_pose_is_the_one_that_is_found(name):
+    hand = get_hand(name)
+    found = hand.posed(widest_pose(hand))
+    np.testing.assert_allclose(wide_angles(hand), found, atol=0.03)
+    assert (wide_angles(hand) >= hand.lower - 1e-6).all() and (wide_angles(hand) <= hand.upper + 1e-6).all()
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_gaps_are_those_between_skins_along_the_cross_finger_axis(name):
+    hand = get_hand(name)
+    cross, radii = grasp_frame(hand).cross, hand.keypoint_radii[len(hand.links) :]
+    for closure, gap in zip(CLOSURES, table_of_gaps(hand), strict=True):
+        tips = _tips(hand, np.asarray(closure_pose(hand, np.float32([closure]))))
+        skins = (tips[1:] - tips[0]) @ cross - radii[1:] - radii[0]
+        assert gap == pytest.approx(skins.min(), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_the_widest_pose_opens_by_a_quarter_and_faces_the_object_as_the_open_one_does(name):
+    hand = get_hand(name)
+    gaps, frame = table_of_gaps(hand), grasp_frame(hand)
+    assert (np.diff(gaps) < 0).all()
+    assert widest_gap(hand) > 1.25 * gaps[CLOSURES.tolist().index(0.0)]
+    assert widest_gap(hand) > 0.9 * WIDEST * hand.object_scale
+    tips = _tips(hand, wide_angles(hand))
+    across = tips[1:].mean(0) - tips[0]
+    assert across @ frame.cross / np.linalg.norm(across) > np.cos(np.radians(5))
+
+
+def test_closures_meet_the_three_poses_and_mix_between_them():
+    hand = get_hand("human")
+    ends = np.asarray(closure_pose(hand, np.float32([[-1.0], [0.0], [1.0]])))
+    np.testing.assert_allclose(ends, [wide_angles(hand), hand.q_open, hand.q_closed], atol=1e-6)
+    half = np.asarray(closure_pose(hand, np.float32([-0.5])))
+    np.testing.assert_allclose(half, (wide_angles(hand) + hand.q_open) / 2, atol=1e-6)
+    apart = np.linspace(-1, 1, len(hand.joints), dtype=np.float32)
+    for joint, closure in enumerate(apart):
+        own = np.asarray(closure_pose(hand, np.float32([closure])))[joint]
+        assert np.asarray(closure_pose(hand, apart))[joint] == pytest.approx(own, abs=1e-6)
+
+
+@settings(deadline=None, max_examples=20)
+@given(width=st.floats(0.0, 0.12), margin=st.floats(0.015, 0.06))
+def test_a_preshaped_hand_is_wider_than_the_object_by_the_margin_or_as_wide_as_it_opens(width, margin):
+    hand = get_hand("human")
+    q = np.asarray(preshape(hand, np.float32([width]), np.float32(margin)))[0]
+    tips, radii = _tips(hand, q), hand.keypoint_radii[len(hand.links) :]
+    gap = ((tips[1:] - tips[0]) @ grasp_frame(hand).cross - radii[1:] - radii[0]).min()
+    assert gap == pytest.approx(min(width + margin, widest_gap(hand)), abs=2e-3)
