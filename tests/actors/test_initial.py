@@ -16,6 +16,7 @@ from common.hands.kinematics import hand_center, keypoints, link_transforms
 from common.task.bank import ConstraintBank
 from common.task.constraints.heading import heading_wrist_pose
 from common.task.constraints.priority import resolve
+from common.task.constraints.trajectory import closing
 from common.task.features import scene_of
 from common.task.geometry import in_world
 from common.task.metrics import errors
@@ -140,10 +141,15 @@ def test_aligned_pairs_are_drawn_where_they_are_asked_for(few):
 @pytest.mark.parametrize("on", [{"pose"}, {"pose", "trajectory"}, {"trajectory"}, set()])
 @pytest.mark.parametrize("dynamic", [True, False])
 def test_heading_guidance_and_reward_know_one_center(dynamic, on):
-    """Where the hand is at its target with the fingers of its start, the heading that the rules made is met to 0 m."""
+    """Where the hand is at its target, the heading that the rules made is met to 0 m.
+
+    With the fingers of its start, but under a trajectory alone with those of the partly closed hand.
+    """
     task = dataclasses.replace(TASK, dynamic_center=dynamic)
     state, surface, goal = scene(21)
     goal, q = _begun(surface, goal, {name: np.full(4, name in on) for name in ("affordance", "pose", "trajectory")})
+    if on == {"trajectory"}:
+        q = jnp.tile(closing(HAND), (4, 1))
     wrist = goal["trajectory"] if "trajectory" in on else goal["pose"] if on else None
     if wrist is None:
         center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, q)))

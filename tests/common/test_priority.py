@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from common.hands.kinematics import grasp_frame
+from common.hands.kinematics import grasp_frame, keypoints, link_transforms
 from common.task.constraints.priority import explain, resolve
 from tests.scenes import HAND, scene
 
@@ -48,6 +48,25 @@ def test_an_overridden_heading_is_that_of_the_overriding_reference(trajectory):
     expected = Rotation.from_quat(q, scalar_first=True).apply(grasp_frame(HAND).heading)
     np.testing.assert_allclose(done.goal["heading"].direction[0], expected, atol=1e-5)
     assert abs(np.dot(done.goal["heading"].direction[0], done.goal["heading"].cross[0])) < 1e-5
+
+
+def test_a_lone_trajectorys_heading_is_at_the_centre_of_a_hand_that_is_closed_by_two_fifths():
+    """By hand: the last waypoint is at (1, 2, 3) m and not turned, so the centre is that of the wrist frame, shifted."""
+    _, surface, asked = scene(0)
+    path = asked["trajectory"].position.copy()
+    turns = asked["trajectory"].quaternion.copy()
+    path[:, -1], turns[:, -1] = (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)
+    asked = asked.replace("trajectory", position=path, quaternion=turns)
+    q = 0.6 * HAND.q_open + 0.4 * HAND.q_closed
+    tips = np.asarray(keypoints(HAND, link_transforms(HAND, q)))[len(HAND.links) :]
+    center = (tips[0] + (tips[1] + tips[2] + tips[3] + tips[4]) / 4) / 2
+    alone = resolve(HAND, surface, asked, _flags(trajectory=True)).goal
+    np.testing.assert_allclose(alone["heading"].position, np.tile([1, 2, 3] + center, (4, 1)), atol=1e-5)
+    # The fingers of a reference pose are known, and taken as they are.
+    both = resolve(HAND, surface, asked, _flags(pose=True, trajectory=True)).goal
+    tips = np.asarray(keypoints(HAND, link_transforms(HAND, asked["pose"].q)))[:, len(HAND.links) :]
+    expected = np.array([1, 2, 3]) + (tips[:, 0] + tips[:, 1:].mean(1)) / 2
+    np.testing.assert_allclose(both["heading"].position, expected, atol=1e-5)
 
 
 def test_under_a_trajectory_the_poses_fingers_are_carried_by_its_last_waypoint():

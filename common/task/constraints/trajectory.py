@@ -33,6 +33,12 @@ APART = 0.02
 """Metres between a pose's wrist and a trajectory's end from which on they contradict."""
 TWISTED = 0.3
 """Radians between their orientations, likewise."""
+CLOSED = 0.4
+"""Share of the way from the open hand to the fist at which the hand centre is taken where no pose names the fingers.
+
+Median distance to the centres of closed reference poses, for the shares 0, 0.4, 0.5 and 1: human 21, 19, 19 and 42 mm,
+Allegro 32, 26, 24 and 46 mm, Sharpa 25, 19, 20 and 51 mm (432, 398 and 417 poses on 32 objects of all families).
+"""
 _FAR, _TURNED = 0.15, 0.5
 """Errors (m, rad) beyond which tracking costs no more."""
 
@@ -91,9 +97,12 @@ class Trajectory(Constraint):
         return TrajectoryGoal(*path)
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
-        """The last waypoint is the wrist of a reference pose, and the heading becomes the waypoint's."""
+        """The last waypoint is the wrist of a reference pose, and the heading becomes the waypoint's.
+
+        The heading's position is the hand centre of the pose's fingers; without a pose, of a partly closed hand.
+        """
         here, last = asked["trajectory"], last_waypoint(goal)
-        q = jnp.broadcast_to(jnp.array(hand.q_open), (here.shape[0], len(hand.joints)))
+        q = jnp.broadcast_to(jnp.array(closing(hand)), (here.shape[0], len(hand.joints)))
         if "pose" in goal.values:
             q = jnp.where(asked["pose"][:, None], goal["pose"].q, q)
             goal = goal.where(here, "pose", position=last[0], quaternion=last[1])
@@ -137,6 +146,11 @@ class Trajectory(Constraint):
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
         """It guides the wrist."""
         return ["The wrist trajectory guides the wrist; the heading follows from its last waypoint."]
+
+
+def closing(hand: Hand) -> np.ndarray:
+    """(F,) finger angles q_open + 0.4 (q_closed - q_open), at which an unknown grasp's hand centre is estimated."""
+    return np.asarray(hand.q_open + CLOSED * (hand.q_closed - hand.q_open), np.float32)
 
 
 def last_waypoint(goal: Goal) -> tuple[Array, Array]:
