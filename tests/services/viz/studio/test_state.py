@@ -85,7 +85,7 @@ def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studi
     studio.paint([studio.arrow.position - INWARD * studio.arrow.direction], 0.03, avoid=True)
     view = describe(studio)
     assert view["active"]["overruled"] and any(
-        "turned towards the graspable region" in line for line in view["explanation"]
+        "redirected to the graspable region" in line for line in view["explanation"]
     )
     assert np.linalg.norm(np.subtract(view["active"]["direction"], studio.arrow.direction)) > 0.02
 
