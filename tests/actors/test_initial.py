@@ -109,6 +109,20 @@ def test_a_trajectory_that_ends_nearer_to_the_avoid_region_is_never_drawn_beside
     assert 0.2 < both.mean() < 0.3
 
 
+def test_a_disturbance_never_makes_a_trajectory_contradict_an_affordance():
+    """Trajectories 3, 4 and 5 end 5, 15 and 25 mm on the graspable side, and disturbances have up to 10 mm."""
+    task = dataclasses.replace(TASK, disturbed_references=1.0)
+    drawn = _sampler(task)(_bank(np.ones(M, bool)), jax.random.key(3))
+    region, on = np.asarray(drawn.region) == 1, np.asarray(drawn.goal.active["trajectory"])
+    end = np.asarray(drawn.goal["trajectory"].position)[:, -1]
+    both = region & on
+    assert (end[both, 0] > 0).all()
+    # Those that would have contradicted it are as they were; the rest, and those without affordance, are disturbed.
+    exact = np.isclose(end[:, 0], 0.005, atol=1e-6) & np.isclose(end[:, 1], 0.0, atol=1e-9)
+    assert 0.02 < exact[both].mean() < 0.2 and not exact[on & ~region].any()
+    assert end[both, 1].std() > 0.003 and (end[on & ~region, 0] < 0).any()
+
+
 def test_where_no_trajectory_agrees_with_the_affordance_none_is_drawn():
     active, pose, trajectory = _drawn(TASK, np.arange(M) < 3)
     assert not (active["trajectory"] & active["region"]).any()

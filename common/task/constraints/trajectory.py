@@ -82,19 +82,21 @@ class Trajectory(Constraint):
 
     def allowed(self, draw: "Draw") -> Array:
         """Those clear of the table that agree with an affordance, where one is asked for (region 1)."""
-        bank, objects = draw.bank, draw.objects
-        ends = bank.trajectory_position[objects, draw.region, :, -1]
-        surface = Surface(bank.points[objects], bank.avoid[objects])
-        apart = jax.vmap(_apart_from_regions, (None, 1), 1)(surface, ends)
-        return draw.allowed & ((draw.region == 0)[:, None] | ~_contradicts_affordance(apart))
+        ends = draw.bank.trajectory_position[draw.objects, draw.region, :, -1]
+        return draw.allowed & jax.vmap(_agrees, (None, 1), 1)(draw, ends)
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> TrajectoryGoal:
-        """The trajectory to one of the object's reference poses."""
+        """The trajectory to one of the object's reference poses.
+
+        A disturbance that would make it contradict an affordance is left out.
+        """
         index = draw.objects, draw.region, draw.reference["trajectory"]
-        path = draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index]
-        if draw.disturbance is not None:
-            path = disturbed_wrist(*path, draw.disturbance, key)
-        return TrajectoryGoal(*path)
+        path = TrajectoryGoal(draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index])
+        if draw.disturbance is None:
+            return path
+        disturbed = TrajectoryGoal(*disturbed_wrist(*path, draw.disturbance, key))
+        kept = _agrees(draw, disturbed.position[:, -1])[:, None, None]
+        return TrajectoryGoal(*(jnp.where(kept, *pair) for pair in zip(disturbed, path, strict=True)))
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
         """The last waypoint is the wrist of a reference pose, and the heading becomes the waypoint's.
@@ -200,6 +202,12 @@ def _apart_from_regions(surface: Surface, end: Array) -> dict[str, Array]:
         "avoid": least_distance(surface.points, surface.avoid, end),
         "graspable": least_distance(surface.points, ~surface.avoid, end),
     }
+
+
+def _agrees(draw: "Draw", end: Array) -> Array:
+    """(B,) bool: trajectories that end at (B, 3) agree with the affordance of a draw, or it has none (region 0)."""
+    surface = Surface(draw.bank.points[draw.objects], draw.bank.avoid[draw.objects])
+    return (draw.region == 0) | ~_contradicts_affordance(_apart_from_regions(surface, end))
 
 
 def _contradicts_affordance(apart: Mapping[str, Array]) -> Array:
