@@ -15,7 +15,7 @@ from common.config import SensingConfig, TaskConfig
 from common.hands.spec import Hand
 from common.task.bank import ConstraintBank, Draw
 from common.task.constraints import known, optional
-from common.task.constraints.priority import Resolution, resolve
+from common.task.constraints.priority import Resolution, active_blocks, resolve
 from common.task.sensing import Sensors, draw_sensors
 from common.task.types import Array, Goal, Surface
 
@@ -73,6 +73,9 @@ def sample(
         c.name: jax.random.uniform(own_key(key, c.name, 0), (batch,)) < getattr(task, f"p_{c.name}")
         for c in optional(task)
     }
+    if "affordance" in wanted and "trajectory" in wanted:
+        more = jax.random.uniform(own_key(key, "together", 0), (batch,)) < task.p_together
+        wanted["trajectory"] |= active_blocks(wanted)["affordance"] & more
     draw = Draw(bank, objects, rests, disturbance=_disturbance(task, own_key(key, "disturbance", 0), batch))
     return _drawn(hand, task, draw, next(keys), wanted, stationary)
 

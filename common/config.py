@@ -145,6 +145,9 @@ class TaskConfig(_Shares):
     own_references: bool = True
     """Half of an object's reference poses and trajectories are remade from the policy's own grasps as it learns; the
     others, or all without, stay those that closing the hand around the objects gave."""
+    p_together: float = 0.0
+    """Probability that an episode with an affordance also gets a wrist trajectory that agrees with it, where the object
+    has one; in addition to those that `p_trajectory` gives."""
     aligned_references: bool = False
     """An episode with a reference pose and a wrist trajectory gets the trajectory to that pose; otherwise the two are
     drawn independently, as in the paper, and the trajectory may end elsewhere."""

@@ -123,6 +123,27 @@ def test_a_disturbance_never_makes_a_trajectory_contradict_an_affordance():
     assert end[both, 1].std() > 0.003 and (end[on & ~region, 0] < 0).any()
 
 
+@pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
+def test_a_share_of_the_affordances_gets_a_trajectory_as_well(share):
+    """By hand: 1/2 of the episodes have an affordance, 1/2 of these no pose, 1/2 of these a trajectory anyway."""
+    task = dataclasses.replace(TASK, p_together=share)
+    active, _, trajectory = _drawn(task, np.ones(M, bool))
+    both = active["trajectory"] & active["affordance"]
+    assert both.mean() == pytest.approx(0.25 * (0.5 + 0.5 * share), abs=0.03)
+    assert set(trajectory[both]) == {3, 4, 5}
+    before = _drawn(TASK, np.ones(M, bool))[0]
+    for name in ("affordance", "pose_finger", "region"):
+        np.testing.assert_array_equal(active[name], before[name])
+    # Only episodes whose affordance counts get one more; the others are those of independent draws.
+    assert not (active["trajectory"] & ~before["trajectory"] & ~active["affordance"]).any()
+    assert not (before["trajectory"] & ~active["trajectory"]).any()
+
+
+def test_no_object_gets_a_trajectory_that_its_affordance_excludes():
+    active, _, _ = _drawn(dataclasses.replace(TASK, p_together=1.0), np.arange(M) < 3)
+    assert not (active["trajectory"] & active["region"]).any() and active["affordance"].any()
+
+
 def test_where_no_trajectory_agrees_with_the_affordance_none_is_drawn():
     active, pose, trajectory = _drawn(TASK, np.arange(M) < 3)
     assert not (active["trajectory"] & active["region"]).any()
