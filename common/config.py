@@ -18,7 +18,7 @@ from common.engines import PhysicsName
 from common.errors import CongraspError
 from common.hands.spec import CONTACT_TIME
 from common.inputs import file_name
-from common.task.constraints import CONSTRAINTS, PAPER
+from common.task.constraints import CONSTRAINTS, OURS, PAPER
 from common.task.reward import GRASP
 
 MetricWriter = Literal["tensorboard", "wandb", "wandb-offline"]
@@ -138,7 +138,7 @@ class TaskConfig(_Shares):
     """Surface points of an object that the policy senses (at most 512)."""
     trajectory_points: int = 15
     """K, waypoints of a wrist trajectory."""
-    constraints: tuple[str, ...] = PAPER
+    constraints: tuple[str, ...] = OURS
     """Constraints that the policy knows: what it observes, and can be asked for."""
     headings: Literal["all", "above"] = "all"
     """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier)."""
@@ -404,7 +404,7 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
 
 
 def with_older_physics(task: Any) -> Any:
-    """A `TaskConfig` from JSON; physics that an older file does not name is what held then, not today's default.
+    """A `TaskConfig` from JSON; physics and constraints that an older file does not name are those of then.
 
     Args:
       task: the value, of whatever type; only an object of which `control` is one, too, or is not there, is changed.
@@ -413,7 +413,7 @@ def with_older_physics(task: Any) -> Any:
     if not isinstance(control, dict):
         return task
     then = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0, "hold_acceleration": 1.0}
-    return {"contact_time": 0.016, **task, "control": {**then, **control}}
+    return {"contact_time": 0.016, "constraints": PAPER, **task, "control": {**then, **control}}
 
 
 def _no_constant(name: str) -> float:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from common import rotations
 from common.task.constraints import known
 from common.task.constraints.base import Scene
+from common.task.constraints.fingers import chosen_fingers, keypoint_weights
 from common.task.geometry import FAR, square
 from common.task.types import Array, SceneState
 
@@ -42,7 +43,8 @@ class Term(NamedTuple):
 def _distance(scene: Scene, earning: Earning) -> Array:
     """Weighted distance from the keypoints to the surface."""
     distances = jnp.linalg.norm(scene.features.nearest, axis=-1)
-    return -jnp.sum(jnp.array(scene.hand.keypoint_weights) * jnp.minimum(distances, FAR), -1)
+    weights = keypoint_weights(scene.hand, chosen_fingers(scene.task.constraints, scene.goal))
+    return -jnp.sum(weights * jnp.minimum(distances, FAR), -1)
 
 
 def _contact(scene: Scene, earning: Earning) -> Array:

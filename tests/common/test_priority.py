@@ -67,7 +67,7 @@ def test_a_lone_trajectorys_heading_is_at_the_centre_of_a_hand_that_is_closed_by
     tips = np.asarray(keypoints(HAND, link_transforms(HAND, q)))[len(HAND.links) :]
     center = (tips[0] + (tips[1] + tips[2] + tips[3] + tips[4]) / 4) / 2
     alone = resolve(HAND, surface, asked, _flags(trajectory=True)).goal
-    np.testing.assert_allclose(alone["heading"].position, np.tile(center + (1, 2, 3), (4, 1)), atol=1e-5)
+    np.testing.assert_allclose(alone["heading"].position, np.tile(np.add(center, (1, 2, 3)), (4, 1)), atol=1e-5)
     # The fingers of a reference pose are known, and taken as they are.
     both = resolve(HAND, surface, asked, _flags(pose=True, trajectory=True)).goal
     tips = np.asarray(keypoints(HAND, link_transforms(HAND, asked["pose"].q)))[:, len(HAND.links) :]

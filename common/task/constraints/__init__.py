@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers())
 PAPER = ("heading", "affordance", "pose", "trajectory")
-"""Names of the paper's constraints: what a policy knows unless its task says otherwise."""
+"""Names of the paper's constraints."""
+OURS = (*PAPER, "fingers")
+"""Names of those that a policy knows unless its task says otherwise."""
 
 
 def get_constraint(name: str) -> Constraint:
@@ -89,6 +91,7 @@ def require_known(names: Iterable[str], task: "TaskConfig") -> None:
 
 __all__ = [
     "CONSTRAINTS",
+    "OURS",
     "PAPER",
     "Constraint",
     "blocks",

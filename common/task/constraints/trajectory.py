@@ -19,6 +19,7 @@ from common.task.constraints.base import (
     Scene,
     Weight,
 )
+from common.task.constraints.fingers import chosen_fingers
 from common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
 from common.task.constraints.pose import heading_message
 from common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
@@ -108,7 +109,7 @@ class Trajectory(Constraint):
         if "pose" in goal.values:
             q = jnp.where(asked["pose"][:, None], goal["pose"].q, q)
             goal = goal.where(here, "pose", position=last[0], quaternion=last[1])
-        return goal.where(here, "heading", **heading_of_wrist(hand, q, *last))
+        return goal.where(here, "heading", **heading_of_wrist(hand, q, *last, chosen_fingers(asked, goal)))
 
     def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The waypoints."""
