@@ -15,6 +15,7 @@ from common.config import SensingConfig, TaskConfig
 from common.hands.spec import Hand
 from common.task.bank import ConstraintBank, Draw
 from common.task.constraints import known, optional
+from common.task.constraints.force import least_force
 from common.task.constraints.priority import Resolution, active_blocks, resolve
 from common.task.sensing import Sensors, draw_sensors
 from common.task.types import Array, Goal, Surface
@@ -158,13 +159,16 @@ def _drawn(
     """What is left to draw of B episodes of given objects, resting poses and (where they can be had) constraints."""
     bank, batch = draw.bank, draw.objects.shape
     mass, friction, length = (jax.random.uniform(part, batch) for part in jax.random.split(key, 3))
+    low, high = task.mass_range
+    friction_low, friction_high = task.friction_range
+    mass = low + (high - low) * mass
+    friction = friction_low + (friction_high - friction_low) * friction
     draw, asked = _available(task, draw, wanted)
+    draw = draw._replace(least_force=least_force(bank.mass[draw.objects] * mass, friction))
     draw = draw._replace(reference=_references(task, draw, asked, key))
     values = {c.name: c.sample(hand, draw, own_key(key, c.name, 1)) for c in known(task)}
     surface = Surface(bank.points[draw.objects], bank.avoid[draw.objects])
     goal = resolve(hand, surface, Goal(values, {}), asked).goal
-    low, high = task.mass_range
-    friction_low, friction_high = task.friction_range
     gain_low, gain_high = task.gain_range
     reset_state = start(
         hand,
@@ -172,8 +176,8 @@ def _drawn(
         goal,
         bank.rest[draw.objects, draw.rests],
         objects=draw.objects,
-        mass_scale=low + (high - low) * mass,
-        friction=friction_low + (friction_high - friction_low) * friction,
+        mass_scale=mass,
+        friction=friction,
         gain_scale=gain_low + (gain_high - gain_low) * jax.random.uniform(own_key(key, "gains", 0), batch),
         stationary=jnp.broadcast_to(stationary, batch),
     )

@@ -24,7 +24,7 @@ class Earning(NamedTuple):
     force: Array
     """(B, L, 3) net force on each link, N."""
     force_max: Array
-    """() f_max, N per link."""
+    """() or (B, 1) f_max, N per link."""
 
 
 class Term(NamedTuple):
@@ -144,10 +144,11 @@ def fallen(task: "TaskConfig", state: SceneState) -> Array:
 
 def reward_terms(scene: Scene, weights: "RewardWeights") -> dict[str, Array]:
     """Weighted terms (B,) by the names in `terms`; the reward is their sum."""
-    touching, force = scene.features.touching, scene.features.force
+    touching, force, most = scene.features.touching, scene.features.force, weights.force_max
     for constraint in known(scene.task):
         touching, force = constraint.earning(scene, touching, force)
-    earning = Earning(touching, force, weights.force_max)
+        most = constraint.force_max(scene, most)
+    earning = Earning(touching, force, most)
     found = {term.name: term.value(scene, earning) for term in GRASP if term.value is not None}
     for constraint in known(scene.task):
         found |= constraint.reward(scene)

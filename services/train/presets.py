@@ -22,6 +22,7 @@ QUICKSTART = RunConfig(
         p_pose=0.0,
         p_trajectory=0.0,
         p_fingers=0.0,
+        p_force=0.0,
     ),
     objects=ObjectsConfig(count=16),
     network=NetworkConfig(hidden=(256, 128)),
@@ -43,6 +44,7 @@ def easier(config: RunConfig) -> list[str]:
         "a reference pose": task.p_pose,
         "a wrist trajectory": task.p_trajectory,
         "a choice of fingers": task.p_fingers,
+        "a force limit": task.p_force,
     }
     absent = [name for name, probability in odds.items() if not probability]
     if absent:

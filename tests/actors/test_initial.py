@@ -61,6 +61,7 @@ def _bank(valid: np.ndarray) -> ConstraintBank:
         pose_valid=np.broadcast_to(valid, (2, 2, 1, M)),
         has_affordance=np.ones((2, 1), bool),
         weight=np.ones(2, np.float32),
+        mass=np.array([0.1, 1.0], np.float32),
         renewable=np.ones(2, bool),
         grasps=np.zeros((2, 2), int),
     )

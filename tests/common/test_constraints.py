@@ -28,8 +28,8 @@ OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional
 TASK = TaskConfig(constraints=NAMES)
 OBJECTS = [procedural.generate(1, family) for family in ("hammer", "mug")]
 BATCH = 256
-CHANGES = {"fingers": {"heading", "distance", "heading_position"}}
-"""Blocks and reward terms of others that a constraint changes: the hand centre and the distance are the set's."""
+CHANGES = {"fingers": {"heading", "distance", "heading_position"}, "force": {"force_excess"}}
+"""Blocks and reward terms of others that a constraint changes: hand centre and distance of the set, and f_max."""
 each = pytest.mark.parametrize("constraint", CONSTRAINTS, ids=NAMES)
 each_optional = pytest.mark.parametrize("constraint", OPTIONAL, ids=lambda constraint: constraint.name)
 
@@ -65,7 +65,7 @@ def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
 
 def test_the_observation_is_as_wide_as_its_layout(whole):
     assert observe(whole).shape == (4, sum(size for _, size in layout(HAND, TASK)))
-    assert dict(layout(HAND, TASK))["mask"] == len(blocks(TASK)) == 5
+    assert dict(layout(HAND, TASK))["mask"] == len(blocks(TASK)) == 6
 
 
 def test_names_are_unique_over_all_constraints():
@@ -115,7 +115,7 @@ def test_it_shows_pays_and_forbids_nothing_while_it_is_inactive(constraint, whol
             assert on_observation[:, block].any() and not off_observation[:, block].any(), name
         elif name == "mask":
             silent = [mask[block] for block in constraint.blocks]
-            np.testing.assert_array_equal(off_observation[:, block] == 0, np.tile(np.isin(range(5), silent), (4, 1)))
+            np.testing.assert_array_equal(off_observation[:, block] == 0, np.tile(np.isin(range(6), silent), (4, 1)))
         elif name not in CHANGES.get(constraint.name, ()):
             np.testing.assert_array_equal(on_observation[:, block], off_observation[:, block], err_msg=name)
     assert not any(np.any(value) for value in constraint.reward(off).values())
@@ -194,14 +194,14 @@ def test_requests_fill_the_arrays_that_they_give():
 
 
 TABLE = [
-    dict(zip([c.name for c in OPTIONAL], flags, strict=True)) for flags in itertools.product([False, True], repeat=4)
+    dict(zip([c.name for c in OPTIONAL], flags, strict=True)) for flags in itertools.product([False, True], repeat=5)
 ]
 
 
 @pytest.mark.parametrize("asked", TABLE, ids=lambda asked: "+".join(name for name in asked if asked[name]) or "heading")
 def test_active_blocks(asked):
     """The paper's figure of priorities; the choice of fingers yields to a reference pose as the affordance does."""
-    affordance, pose, trajectory, fingers = (asked[c.name] for c in OPTIONAL)
+    affordance, pose, trajectory, fingers, force = (asked[c.name] for c in OPTIONAL)
     found = active_blocks({name: np.full(2, flag) for name, flag in asked.items()})
     expected = {
         "affordance": affordance and not pose,
@@ -209,6 +209,7 @@ def test_active_blocks(asked):
         "pose_wrist": pose and not trajectory,
         "trajectory": trajectory,
         "fingers": fingers and not pose,
+        "force_limit": force,
     }
     assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
 

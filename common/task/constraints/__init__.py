@@ -11,6 +11,7 @@ from common.request import GraspRequest
 from common.task.constraints.affordance import Affordance
 from common.task.constraints.base import Constraint, ErrorSpec, unknown_constraint
 from common.task.constraints.fingers import Fingers
+from common.task.constraints.force import Force
 from common.task.constraints.heading import Heading
 from common.task.constraints.pose import Pose
 from common.task.constraints.trajectory import Trajectory
@@ -19,10 +20,10 @@ from common.task.types import Goal
 if TYPE_CHECKING:
     from common.config import TaskConfig
 
-CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers())
+CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers(), Force())
 PAPER = ("heading", "affordance", "pose", "trajectory")
 """Names of the paper's constraints."""
-OURS = (*PAPER, "fingers")
+OURS = (*PAPER, "fingers", "force")
 """Names of those that a policy knows unless its task says otherwise."""
 
 
