@@ -8,6 +8,9 @@ from collections import Counter
 import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from actors.bank import build_bank
 from actors.initial import InitialConditions, sample
@@ -16,12 +19,13 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
 from common.request import GraspRequest
+from common.task import metrics
 from common.task.constraints import CONSTRAINTS, OURS, PAPER, blocks, get_constraint, goal_of, known, require_known
 from common.task.constraints.priority import active_blocks
 from common.task.features import scene_of
 from common.task.observation import fields, layout, observe
 from common.task.reward import GRASP, reward_terms, terms
-from tests.scenes import HAND, active, scene
+from tests.scenes import HAND, active, moved, scene
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
 OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional)
@@ -179,6 +183,25 @@ def test_what_is_not_known_is_named():
         CongraspError, match=r"The policy does not know the constraint 'fingers'.*constraints … fingers"
     ):
         require_known(["heading", "fingers"], TaskConfig(constraints=PAPER))
+
+
+@settings(max_examples=6, deadline=None)
+@given(st.integers(0, 1000))
+def test_errors_and_rewards_do_not_depend_on_where_the_scene_is(seed):
+    """Turned about the vertical and shifted level, with every constraint active."""
+    state, surface, goal = scene(seed)
+    rng = np.random.default_rng(seed)
+    level = moved(state, np.append(rng.normal(size=2), 0.0), Rotation.from_euler("z", rng.uniform(-3, 3)))
+    some, others = (_judged(each, surface, goal) for each in (state, level))
+    for one, other in zip(jax.tree.leaves(some), jax.tree.leaves(others), strict=True):
+        np.testing.assert_allclose(one, other, rtol=2e-3, atol=5e-3)
+
+
+@jax.jit
+def _judged(state, surface, goal):
+    """Observation, reward terms and errors of a scene."""
+    made = scene_of(HAND, TASK, state, surface, goal)
+    return observe(made), reward_terms(made, RewardWeights()), metrics.errors(made)
 
 
 def test_requests_fill_the_arrays_that_they_give():

@@ -38,6 +38,7 @@ def _sample(success, held, **columns) -> Sample:
         "trajectory_m",
         "affordance_ratio",
         "fingers_ratio",
+        "force_ratio",
         *(f"mask_{name}" for name in BLOCKS),
     )
     values = {name: np.zeros(count, np.float32) for name in names}
