@@ -85,6 +85,7 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
     key = jax.random.key(seed)
     references = _references(hand, *surfaces, *chosen, columns["rest"], key, waypoints=task.trajectory_points)
     own = {"weight": np.ones(count, np.float32), "renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
+    own["mass"] = np.array([obj.mass for obj in objects], np.float32)
     return jax.device_put(ConstraintBank(**columns, **references, **own))
 
 

@@ -17,7 +17,8 @@ from common.hands.closure import MARGIN, preshape
 from common.hands.spec import Hand
 from common.task.bank import ConstraintBank, Draw
 from common.task.constraints import known, optional
-from common.task.constraints.priority import Resolution, resolve
+from common.task.constraints.force import least_force
+from common.task.constraints.priority import Resolution, active_blocks, resolve
 from common.task.sampling.headings import Headings, local_width
 from common.task.sensing import Sensors, draw_sensors
 from common.task.types import Array, Goal, Surface
@@ -90,6 +91,9 @@ def sample(
         c.name: jax.random.uniform(own_key(key, c.name, 0), (batch,)) < getattr(task, f"p_{c.name}")
         for c in optional(task)
     }
+    if "affordance" in wanted and "trajectory" in wanted:
+        more = jax.random.uniform(own_key(key, "together", 0), (batch,)) < task.p_together
+        wanted["trajectory"] |= active_blocks(wanted)["affordance"] & more
     draw = Draw(bank, objects, rests, disturbance=_disturbance(task, own_key(key, "disturbance", 0), batch))
     approach = _varied(task, own_key(key, "approach", 0), batch)
     return _drawn(hand, task, draw, next(keys), wanted, stationary, approach)
@@ -189,13 +193,16 @@ def _drawn(
     """What is left to draw of B episodes of given objects, resting poses and (where they can be had) constraints."""
     bank, batch = draw.bank, draw.objects.shape
     mass, friction, length = (jax.random.uniform(part, batch) for part in jax.random.split(key, 3))
+    low, high = task.mass_range
+    friction_low, friction_high = task.friction_range
+    mass = low + (high - low) * mass
+    friction = friction_low + (friction_high - friction_low) * friction
     draw, asked = _available(task, draw, wanted)
+    draw = draw._replace(least_force=least_force(bank.mass[draw.objects] * mass, friction))
     draw = draw._replace(reference=_references(task, draw, asked, key))
     values = {c.name: c.sample(hand, draw, own_key(key, c.name, 1)) for c in known(task)}
     surface = Surface(bank.points[draw.objects], bank.avoid[draw.objects])
     goal = resolve(hand, surface, Goal(values, {}), asked).goal
-    low, high = task.mass_range
-    friction_low, friction_high = task.friction_range
     gain_low, gain_high = task.gain_range
     reset_state = start(
         hand,
@@ -205,8 +212,8 @@ def _drawn(
         bank.rest[draw.objects, draw.rests],
         approach,
         objects=draw.objects,
-        mass_scale=low + (high - low) * mass,
-        friction=friction_low + (friction_high - friction_low) * friction,
+        mass_scale=mass,
+        friction=friction,
         gain_scale=gain_low + (gain_high - gain_low) * jax.random.uniform(own_key(key, "gains", 0), batch),
         stationary=jnp.broadcast_to(stationary, batch),
     )

@@ -18,7 +18,7 @@ from common.engines import PhysicsName
 from common.errors import CongraspError
 from common.hands.spec import CONTACT_TIME
 from common.inputs import file_name
-from common.task.constraints import CONSTRAINTS, PAPER
+from common.task.constraints import CONSTRAINTS, OURS, PAPER
 from common.task.reward import GRASP
 
 MetricWriter = Literal["tensorboard", "wandb", "wandb-offline"]
@@ -161,13 +161,16 @@ class TaskConfig(_Shares):
     """Surface points of an object that the policy senses (at most 512)."""
     trajectory_points: int = 15
     """K, waypoints of a wrist trajectory."""
-    constraints: tuple[str, ...] = PAPER
+    constraints: tuple[str, ...] = OURS
     """Constraints that the policy knows: what it observes, and can be asked for."""
     headings: Literal["all", "above"] = "all"
     """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier)."""
     own_references: bool = True
     """Half of an object's reference poses and trajectories are remade from the policy's own grasps as it learns; the
     others, or all without, stay those that closing the hand around the objects gave."""
+    p_together: float = 0.0
+    """Probability that an episode with an affordance also gets a wrist trajectory that agrees with it, where the object
+    has one; in addition to those that `p_trajectory` gives."""
     aligned_references: bool = False
     """An episode with a reference pose and a wrist trajectory gets the trajectory to that pose; otherwise the two are
     drawn independently, as in the paper, and the trajectory may end elsewhere."""
@@ -424,7 +427,7 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
 
 
 def with_older_physics(task: Any) -> Any:
-    """A `TaskConfig` from JSON; physics that an older file does not name is what held then, not today's default.
+    """A `TaskConfig` from JSON; physics and constraints that an older file does not name are those of then.
 
     Args:
       task: the value, of whatever type; only an object of which `control` is one, too, or is not there, is changed.
@@ -441,6 +444,7 @@ def with_older_physics(task: Any) -> Any:
     }
     back_off = task.get("back_off", 0.15)
     begun = {
+        "constraints": PAPER,
         "constant_mass": False,
         "torsional_friction": 0.0,
         "object_damping": 5e-4,

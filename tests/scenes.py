@@ -7,6 +7,7 @@ from common.hands import get_hand
 from common.task.constraints import CONSTRAINTS
 from common.task.constraints.affordance import AffordanceGoal
 from common.task.constraints.fingers import FingersGoal
+from common.task.constraints.force import ForceGoal
 from common.task.constraints.heading import HeadingGoal
 from common.task.constraints.pose import PoseGoal
 from common.task.constraints.trajectory import TrajectoryGoal
@@ -77,6 +78,7 @@ def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
     }
     surface = Surface(normal(N, 3, scale=0.03), rng.random((batch, N)) < 0.5)
     values["fingers"] = FingersGoal(np.arange(len(HAND.fingers)) < rng.integers(2, len(HAND.fingers), (batch, 1)))
+    values["force"] = ForceGoal(rng.uniform(1.0, 8.0, batch).astype(np.float32))
     return state, surface, Goal(values, active(*(block for c in CONSTRAINTS for block in c.blocks), batch=batch))
 
 

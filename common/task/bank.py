@@ -48,6 +48,8 @@ class ConstraintBank(NamedTuple):
     """(N, R) bool: the object has an avoid region, and its graspable one can be approached in the resting pose."""
     weight: Array
     """(N,) how often the object is drawn, in relation to the others."""
+    mass: Array
+    """(N,) kg, before the factor of the episode."""
     renewable: Array
     """(N,) bool: grasps of the policy in training may take the place of the object's references."""
     grasps: Array
@@ -102,7 +104,8 @@ class Draw(NamedTuple):
     """(B,) int, the axis V: that of the constraints which are asked for so far."""
     reference: Mapping[str, Array] = MappingProxyType({})
     """(B,) int by the name of each constraint that is drawn from references: one that it allows, if there is any."""
-
+    least_force: Array = 1.0
+    """(B,) N, the least limit on a link's force under which the episode's object can be held."""
     disturbance: Array | None = None
     """(B,) between 0 and 1, how far references are off (`common.task.sampling.disturbances`); None for not at all."""
 

@@ -20,6 +20,7 @@ REGIONS = ("whole surface", "graspable region")
 """The axis V: constraints for the whole surface, and for the graspable region alone."""
 FORMAT = 2
 _LARGEST = 100.0  # m or rad
+_MASS = 0.2  # kg of an object whose set is of a time when sets did not say it
 MEANING = {
     "surface/points": "(P, 3) m, object frame",
     "surface/minus": "(P,) bool, the point belongs to the avoid region",
@@ -104,6 +105,7 @@ def _row(made: Message, split: Split) -> ConstraintBank:
         pose_valid=pose[:, usable],
         has_affordance=arrays["surface/minus"].any() & heading[1].any(-1),
         weight=np.float32(1.0),
+        mass=np.float32(made.meta.get("object_mass", _MASS)),
         renewable=np.bool_(False),
         grasps=np.zeros(2, int),
     )
@@ -152,6 +154,9 @@ def _check(message: Message) -> None:
     scale = meta.get("object_scale")
     if not isinstance(scale, (int, float)) or not 0 < scale <= 100 or not isinstance(meta.get("object_digest"), str):
         raise ValueError("its object_scale or object_digest is none")
+    mass = meta.get("object_mass", _MASS)
+    if isinstance(mass, bool) or not isinstance(mass, (int, float)) or not 0 < mass <= 1000:
+        raise ValueError("its object_mass is none")
     if len(_names(meta.get("variants"))) != len(REGIONS):
         raise ValueError(f"it has other variants than {', '.join(REGIONS)}")
     sizes = check_arrays(message.arrays, MEANING, indices=("visual/faces",), largest=_LARGEST, sizes=sizes)

@@ -13,7 +13,8 @@ from common.hands import kinematics
 from common.hands.spec import Hand
 from common.task.constraints import known
 from common.task.constraints.base import Scene
-from common.task.geometry import nearest_index, squared_distances, wrist_pose
+from common.task.constraints.fingers import chosen_fingers
+from common.task.geometry import hand_center, nearest_index, squared_distances, wrist_pose
 from common.task.sensing import Readings
 from common.task.types import Array, Goal, SceneState, Surface
 
@@ -32,7 +33,8 @@ class Features(NamedTuple):
     keypoints: Array
     """(B, P, 3) link origins and fingertips."""
     center: Array
-    """(B, 3) hand centre p: of the present fingers, or in the ablation of those with which the episode began."""
+    """(B, 3) hand centre p: of the present fingers, or in the ablation of those with which the episode began; of those
+    that an active choice of fingers allows."""
     nearest: Array
     """(B, P, 3) d: from each keypoint to the nearest surface point."""
     force: Array
@@ -94,7 +96,7 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
         object_position=object_position,
         object_quaternion=object_quaternion,
         keypoints=keypoints,
-        center=kinematics.hand_center(hand, fingers),
+        center=hand_center(hand, fingers, chosen_fingers(task.constraints, goal)),
         nearest=rotations.apply(rotations.to_matrix(object_quaternion), nearest),
         force=jnp.sum(forces, -2),
         touching=jnp.any(found, -1),

@@ -4,12 +4,31 @@ import jax
 import jax.numpy as jnp
 
 from common import rotations
+from common.hands import kinematics
+from common.hands.spec import Hand
 from common.task.types import Array, SceneState
 
 FAR = 0.3
 """Metres that stand for "no such surface point"."""
 FORCE_SCALE = 5.0
 """N at which the squashed force is one half."""
+
+
+def hand_center(hand: Hand, points: Array, fingers: Array | None = None) -> Array:
+    """(B, 3) hand centre: middle between the thumb's tip and the mean of the other tips that count.
+
+    Args:
+      hand: the hand.
+      points: (B, P, 3) its keypoints.
+      fingers: (B, G) bool, the fingers that count, thumb first; all by default.
+    """
+    whole = kinematics.hand_center(hand, points)
+    if fingers is None:
+        return whole
+    tips, counted = points[..., len(hand.links) :, :], fingers[..., 1:, None].astype(jnp.float32)
+    others = jnp.sum(tips[..., 1:, :] * counted, -2) / jnp.maximum(jnp.sum(counted, -2), 1.0)
+    # Where all count, the same formula as without a choice, to the last bit.
+    return jnp.where(jnp.all(fingers, -1, keepdims=True), whole, 0.5 * (tips[..., 0, :] + others))
 
 
 def wrist_pose(state: SceneState) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from common import rotations
 from common.task.constraints import known
 from common.task.constraints.base import Scene
+from common.task.constraints.fingers import chosen_fingers, keypoint_weights
 from common.task.geometry import FAR, square
 from common.task.types import Array, SceneState
 
@@ -23,7 +24,7 @@ class Earning(NamedTuple):
     force: Array
     """(B, L, 3) net force on each link, N."""
     force_max: Array
-    """() f_max, N per link."""
+    """() or (B, 1) f_max, N per link."""
 
 
 class Term(NamedTuple):
@@ -42,7 +43,8 @@ class Term(NamedTuple):
 def _distance(scene: Scene, earning: Earning) -> Array:
     """Weighted distance from the keypoints to the surface."""
     distances = jnp.linalg.norm(scene.features.nearest, axis=-1)
-    return -jnp.sum(jnp.array(scene.hand.keypoint_weights) * jnp.minimum(distances, FAR), -1)
+    weights = keypoint_weights(scene.hand, chosen_fingers(scene.task.constraints, scene.goal))
+    return -jnp.sum(weights * jnp.minimum(distances, FAR), -1)
 
 
 def _contact(scene: Scene, earning: Earning) -> Array:
@@ -142,10 +144,11 @@ def fallen(task: "TaskConfig", state: SceneState) -> Array:
 
 def reward_terms(scene: Scene, weights: "RewardWeights") -> dict[str, Array]:
     """Weighted terms (B,) by the names in `terms`; the reward is their sum."""
-    touching, force = scene.features.touching, scene.features.force
+    touching, force, most = scene.features.touching, scene.features.force, weights.force_max
     for constraint in known(scene.task):
         touching, force = constraint.earning(scene, touching, force)
-    earning = Earning(touching, force, weights.force_max)
+        most = constraint.force_max(scene, most)
+    earning = Earning(touching, force, most)
     found = {term.name: term.value(scene, earning) for term in GRASP if term.value is not None}
     for constraint in known(scene.task):
         found |= constraint.reward(scene)

@@ -23,7 +23,9 @@ _MOST_ATTEMPTS = 1024
 Constraints: Any = dataclasses.make_dataclass(
     "Constraints",
     [
-        (option.name, Annotated[tuple[str, ...], Doc(option.help)], ())
+        (option.name, Annotated[bool, Doc(option.help)], False)
+        if option.switch
+        else (option.name, Annotated[tuple[str, ...], Doc(option.help)], ())
         if option.many
         else (option.name, Annotated[str, Doc(option.help)], "")
         for constraint in CONSTRAINTS

@@ -28,6 +28,7 @@ _UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for 
 PROBED_EPISODES = 2000
 """Forces are read from this many episodes of a row at most."""
 _FORCES = ("link_force", "force_sum", "torque_share")
+_PRESSED = ("force_peak_n", "force_mean_n")
 _NORMAL_95 = 1.959964
 _HUNDREDTHS = np.linspace(0, 1, 101)
 _SIZES = ("small", "medium", "large")
@@ -121,8 +122,10 @@ class Row:
           LookupError, TypeError: it did not.
         """
         own = {field.name: row[field.name] for field in dataclasses.fields(cls) if field.name in row}
-        errors = {name: row[name] for names in ERRORS.values() for name in names.values()}
+        # Files of before lack what constraints that came later measure.
+        errors = {name: row.get(name) for names in ERRORS.values() for name in names.values()}
         forces = {f"{name}_{of}": row[f"{name}_{of}"] for name in _FORCES for of in ("mean", "p95")}
+        forces |= {name: row.get(name) for name in _PRESSED}
         known = {*own, *errors, *forces, "return"}
         measured = {name: value for name, value in row.items() if name not in known}
         own |= {"paper": PaperRow(**row["paper"]) if row["paper"] else None, "plausibility": measured}
@@ -240,13 +243,20 @@ def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, flo
 
 
 def _forces(sample: Sample) -> dict[str, float | None]:
-    """Mean and 95th percentile: force of a touching link, sum over the links, and finger torque over its limit."""
+    """Mean and 95th percentile: force of a touching link, sum over the links, and finger torque over its limit.
+
+    `force_peak_n` is the greatest force of a link in an episode, `force_mean_n` that of the strongest link in a step.
+    Both are means over the episodes.
+    """
     links = np.asarray(sample.link_force, np.float32)
     samples = links[links > 0], links.sum(-1).ravel(), np.asarray(sample.torque, np.float32).ravel()
     row: dict[str, float | None] = {}
     for name, found in zip(_FORCES, samples, strict=True):
         row[f"{name}_mean"] = float(found.mean()) if found.size else None
         row[f"{name}_p95"] = float(np.percentile(found, 95)) if found.size else None
+    strongest = links.max(-1) if links.size else np.zeros(0)
+    row["force_peak_n"] = float(strongest.max(-1).mean()) if strongest.size else None
+    row["force_mean_n"] = float(strongest.mean()) if strongest.size else None
     return row
 
 

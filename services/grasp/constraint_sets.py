@@ -114,6 +114,7 @@ def set_of(
         "object": obj.name,
         "object_digest": store.digest(obj),
         "object_scale": 1.0,
+        "object_mass": float(obj.mass),
         "seed": seed,
         "variants": list(REGIONS),
         "finger_joints": [joint.name for joint in hand.joints],

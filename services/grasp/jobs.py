@@ -117,7 +117,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
     try:
         folder = settings.out / file_name(at.name, "the folder of an object")
         given = {
-            name: [_identity(part) for part in ([text] if isinstance(text, str) else text)]
+            name: [_identity(part) for part in ([str(text)] if isinstance(text, str | bool) else text)]
             for name, text in settings.constraints.items()
             if text
         }

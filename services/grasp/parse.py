@@ -21,8 +21,9 @@ from common.inputs import read_json
 from common.objects.spec import GraspObject
 from common.request import GraspRequest
 from common.task import constraint_sets
-from common.task.constraints import CONSTRAINTS
+from common.task.constraints import CONSTRAINTS, get_constraint
 from common.task.constraints.base import Option
+from common.task.constraints.force import least_force
 from common.wire.codec import Message
 from services.assets.objects.headers import check_header
 from services.assets.objects.sizes import size_in_words
@@ -82,8 +83,15 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
     return GraspRequest({"heading": {}, **found}, avoid, above=written.texts["heading"] == ABOVE)
 
 
-def _plain(option: Option, value: str | os.PathLike[str] | Iterable[Any]) -> str | tuple[str, ...]:
-    """What was written for an option: its words where it takes several, else one text."""
+def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]) -> str | tuple[str, ...]:
+    """What was written for an option: its words where it takes several, else one text, empty for a switch that is off.
+
+    A number stands for its text.
+    """
+    if option.switch:
+        return "yes" if value else ""
+    if isinstance(value, int | float):
+        return f"{value:g}"
     text = os.fspath(value) if isinstance(value, str | os.PathLike) else ",".join(map(str, value))
     return tuple(text.replace(",", " ").split()) if option.many else text
 
@@ -103,6 +111,15 @@ def _heading(written: Written) -> dict[str, np.ndarray] | None:
 def _affordance(written: Written) -> dict[str, np.ndarray] | None:
     """It has no arrays of its own: what it asks for is in the avoid region."""
     return {} if written.texts["affordance"] or written.texts["avoid"] else None
+
+
+def _force(written: Written) -> dict[str, np.ndarray] | None:
+    """The limit that is given, or the least one for the object's weight."""
+    if not written.texts["gentle"]:
+        return get_constraint("force").parse(written.texts, written.hand)
+    if written.texts["force"]:
+        raise CongraspError("--force and --gentle both set the force limit.", "Leave one out.")
+    return {"limit": np.asarray(least_force(written.obj.mass, 1.0), np.float32)}
 
 
 def _numbers(text: str, count: int, name: str) -> np.ndarray:
@@ -355,5 +372,6 @@ READERS: dict[str, Callable[[Written], dict[str, np.ndarray] | None]] = {
     "affordance": _affordance,
     "pose": _pose,
     "trajectory": _trajectory,
+    "force": _force,
 }
 """Readers of constraints that take files or the object's own coordinates; the others parse by themselves."""

@@ -21,6 +21,8 @@ QUICKSTART = RunConfig(
         p_affordance=0.0,
         p_pose=0.0,
         p_trajectory=0.0,
+        p_fingers=0.0,
+        p_force=0.0,
     ),
     objects=ObjectsConfig(count=16),
     network=NetworkConfig(hidden=(256, 128)),
@@ -41,6 +43,8 @@ def easier(config: RunConfig) -> list[str]:
         "an affordance": task.p_affordance,
         "a reference pose": task.p_pose,
         "a wrist trajectory": task.p_trajectory,
+        "a choice of fingers": task.p_fingers,
+        "a force limit": task.p_force,
     }
     absent = [name for name, probability in odds.items() if not probability]
     if absent:

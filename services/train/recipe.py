@@ -78,6 +78,9 @@ def recipe(hand: Hand) -> RunConfig:
             p_affordance=own.p_affordance,
             p_pose=0.35,
             p_trajectory=0.35,
+            p_fingers=0.25,
+            p_force=0.25,
+            p_together=0.45,  # trajectory and affordance in 15 % of the episodes (Allegro: 17), without it in 8 (9)
             hold_steps_max=200,
             disturbed_references=0.5,
             mass_range=(0.8, 1.6),

@@ -16,6 +16,7 @@ from common.hands.kinematics import hand_center, keypoints, link_transforms
 from common.task.bank import ConstraintBank
 from common.task.constraints.heading import heading_wrist_pose
 from common.task.constraints.priority import resolve
+from common.task.constraints.trajectory import closing
 from common.task.features import scene_of
 from common.task.geometry import in_world
 from common.task.metrics import errors
@@ -60,6 +61,7 @@ def _bank(valid: np.ndarray) -> ConstraintBank:
         pose_valid=np.broadcast_to(valid, (2, 2, 1, M)),
         has_affordance=np.ones((2, 1), bool),
         weight=np.ones(2, np.float32),
+        mass=np.array([0.1, 1.0], np.float32),
         renewable=np.ones(2, bool),
         grasps=np.zeros((2, 2), int),
     )
@@ -108,6 +110,41 @@ def test_a_trajectory_that_ends_nearer_to_the_avoid_region_is_never_drawn_beside
     assert 0.2 < both.mean() < 0.3
 
 
+def test_a_disturbance_never_makes_a_trajectory_contradict_an_affordance():
+    """Trajectories 3, 4 and 5 end 5, 15 and 25 mm on the graspable side, and disturbances have up to 10 mm."""
+    task = dataclasses.replace(TASK, disturbed_references=1.0)
+    drawn = _sampler(task)(_bank(np.ones(M, bool)), jax.random.key(3))
+    region, on = np.asarray(drawn.region) == 1, np.asarray(drawn.goal.active["trajectory"])
+    end = np.asarray(drawn.goal["trajectory"].position)[:, -1]
+    both = region & on
+    assert (end[both, 0] > 0).all()
+    # Those that would have contradicted it are as they were; the rest, and those without affordance, are disturbed.
+    exact = np.isclose(end[:, 0], 0.005, atol=1e-6) & np.isclose(end[:, 1], 0.0, atol=1e-9)
+    assert 0.02 < exact[both].mean() < 0.2 and not exact[on & ~region].any()
+    assert end[both, 1].std() > 0.003 and (end[on & ~region, 0] < 0).any()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
+def test_a_share_of_the_affordances_gets_a_trajectory_as_well(share):
+    """By hand: 1/2 of the episodes have an affordance, 1/2 of these no pose, 1/2 of these a trajectory anyway."""
+    task = dataclasses.replace(TASK, p_together=share)
+    active, _, trajectory = _drawn(task, np.ones(M, bool))
+    both = active["trajectory"] & active["affordance"]
+    assert both.mean() == pytest.approx(0.25 * (0.5 + 0.5 * share), abs=0.03)
+    assert set(trajectory[both]) == {3, 4, 5}
+    before = _drawn(TASK, np.ones(M, bool))[0]
+    for name in ("affordance", "pose_finger", "region"):
+        np.testing.assert_array_equal(active[name], before[name])
+    # Only episodes whose affordance counts get one more; the others are those of independent draws.
+    assert not (active["trajectory"] & ~before["trajectory"] & ~active["affordance"]).any()
+    assert not (before["trajectory"] & ~active["trajectory"]).any()
+
+
+def test_no_object_gets_a_trajectory_that_its_affordance_excludes():
+    active, _, _ = _drawn(dataclasses.replace(TASK, p_together=1.0), np.arange(M) < 3)
+    assert not (active["trajectory"] & active["region"]).any() and active["affordance"].any()
+
+
 def test_where_no_trajectory_agrees_with_the_affordance_none_is_drawn():
     active, pose, trajectory = _drawn(TASK, np.arange(M) < 3)
     assert not (active["trajectory"] & active["region"]).any()
@@ -140,10 +177,15 @@ def test_aligned_pairs_are_drawn_where_they_are_asked_for(few):
 @pytest.mark.parametrize("on", [{"pose"}, {"pose", "trajectory"}, {"trajectory"}, set()])
 @pytest.mark.parametrize("dynamic", [True, False])
 def test_heading_guidance_and_reward_know_one_center(dynamic, on):
-    """Where the hand is at its target with the fingers of its start, the heading that the rules made is met to 0 m."""
+    """Where the hand is at its target, the heading that the rules made is met to 0 m.
+
+    With the fingers of its start, but under a trajectory alone with those of the partly closed hand.
+    """
     task = dataclasses.replace(TASK, dynamic_center=dynamic)
     state, surface, goal = scene(21)
     goal, q = _begun(surface, goal, {name: np.full(4, name in on) for name in ("affordance", "pose", "trajectory")})
+    if on == {"trajectory"}:
+        q = jnp.tile(closing(HAND), (4, 1))
     wrist = goal["trajectory"] if "trajectory" in on else goal["pose"] if on else None
     if wrist is None:
         center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, q)))

@@ -8,6 +8,9 @@ from collections import Counter
 import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from actors.bank import build_bank
 from actors.initial import InitialConditions, sample
@@ -16,18 +19,21 @@ from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
 from common.request import GraspRequest
-from common.task.constraints import CONSTRAINTS, PAPER, blocks, get_constraint, goal_of, known, require_known
+from common.task import metrics
+from common.task.constraints import CONSTRAINTS, OURS, PAPER, blocks, get_constraint, goal_of, known, require_known
 from common.task.constraints.priority import active_blocks
 from common.task.features import scene_of
 from common.task.observation import fields, layout, observe
 from common.task.reward import GRASP, reward_terms, terms
-from tests.scenes import HAND, active, scene
+from tests.scenes import HAND, active, moved, scene
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
 OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional)
 TASK = TaskConfig(constraints=NAMES)
 OBJECTS = [procedural.generate(1, family) for family in ("hammer", "mug")]
 BATCH = 256
+CHANGES = {"fingers": {"heading", "distance", "heading_position"}, "force": {"force_excess"}}
+"""Blocks and reward terms of others that a constraint changes: hand centre and distance of the set, and f_max."""
 each = pytest.mark.parametrize("constraint", CONSTRAINTS, ids=NAMES)
 each_optional = pytest.mark.parametrize("constraint", OPTIONAL, ids=lambda constraint: constraint.name)
 
@@ -63,7 +69,7 @@ def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
 
 def test_the_observation_is_as_wide_as_its_layout(whole):
     assert observe(whole).shape == (4, sum(size for _, size in layout(HAND, TASK)))
-    assert dict(layout(HAND, TASK))["mask"] == len(blocks(TASK)) == 5
+    assert dict(layout(HAND, TASK))["mask"] == len(blocks(TASK)) == 6
 
 
 def test_names_are_unique_over_all_constraints():
@@ -113,17 +119,17 @@ def test_it_shows_pays_and_forbids_nothing_while_it_is_inactive(constraint, whol
             assert on_observation[:, block].any() and not off_observation[:, block].any(), name
         elif name == "mask":
             silent = [mask[block] for block in constraint.blocks]
-            np.testing.assert_array_equal(off_observation[:, block] == 0, np.tile(np.isin(range(5), silent), (4, 1)))
-        else:
+            np.testing.assert_array_equal(off_observation[:, block] == 0, np.tile(np.isin(range(6), silent), (4, 1)))
+        elif name not in CHANGES.get(constraint.name, ()):
             np.testing.assert_array_equal(on_observation[:, block], off_observation[:, block], err_msg=name)
     assert not any(np.any(value) for value in constraint.reward(off).values())
     touching, force = whole.features.touching, whole.features.force
     for before, after in zip((touching, force), constraint.earning(off, touching, force), strict=True):
         np.testing.assert_array_equal(before, after)
-    # Nor does it change what the others are paid, but for contacts that it forbids.
+    # Nor does it change what the others are paid, but for contacts that it forbids and what it declares.
     others, paid = (reward_terms(one, RewardWeights()) for one in (whole, off))
     own = {weight.name for weight in constraint.weights}
-    for name in set(terms(TASK)) - own - {"contact", "force"}:
+    for name in set(terms(TASK)) - own - {"contact", "force"} - CHANGES.get(constraint.name, set()):
         np.testing.assert_array_equal(others[name], paid[name], err_msg=name)
 
 
@@ -163,7 +169,8 @@ def test_names_that_it_gives_are_there(constraint):
 
 
 def test_the_papers_constraints_come_first():
-    assert PAPER == NAMES[:4] == TaskConfig().constraints == ("heading", "affordance", "pose", "trajectory")
+    assert PAPER == NAMES[:4] == ("heading", "affordance", "pose", "trajectory")
+    assert OURS == NAMES == TaskConfig().constraints
     assert [c.name for c in known(TaskConfig(constraints=("trajectory", "heading")))] == ["heading", "trajectory"]
 
 
@@ -175,7 +182,26 @@ def test_what_is_not_known_is_named():
     with pytest.raises(
         CongraspError, match=r"The policy does not know the constraint 'fingers'.*constraints … fingers"
     ):
-        require_known(["heading", "fingers"], TaskConfig())
+        require_known(["heading", "fingers"], TaskConfig(constraints=PAPER))
+
+
+@settings(max_examples=6, deadline=None)
+@given(st.integers(0, 1000))
+def test_errors_and_rewards_do_not_depend_on_where_the_scene_is(seed):
+    """Turned about the vertical and shifted level, with every constraint active."""
+    state, surface, goal = scene(seed)
+    rng = np.random.default_rng(seed)
+    level = moved(state, np.append(rng.normal(size=2), 0.0), Rotation.from_euler("z", rng.uniform(-3, 3)))
+    some, others = (_judged(each, surface, goal) for each in (state, level))
+    for one, other in zip(jax.tree.leaves(some), jax.tree.leaves(others), strict=True):
+        np.testing.assert_allclose(one, other, rtol=2e-3, atol=5e-3)
+
+
+@jax.jit
+def _judged(state, surface, goal):
+    """Observation, reward terms and errors of a scene."""
+    made = scene_of(HAND, TASK, state, surface, goal)
+    return observe(made), reward_terms(made, RewardWeights()), metrics.errors(made)
 
 
 def test_requests_fill_the_arrays_that_they_give():
@@ -191,14 +217,14 @@ def test_requests_fill_the_arrays_that_they_give():
 
 
 TABLE = [
-    dict(zip([c.name for c in OPTIONAL], flags, strict=True)) for flags in itertools.product([False, True], repeat=4)
+    dict(zip([c.name for c in OPTIONAL], flags, strict=True)) for flags in itertools.product([False, True], repeat=5)
 ]
 
 
 @pytest.mark.parametrize("asked", TABLE, ids=lambda asked: "+".join(name for name in asked if asked[name]) or "heading")
 def test_active_blocks(asked):
     """The paper's figure of priorities; the choice of fingers yields to a reference pose as the affordance does."""
-    affordance, pose, trajectory, fingers = (asked[c.name] for c in OPTIONAL)
+    affordance, pose, trajectory, fingers, force = (asked[c.name] for c in OPTIONAL)
     found = active_blocks({name: np.full(2, flag) for name, flag in asked.items()})
     expected = {
         "affordance": affordance and not pose,
@@ -206,6 +232,7 @@ def test_active_blocks(asked):
         "pose_wrist": pose and not trajectory,
         "trajectory": trajectory,
         "fingers": fingers and not pose,
+        "force_limit": force,
     }
     assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
 
@@ -216,8 +243,15 @@ def _draw(task: TaskConfig, bank) -> InitialConditions:
     return sample(HAND, task, bank, jax.random.key(3), BATCH)
 
 
-def _same(some: InitialConditions, more: InitialConditions, but: str) -> None:
-    """Everything that does not belong to one constraint is the same."""
+def _same(some: InitialConditions, more: InitialConditions, but: str, moved: np.ndarray | None = None) -> None:
+    """Everything that does not belong to one constraint is the same, but for places of the hand that moved (B,)."""
+    if moved is not None:
+        position = np.where(moved[:, None], some.goal["heading"].position, more.goal["heading"].position)
+        base = np.where(moved[:, None], some.reset_state.base_position, more.reset_state.base_position)
+        more = more._replace(
+            goal=more.goal.replace("heading", position=position),
+            reset_state=more.reset_state._replace(base_position=base),
+        )
     goals = [dict(part.goal.flat().items()) for part in (some, more)]
     actives = [part.goal.active for part in (some, more)]
     own = {*get_constraint(but).blocks, *(f"{but}_{name}" for name in get_constraint(but).arrays)}
@@ -242,8 +276,8 @@ def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint
 
 
 def test_episodes_with_fingers_are_those_without_in_all_else(bank):
-    some, more = _draw(TaskConfig(), bank), _draw(TASK, bank)
-    _same(some, more, "fingers")
+    some, more = _draw(TaskConfig(constraints=PAPER), bank), _draw(TaskConfig(constraints=(*PAPER, "fingers")), bank)
+    _same(some, more, "fingers", np.asarray(more.goal.active["fingers"]))
     chosen = np.asarray(more.goal.active["fingers"])
     pose = np.asarray(more.goal.active["pose_finger"])
     assert not chosen[pose].any() and abs(chosen[~pose].mean() - 0.5) < 0.15

@@ -92,4 +92,4 @@ def test_a_heading_from_elsewhere_follows_the_reference(stronger):
 def test_a_heading_towards_what_must_not_be_touched_is_turned():
     found = only(AVOID, heading={"direction": np.array([0.0, -1.0, 0.0]), "position": np.array([0.08, 0.0, 0.0])})
     assert (found.weaker, found.stronger, found.refused) == ("heading", "affordance", False)
-    assert "0.0 cm from what must not be touched" in found.message and "turns the heading" in found.message
+    assert "0.0 cm from what must not be touched" in found.message and "redirects the heading" in found.message

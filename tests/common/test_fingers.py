@@ -5,21 +5,28 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from common import rotations
 from common.config import RewardWeights, TaskConfig
 from common.errors import CongraspError
-from common.hands import get_hand
+from common.hands import get_hand, kinematics
+from common.policy.bundle import load
+from common.policy.pretrained import policy_file
 from common.task import metrics
 from common.task.bank import Draw
-from common.task.constraints import get_constraint
-from common.task.constraints.fingers import FingersGoal
+from common.task.constraints import PAPER, get_constraint
+from common.task.constraints.fingers import FingersGoal, finger_sets, keypoint_weights
 from common.task.features import features, scene_of
-from common.task.observation import fields
+from common.task.geometry import hand_center
+from common.task.observation import fields, layout, observe
 from common.task.reward import reward_terms, terms
-from common.task.types import Surface
+from common.task.types import Goal, Surface
 from tests.scenes import HAND, L, active, scene
 
 FINGERS = get_constraint("fingers")
+HEADING = get_constraint("heading")
 TASK = TaskConfig(constraints=("heading", "fingers"))
 PINCH = np.array([[True, True, False, False, False]])
 # Links and tips in the order of the human hand: palm, then three links of thumb, index, middle, ring and little finger.
@@ -101,21 +108,104 @@ def test_error_is_the_share_of_other_fingers_links():
     np.testing.assert_array_equal(idle["fingers_ratio"], [0.0])  # nothing touched: nothing wrong
 
 
-def test_draws_are_the_thumb_with_one_or_more_of_the_others():
-    count, zero = 4000, np.zeros(4000, int)
+def test_draws_are_the_thumb_with_any_of_the_others():
+    """By hand: 15 sets of the human hand; half of the draws are pinch, tripod or all, the other half any of the 15."""
+    zero = np.zeros(6000, int)
     allowed = np.asarray(FINGERS.sample(HAND, Draw(None, zero, zero, zero, {}), jax.random.key(0)).allowed)
-    number = allowed.sum(-1)
-    np.testing.assert_array_equal(allowed, np.arange(5) < number[:, None])
-    shares = np.bincount(number, minlength=6) / count
-    np.testing.assert_array_equal(shares[:2], 0.0)
-    np.testing.assert_allclose(shares[2:], 0.25, atol=0.03)
+    assert allowed[:, 0].all() and allowed[:, 1:].any(-1).all()
+    number = allowed @ (1 << np.arange(5))
+    shares = np.bincount(number, minlength=32) / len(number)
+    expected = np.full(32, 1 / 30) * (np.arange(32) % 2)
+    expected[1] = 0.0
+    expected[[0b00011, 0b00111, 0b11111]] += 1 / 6
+    np.testing.assert_allclose(shares, expected, atol=0.02)
     np.testing.assert_array_equal(FINGERS.suggested(HAND, TASK)["allowed"], PINCH[0])
 
 
-def test_one_finger_is_not_valid():
-    surface = Surface(np.zeros((3, 4, 3)), np.zeros((3, 4), bool))
-    allowed = np.array([[1, 0, 0, 0, 0], [0, 1, 1, 0, 0], [1, 1, 1, 1, 1]], bool)
-    np.testing.assert_array_equal(FINGERS.valid(surface, FingersGoal(allowed)), [False, True, True])
+@pytest.mark.parametrize(("hand", "count"), [("human", 15), ("allegro", 7)])
+def test_sets_are_all_with_a_thumb_and_another_finger(hand, count):
+    sets, shares = finger_sets(get_hand(hand))
+    assert len(sets) == count == len({row.tobytes() for row in sets}) and shares.sum() == pytest.approx(1.0)
+    assert sets[:, 0].all() and sets[:, 1:].any(-1).all()
+    likely = {tuple(row.nonzero()[0].tolist()) for row in sets[shares > 2 * shares.min()]}
+    assert likely == {(0, 1), (0, 1, 2), tuple(range(sets.shape[1]))}
+
+
+def test_a_set_needs_the_thumb_and_another_finger():
+    surface = Surface(np.zeros((4, 4, 3)), np.zeros((4, 4), bool))
+    allowed = np.array([[1, 0, 0, 0, 0], [0, 1, 1, 0, 0], [1, 0, 0, 1, 0], [1, 1, 1, 1, 1]], bool)
+    np.testing.assert_array_equal(FINGERS.valid(surface, FingersGoal(allowed)), [False, False, True, True])
+
+
+def test_the_hand_centre_is_that_of_the_set():
+    """By hand, of tips on a line: a pinch is midway between thumb and index, thumb and two others at their mean."""
+    points = np.zeros((3, len(HAND.keypoints), 3), np.float32)
+    points[:, len(HAND.links) :, 0] = [0.0, 0.2, 0.4, 0.6, 1.2]
+    fingers = np.array([[1, 1, 0, 0, 0], [1, 0, 1, 0, 1], [1, 1, 1, 1, 1]], bool)
+    np.testing.assert_allclose(hand_center(HAND, points, fingers)[:, 0], [0.1, 0.4, 0.3], atol=1e-6)
+    np.testing.assert_array_equal(hand_center(HAND, points), kinematics.hand_center(HAND, points))
+    with_pinch, without = pinch(), pinch(on=False)
+    tips = np.asarray(with_pinch.features.keypoints)[:, len(HAND.links) :]
+    np.testing.assert_allclose(with_pinch.features.center, (tips[:, 0] + tips[:, 1]) / 2, atol=1e-6)
+    np.testing.assert_allclose(without.features.center, (tips[:, 0] + tips[:, 1:].mean(1)) / 2, atol=1e-6)
+
+
+def test_the_distance_reward_is_that_of_the_set():
+    """By hand: 21 keypoints, of which 5 tips count four times, are 36 units; of a pinch 1 + 6 + 2 x 4 = 15 count."""
+    assert len(HAND.keypoints) == 21
+    made = reward_terms(pinch(), RewardWeights(**dict.fromkeys(terms(TASK), 1.0)))["distance"]
+    # 6 link origins and the palm at 0.2 m, the thumb's tip at 1 mm, the index finger's at 0.2 m; all weigh 21 together.
+    np.testing.assert_allclose(made, [-21 / 15 * (7 * 0.2 + 4 * 0.001 + 4 * 0.2)], rtol=1e-5)
+    free = reward_terms(pinch(on=False), RewardWeights(**dict.fromkeys(terms(TASK), 1.0)))["distance"]
+    far = 16 * 0.2 + 4 * (0.001 + 0.2 + 0.027 + 0.0108 + 0.2)
+    np.testing.assert_allclose(free, [-21 / 36 * far], rtol=1e-5)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 14))
+def test_fingers_that_may_not_touch_move_neither_centre_nor_distance(seed, which):
+    chosen = np.broadcast_to(finger_sets(HAND)[0][which], (2, 5))
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(2, len(HAND.keypoints), 3)).astype(np.float32)
+    owner = HAND.link_fingers[HAND.keypoint_links]
+    other = (owner >= 0) & ~chosen[0][owner]
+    moved = points + other[:, None] * rng.normal(size=points.shape).astype(np.float32)
+    np.testing.assert_allclose(hand_center(HAND, points, chosen), hand_center(HAND, moved, chosen), atol=1e-6)
+    weights = np.asarray(keypoint_weights(HAND, chosen))
+    assert (weights[:, other] == 0).all() and (weights[:, ~other] > 0).all()
+    np.testing.assert_allclose(weights.sum(-1), HAND.keypoint_weights.sum(), rtol=1e-5)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_pinch_begins_and_ends_at_the_heading(seed):
+    """The wrist is placed by the set's centre, so that a hand that only moves forward arrives with no error."""
+    goal = dataclasses.replace(scene(seed)[2], active=active("fingers"))
+    q = np.tile(HAND.q_open, (4, 1))
+    position, quaternion = HEADING.initial_wrist(HAND, TASK, goal, q)[1:]
+    position = position + TASK.back_off * goal["heading"].direction
+    points = kinematics.keypoints(HAND, kinematics.link_transforms(HAND, q))
+    center = hand_center(HAND, points, goal["fingers"].allowed)
+    there = position + rotations.rotate(quaternion, center)
+    np.testing.assert_allclose(there, goal["heading"].position, atol=1e-5)
+
+
+@pytest.mark.parametrize("hand", ["human", "allegro", "sharpa"])
+def test_policies_of_before_see_what_they_saw(hand):
+    """The shipped ones list the paper's four constraints: their layout stands, and a choice of fingers is nothing."""
+    bundle = load(policy_file(None, hand))
+    assert bundle.task.constraints == PAPER and layout(get_hand(hand), bundle.task) == bundle.spec.layout
+    if hand != "human":
+        return
+    state, surface, goal = scene(5)
+    without = Goal(
+        {name: goal[name] for name in PAPER}, {name: goal.active[name] for name in goal.active if name != "fingers"}
+    )
+    some, more = (scene_of(HAND, bundle.task, state, surface, each) for each in (without, goal))
+    np.testing.assert_array_equal(some.features.center, kinematics.hand_center(HAND, some.features.keypoints))
+    np.testing.assert_array_equal(observe(some), observe(more))
+    for name, value in reward_terms(some, bundle.task.reward).items():
+        np.testing.assert_array_equal(value, reward_terms(more, bundle.task.reward)[name], err_msg=name)
 
 
 def test_words():
@@ -127,6 +217,8 @@ def test_words():
         FINGERS.parse({"fingers": ("thumb", "pinky")}, HAND)
     with pytest.raises(CongraspError, match="no finger 'little'"):
         FINGERS.parse({"fingers": ("thumb", "little")}, get_hand("allegro"))
+    with pytest.raises(CongraspError, match=r"^--fingers lacks the thumb, which every grasp needs\. Add thumb\.$"):
+        FINGERS.parse({"fingers": ("index", "middle")}, HAND)
     for one in (("thumb",), ("thumb", "thumb")):
         with pytest.raises(CongraspError, match="names one finger"):
             FINGERS.parse({"fingers": one}, HAND)

@@ -2,16 +2,22 @@
 
 import itertools
 
+import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from common.hands.kinematics import grasp_frame
+from common.hands.kinematics import grasp_frame, keypoints, link_transforms
 from common.task.constraints.priority import explain, resolve
 from tests.scenes import HAND, scene
 
 
 def _flags(affordance: bool = False, pose: bool = False, trajectory: bool = False) -> dict[str, np.ndarray]:
     return {"affordance": np.full(4, affordance), "pose": np.full(4, pose), "trajectory": np.full(4, trajectory)}
+
+
+_compiled = jax.jit(lambda surface, asked: resolve(HAND, surface, asked, _flags(affordance=True)))
 
 
 def _resolve(affordance: bool, pose: bool, trajectory: bool):
@@ -50,6 +56,25 @@ def test_an_overridden_heading_is_that_of_the_overriding_reference(trajectory):
     assert abs(np.dot(done.goal["heading"].direction[0], done.goal["heading"].cross[0])) < 1e-5
 
 
+def test_a_lone_trajectorys_heading_is_at_the_centre_of_a_hand_that_is_closed_by_two_fifths():
+    """By hand: the last waypoint is at (1, 2, 3) m and not turned, so that the centre is only shifted."""
+    _, surface, asked = scene(0)
+    path = asked["trajectory"].position.copy()
+    turns = asked["trajectory"].quaternion.copy()
+    path[:, -1], turns[:, -1] = (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)
+    asked = asked.replace("trajectory", position=path, quaternion=turns)
+    q = 0.6 * HAND.q_open + 0.4 * HAND.q_closed
+    tips = np.asarray(keypoints(HAND, link_transforms(HAND, q)))[len(HAND.links) :]
+    center = (tips[0] + (tips[1] + tips[2] + tips[3] + tips[4]) / 4) / 2
+    alone = resolve(HAND, surface, asked, _flags(trajectory=True)).goal
+    np.testing.assert_allclose(alone["heading"].position, np.tile(np.add(center, (1, 2, 3)), (4, 1)), atol=1e-5)
+    # The fingers of a reference pose are known, and taken as they are.
+    both = resolve(HAND, surface, asked, _flags(pose=True, trajectory=True)).goal
+    tips = np.asarray(keypoints(HAND, link_transforms(HAND, asked["pose"].q)))[:, len(HAND.links) :]
+    expected = np.array([1, 2, 3]) + (tips[:, 0] + tips[:, 1:].mean(1)) / 2
+    np.testing.assert_allclose(both["heading"].position, expected, atol=1e-5)
+
+
 def test_under_a_trajectory_the_poses_fingers_are_carried_by_its_last_waypoint():
     asked, done = _resolve(False, True, True)
     np.testing.assert_allclose(done.goal["pose"].position, asked["trajectory"].position[:, -1])
@@ -76,31 +101,81 @@ def test_affordance_turns_a_heading_that_comes_nearer_to_the_avoid_region(at_avo
     assert not np.any(resolve(HAND, surface, asked, _flags()).redirected)
 
 
+def _redirected(points: list[list[float]], avoid: list[list[float]], direction: list[float], cross: list[float]):
+    """The heading of a hand that comes along a direction to (-0.1, 0, 0), and of an object with these points."""
+    _, surface, asked = scene(1)
+    rows = lambda v: np.tile(np.array(v, np.float32), (4, 1))  # noqa: E731
+    cloud = np.tile(np.float32([*points, *avoid]), (4, 1, 1))
+    surface = surface._replace(points=cloud, avoid=np.tile(np.arange(cloud.shape[1]) >= len(points), (4, 1)))
+    asked = asked.replace("heading", position=rows([-0.1, 0, 0]), direction=rows(direction), cross=rows(cross))
+    done = resolve(HAND, surface, asked, _flags(affordance=True))
+    assert np.all(done.redirected) and not np.any(resolve(HAND, surface, done.goal, _flags(affordance=True)).redirected)
+    return jax.tree.map(lambda array: np.asarray(array)[0], done.goal["heading"])
+
+
+def test_a_redirected_heading_keeps_its_direction_where_that_works():
+    """By hand: of two graspable points the nearer one is at (0.1, 0, 0), and the position 2 cm behind it."""
+    heading = _redirected([[0.1, 0, 0], [0.2, 0, 0]], [[-0.1, 0, 0]], [0, 0, -1], [1, 0, 0])
+    np.testing.assert_allclose(heading.position, [0.1, 0, -0.02], atol=1e-6)
+    np.testing.assert_allclose(heading.direction, [0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(heading.cross, [1, 0, 0], atol=1e-6)
+
+
+def test_a_redirected_heading_never_ends_in_the_air():
+    """The middle of a ring of 4 cm is its hole: the heading goes to the ring."""
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = np.stack([0.1 + 0.04 * np.cos(turn), 0 * turn, 0.04 * np.sin(turn)], -1)
+    heading = _redirected(ring.tolist(), [[-0.1, 0, 0]], [0, 0, -1], [0, 1, 0])
+    surface = heading.position - 0.02 * heading.direction
+    assert np.linalg.norm(ring - surface, axis=-1).min() < 1e-6
+    # From above, 3 mm of the ring or more are before each point but those of its upper half.
+    assert surface[2] > -0.001 and np.allclose(heading.direction, [0, 0, -1], atol=1e-6)
+
+
 def test_a_redirected_heading_turns_the_hand_by_the_least_rotation():
     """By hand: v = -z and w = x from 15 cm above the avoid region, at which the graspable one lies 20 cm aside.
 
-    v turns by atan2(0.2, 0.15) about y, away from -z; w with it: (0.6, 0, 0.8).
+    Straight down is blocked by another avoided point. v turns by atan2(0.2, 0.15) about y, away from -z; w with it:
+    (0.6, 0, 0.8).
     """
-    surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)
-    surface = surface._replace(points=surface.points * np.array([1, 0, 0], np.float32))
-    rows = lambda *v: np.tile(np.array(v, np.float32), (4, 1))  # noqa: E731
-    asked = asked.replace("heading", position=rows(-0.1, 0, 0), direction=rows(0, 0, -1), cross=rows(1, 0, 0))
-    heading = resolve(HAND, surface, asked, _flags(affordance=True)).goal["heading"]
-    np.testing.assert_allclose(heading.direction, rows(0.8, 0, -0.6), atol=1e-6)
-    np.testing.assert_allclose(heading.cross, rows(0.6, 0, 0.8), atol=1e-6)
+    heading = _redirected([[0.1, 0, 0]], [[-0.1, 0, 0], [0.1, 0, 0.1]], [0, 0, -1], [1, 0, 0])
+    np.testing.assert_allclose(heading.direction, [0.8, 0, -0.6], atol=1e-6)
+    np.testing.assert_allclose(heading.cross, [0.6, 0, 0.8], atol=1e-6)
+    np.testing.assert_allclose(heading.position, [0.1 + 0.016, 0, -0.012], atol=1e-6)
+
+
+def test_a_redirected_heading_goes_where_the_hand_can_close():
+    """Two plates across the fingers, one of 14 cm that is nearer, one of 6 cm: 12 cm are the most."""
+    wide, narrow = ([[x, y, 0] for y in np.linspace(-half, half, 15)] for x, half in ((0.0, 0.07), (0.1, 0.03)))
+    heading = _redirected([*wide, *narrow], [[-0.1, 0, 0]], [0, 0, -1], [0, 1, 0])
+    np.testing.assert_allclose(heading.position[[0, 2]], [0.1, -0.02], atol=1e-6)
 
 
 @pytest.mark.parametrize("wobble", [0.0, 1e-7, -1e-7])
 def test_rounding_does_not_decide_on_the_roll_of_a_redirected_heading(wobble):
     """The heading turns by a right angle, to where its cross-finger direction w pointed: w turns with it, whatever the
     last bits of w were."""
-    surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)
-    surface = surface._replace(points=surface.points * np.array([1, 0, 0], np.float32) + np.float32([0, 0, 0.15]))
-    rows = lambda *v: np.tile(np.array(v, np.float32), (4, 1))  # noqa: E731
-    asked = asked.replace("heading", position=rows(-0.1, 0, 0), direction=rows(0, 0, -1), cross=rows(1, wobble, 0))
-    heading = resolve(HAND, surface, asked, _flags(affordance=True)).goal["heading"]
-    np.testing.assert_allclose(heading.direction, rows(1, 0, 0), atol=1e-6)
-    np.testing.assert_allclose(heading.cross, rows(0, 0, 1), atol=1e-5)
+    avoid = [[-0.1, 0, 0], [-0.1, 0, 0.12], [0.1, 0, 0.25]]
+    heading = _redirected([[0.1, 0, 0.15]], avoid, [0, 0, -1], [1, wobble, 0])
+    np.testing.assert_allclose(heading.direction, [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(heading.cross, [0, 0, 1], atol=1e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_redirected_headings_lead_to_the_graspable_region(seed):
+    """For any cloud: a point of the region is 2 cm before the position, and the rules have nothing more to change."""
+    _, surface, asked = scene(seed)
+    done = _compiled(surface, asked)
+    moved, heading = np.asarray(done.redirected), jax.device_get(done.goal["heading"])
+    assert not np.any(_compiled(surface, done.goal).redirected)
+    before = heading.position - 0.02 * heading.direction
+    away = np.where(surface.avoid, np.inf, np.linalg.norm(surface.points - before[:, None], axis=-1)).min(-1)
+    assert (away[moved] < 1e-5).all()
+    np.testing.assert_allclose(np.linalg.norm(heading.direction, axis=-1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.sum(heading.direction * heading.cross, -1), 0.0, atol=1e-5)
+    for name, given_array in asked["heading"]._asdict().items():
+        np.testing.assert_allclose(getattr(heading, name)[~moved], given_array[~moved], atol=1e-6)
 
 
 def test_a_cross_finger_direction_along_the_heading_is_replaced_by_an_orthogonal_one():

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from common.config import RewardWeights, TaskConfig
 from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
 from common.task import metrics
-from common.task.constraints import blocks
+from common.task.constraints import PAPER, blocks
 from common.task.constraints.heading import heading_wrist_pose
 from common.task.constraints.pose import pose_gate
 from common.task.constraints.trajectory import active_waypoint
@@ -26,7 +26,7 @@ from common.task.observation import layout, observe
 from common.task.reward import reward_terms, terms
 from tests.scenes import HAND, F, K, L, active, moved, near_targets, scene
 
-TASK = TaskConfig()
+TASK = TaskConfig(constraints=PAPER)
 TERMS, MASKS = terms(TASK), ("affordance", "pose_finger", "pose_wrist", "trajectory")
 UNIT = RewardWeights(**{name: 1.0 for name in TERMS}, force_max=5.0)
 

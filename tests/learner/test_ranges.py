@@ -12,12 +12,13 @@ from common.config import CurriculumConfig, RewardWeights, TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.objects import procedural
+from common.task.constraints import PAPER
 from common.task.metrics import episode_fields
 from common.wire.codec import Message
 from learner.admission import Admission
 from learner.ranges import task_ranges
 
-TASK = TaskConfig(surface_points=32, trajectory_points=4, hold_steps_max=40)
+TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, hold_steps_max=40)
 RANGES = task_ranges(TASK, CurriculumConfig())
 WORLDS, STEPS = 8, 90
 

@@ -15,6 +15,7 @@ from common.hands import get_hand
 from common.objects import procedural
 from common.policy.bundle import PolicyBundle
 from common.task import observation
+from common.task.constraints import PAPER
 from common.wire.codec import Message
 from services.cli.main import load
 from services.evaluate.evaluator import Evaluator
@@ -78,11 +79,11 @@ def test_the_command_refuses_it_in_one_line(
 def test_a_query_for_it_is_refused_in_one_line(query: dict[str, np.ndarray]) -> None:
     message = Message({**query, "fingers_allowed": PINCH}, {"constraints": ["heading", "fingers"]})
     with pytest.raises(UnknownConstraintError, match=f"^The policy {REFUSED}"):
-        Layout(HAND, TaskConfig()).parse(message)
+        Layout(HAND, TaskConfig(constraints=PAPER)).parse(message)
 
 
 def test_the_studio_refuses_it_in_one_line() -> None:
-    studio = Studio(HAND, TaskConfig(), MUG)
+    studio = Studio(HAND, TaskConfig(constraints=PAPER), MUG)
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
         studio.ask("fingers", True)
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
@@ -95,7 +96,7 @@ def test_the_studio_refuses_it_in_one_line() -> None:
 
 
 def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
-    evaluator = Evaluator(untrained(dataclasses.replace(CONFIG, task=TaskConfig())), [MUG], batch=8)
+    evaluator = Evaluator(untrained(dataclasses.replace(CONFIG, task=TaskConfig(constraints=PAPER))), [MUG], batch=8)
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
         evaluator.rows(["fingers"], 1)
 
@@ -152,7 +153,9 @@ def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: di
     assert isinstance(free, Inference) and isinstance(ignored, Inference)
     np.testing.assert_array_equal(free.vectors, ignored.vectors)
     assert np.abs(pinch.vectors - free.vectors).max() > 1e-6
-    assert "fewer than two fingers. Allow two or more" in str(ask(["heading", "fingers"], fingers_allowed=0 * PINCH))
+    assert "needs the thumb and another finger. Allow both" in str(
+        ask(["heading", "fingers"], fingers_allowed=0 * PINCH)
+    )
     with pytest.raises(CongraspError, match="lacks the field 'fingers_allowed'"):
         ask(["heading", "fingers"])
     with pytest.raises(CongraspError, match="nothing that guides the wrist"):
@@ -172,7 +175,7 @@ def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
     assert json.loads(json.dumps(description.describe(studio)))["others"][0]["flags"]["allowed"]["middle"]
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), [1, 1, 1, 0, 0])
     studio.choose("fingers", "allowed", [True, False, False, False, False])
-    assert studio.trouble == "The constraint 'fingers' allows fewer than two fingers. Allow two or more."
+    assert studio.trouble == "The constraint 'fingers' needs the thumb and another finger. Allow both."
     for values in ([True], "thumb"):
         with pytest.raises(CongraspError, match="'fingers' takes 5 flags"):
             studio.choose("fingers", "allowed", values)

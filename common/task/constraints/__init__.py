@@ -11,6 +11,7 @@ from common.request import GraspRequest
 from common.task.constraints.affordance import Affordance
 from common.task.constraints.base import Constraint, ErrorSpec, unknown_constraint
 from common.task.constraints.fingers import Fingers
+from common.task.constraints.force import Force
 from common.task.constraints.heading import Heading
 from common.task.constraints.pose import Pose
 from common.task.constraints.trajectory import Trajectory
@@ -19,9 +20,11 @@ from common.task.types import Goal
 if TYPE_CHECKING:
     from common.config import TaskConfig
 
-CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers())
+CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers(), Force())
 PAPER = ("heading", "affordance", "pose", "trajectory")
-"""Names of the paper's constraints: what a policy knows unless its task says otherwise."""
+"""Names of the paper's constraints."""
+OURS = (*PAPER, "fingers", "force")
+"""Names of those that a policy knows unless its task says otherwise."""
 
 
 def get_constraint(name: str) -> Constraint:
@@ -89,6 +92,7 @@ def require_known(names: Iterable[str], task: "TaskConfig") -> None:
 
 __all__ = [
     "CONSTRAINTS",
+    "OURS",
     "PAPER",
     "Constraint",
     "blocks",

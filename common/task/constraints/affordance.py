@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from common import rotations
 from common.hands.spec import Hand
 from common.task.constraints.base import Constraint, ErrorSpec, ObservationField, Option, Relation, Scene, Weight
-from common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, squash
+from common.task.constraints.heading import HeadingGoal
+from common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, square, squash
+from common.task.sampling.headings import INWARD, MAX_WIDTH
 from common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
@@ -23,6 +25,14 @@ MARGIN = 0.01
 """m, metres the fingers should keep from the avoid region."""
 SHARPNESS = 0.002
 """tau, metres."""
+_CANDIDATES = 24
+"""Graspable surface points to which a heading may be redirected."""
+_AS_A_RADIAN = 0.1
+"""Metres between two heading positions that count as much as a turn by 1 rad."""
+_WORST = 100.0
+"""More than any change of a heading counts."""
+_TUBE, _BREADTH, _BEYOND = 0.01, 0.03, 0.01
+"""Metres, those of `common.task.sampling.headings`: of the approach, and of the slab in which the width is measured."""
 
 
 class AffordanceGoal(NamedTuple):
@@ -94,17 +104,11 @@ class Affordance(Constraint):
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
         """Redirects a heading that comes nearer to the avoid region than to the graspable one.
 
-        It then leads from its start to the middle of the graspable region, and the hand turns with it by the least
-        rotation, so that the cross-finger direction stays orthogonal however far the heading turns.
+        It goes to a graspable surface point instead, by the least change that keeps the rules of heading sets, see
+        `redirected`. The hand turns with it by the least rotation.
         """
-        heading = goal["heading"]
-        weights = (~surface.avoid)[..., None].astype(jnp.float32)
-        middle = jnp.sum(surface.points * weights, 1) / jnp.maximum(jnp.sum(weights, 1), 1.0)
-        towards = middle - (heading.position - REACH * heading.direction)
-        towards = towards / jnp.linalg.norm(towards, axis=-1, keepdims=True)
         turned = asked["affordance"] & _contradicts_heading(_apart_from_heading(hand, surface, goal))
-        cross = rotations.rotate(rotations.shortest(heading.direction, towards, heading.cross), heading.cross)
-        return goal.where(turned, "heading", position=middle, direction=towards, cross=cross)
+        return goal.where(turned, "heading", **redirected(hand, surface, goal["heading"])._asdict())
 
     def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> AffordanceFeatures:
         """Distances, contacts and forces by region: each contact has the label of the nearest surface point."""
@@ -157,8 +161,68 @@ class Affordance(Constraint):
         """It keeps the fingers off its region unless a reference pose names its own contacts."""
         if overridden:
             return ["The affordance is overridden by the reference pose, which names its own contacts."]
-        turned = "The heading came nearer to the avoid region and was turned towards the graspable region."
+        turned = "The heading came nearer to the avoid region and was redirected to the graspable region."
         return ["The affordance keeps the fingers off the avoid region.", *([turned] if redirected else [])]
+
+
+def redirected(hand: Hand, surface: Surface, heading: HeadingGoal) -> HeadingGoal:
+    """Headings (B, ...) that lead to graspable surface points.
+
+    The candidates are surface points of the graspable region, each approached along the heading's own direction and
+    along that from the heading's start. The heading's position is 2 cm behind the point, times the hand's factor on
+    objects. The candidate that breaks the fewest rules of `common.task.sampling.headings` is taken, of several the one
+    that changes the heading least: a turn by 1 rad counts as much as 10 cm between the positions. Rules:
+
+    * Nothing stands before the point, within 1 cm of the approach.
+    * The approach stays 1 cm away from the avoid region, and ends nearer to the graspable one.
+    * The object is no wider than 12 cm, times the same factor, along the cross-finger direction where fingers close.
+
+    Args:
+      hand: the hand.
+      surface: labelled surface points.
+      heading: to change.
+    """
+    chosen = _spread(~surface.avoid)
+    targets = jnp.take_along_axis(surface.points, chosen[..., None], 1)
+    own = jnp.broadcast_to(heading.direction[:, None], targets.shape)
+    start = heading.position - REACH * heading.direction
+    straight = targets - start[:, None]
+    straight = straight / jnp.maximum(jnp.linalg.norm(straight, axis=-1, keepdims=True), 1e-6)
+    direction = jnp.concatenate([own, straight], 1)
+    position = jnp.concatenate([targets, targets], 1) + hand.object_scale * INWARD * direction
+    given, across = (jnp.broadcast_to(axis[:, None], direction.shape) for axis in (heading.direction, heading.cross))
+    cross = rotations.rotate(rotations.shortest(given, direction, across), across)
+    candidates = HeadingGoal(position, direction, cross)
+    angle = jnp.arccos(jnp.clip(jnp.sum(direction * given, -1), -1.0, 1.0))
+    change = angle + jnp.linalg.norm(position - heading.position[:, None], axis=-1) / _AS_A_RADIAN
+    best = jnp.argmin(_WORST * _broken(hand, surface, candidates) + change, -1)[:, None, None]
+    return HeadingGoal(*(jnp.take_along_axis(axis, best, 1)[:, 0] for axis in candidates))
+
+
+def _spread(which: Array) -> Array:
+    """(B, n) indices of up to `_CANDIDATES` true flags (B, N), evenly spread over them."""
+    count = jnp.cumsum(which, -1)
+    rank = jnp.arange(_CANDIDATES) * count[:, -1:] // _CANDIDATES
+    return jnp.argmax(count[:, None] > rank[..., None], -1)
+
+
+def _broken(hand: Hand, surface: Surface, headings: HeadingGoal) -> Array:
+    """(B, n) number of rules that headings (B, n, 3) break, see `redirected`."""
+    offset = surface.points[:, None] - headings.position[:, :, None]
+    depth = jnp.sum(offset * headings.direction[:, :, None], -1)
+    along = jnp.sum(offset * headings.cross[:, :, None], -1)
+    squared = square(offset)
+    from_line = squared - depth**2
+    inward, avoid = hand.object_scale * INWARD, surface.avoid[:, None]
+    before = (depth < -inward - 1.5 * _TUBE) & (depth > -REACH - inward)
+    hidden = jnp.any(before & (from_line < _TUBE**2), -1)
+    past = depth - jnp.clip(depth, -REACH, 0.0)
+    near = jnp.min(jnp.where(avoid, from_line + past**2, jnp.inf), -1) < MARGIN**2
+    to_avoid, to_graspable = (jnp.min(jnp.where(which, squared, jnp.inf), -1) for which in (avoid, ~avoid))
+    slab = (from_line - along**2 < _BREADTH**2) & (depth < _BEYOND)
+    low = jnp.min(jnp.where(slab, along, jnp.inf), -1)
+    wide = jnp.max(jnp.where(slab, along, -jnp.inf), -1) - low > hand.object_scale * MAX_WIDTH
+    return hidden.astype(jnp.int32) + (near | (to_avoid < to_graspable)) + wide
 
 
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
@@ -179,7 +243,7 @@ def _contradicts_heading(apart: Mapping[str, Array]) -> Array:
 def _heading_message(hand: Hand, apart: Mapping[str, Any]) -> str:
     return (
         f"The approach passes {100 * apart['avoid']:.1f} cm from what must not be touched, and "
-        f"{100 * apart['graspable']:.1f} cm from what may be grasped. The affordance turns the heading towards the "
+        f"{100 * apart['graspable']:.1f} cm from what may be grasped. The affordance redirects the heading to the "
         "graspable part."
     )
 

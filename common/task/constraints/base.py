@@ -122,6 +122,8 @@ class Option(NamedTuple):
     help: str
     many: bool = False
     """Takes several words."""
+    switch: bool = False
+    """Takes nothing: it is given or not."""
 
 
 class Constraint:
@@ -239,6 +241,10 @@ class Constraint:
             return touching, force
         lost = forbidden & self.active(scene.goal)[:, None]
         return touching & ~lost, jnp.where(lost[..., None], 0.0, force)
+
+    def force_max(self, scene: Scene, most: Array) -> Array:
+        """Force (B, 1) or () of each link beyond which nothing is earned, N: what it leaves of `most`."""
+        return most
 
     def reward(self, scene: Scene) -> dict[str, Array]:
         """Terms (B,) by the names of `weights`, signed, before the weight, zero where it is inactive."""

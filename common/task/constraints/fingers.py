@@ -1,6 +1,7 @@
 """Fingers: which of them may touch the object (ours). Thumb and index make a pinch, with the middle one a tripod."""
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ from common.errors import CongraspError
 from common.hands.spec import Hand
 from common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Scene, Weight
 from common.task.geometry import flat, share, squash
-from common.task.types import Array, Surface
+from common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
     from common.config import TaskConfig
@@ -21,6 +22,11 @@ MARGIN, SHARPNESS = 0.01, 0.003
 """Metres that the skin of the other fingers should keep from the object, and how sharply that is felt."""
 
 
+_FAVOURED = 0.5
+"""Probability that an episode draws pinch, tripod or all fingers; else every set is as likely as another."""
+_NEEDED = "The constraint 'fingers' needs the thumb and another finger."
+
+
 class FingersGoal(NamedTuple):
     """Fingers by the order of `Hand.fingers`, thumb first."""
 
@@ -28,7 +34,10 @@ class FingersGoal(NamedTuple):
 
 
 class Fingers(Constraint):
-    """A set of fingers; the palm belongs to all of them."""
+    """The thumb and one or more of the other fingers; the palm belongs to all sets.
+
+    The hand centre and the keypoints that are drawn to the object are those of the set alone.
+    """
 
     name, title, goal = "fingers", "fingers", FingersGoal
     blocks = ("fingers",)
@@ -42,7 +51,7 @@ class Fingers(Constraint):
     options = (
         Option("fingers", "Which fingers may touch the object, such as: thumb index. All by default.", many=True),
     )
-    invalid = ("The constraint 'fingers' allows fewer than two fingers.", "Allow two or more.")
+    invalid = (_NEEDED, "Allow both.")
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
         """The set, the room of each other finger, and the forces of their links."""
@@ -55,9 +64,9 @@ class Fingers(Constraint):
         return (block,)
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> FingersGoal:
-        """The thumb with the first one, two, … of the others, or all of them, with equal probability."""
-        count = jax.random.randint(key, draw.objects.shape, 2, len(hand.fingers) + 1)
-        return FingersGoal(jnp.arange(len(hand.fingers)) < count[:, None])
+        """Any set with the thumb; pinch, tripod and all fingers more often than others."""
+        sets, shares = finger_sets(hand)
+        return FingersGoal(jnp.array(sets)[jax.random.choice(key, len(sets), draw.objects.shape, p=jnp.array(shares))])
 
     def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
         """A pinch."""
@@ -89,8 +98,8 @@ class Fingers(Constraint):
         return {"fingers_ratio": share(touching & self.forbidden(scene), touching)}
 
     def valid(self, surface: Surface, own: FingersGoal) -> Array:
-        """Two fingers or more."""
-        return jnp.sum(own.allowed, -1) >= 2
+        """The thumb and another finger."""
+        return own.allowed[:, 0] & jnp.any(own.allowed[:, 1:], -1)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
         """It keeps the others away, unless a reference pose names its own contacts."""
@@ -105,7 +114,45 @@ class Fingers(Constraint):
         allowed = self.named_flags("fingers", given["fingers"], hand.fingers, f"the hand '{hand.name}' has no finger")
         if allowed.sum() < 2:
             raise CongraspError("--fingers names one finger, which cannot hold an object.", "Name two or more.")
+        if not allowed[0]:
+            thumb = hand.fingers[0]
+            raise CongraspError(f"--fingers lacks the {thumb}, which every grasp needs.", f"Add {thumb}.")
         return {"allowed": allowed}
+
+
+@functools.cache
+def finger_sets(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
+    """All sets (S, G) bool of the thumb with one or more of the other fingers, and the probability (S,) of each."""
+    count = len(hand.fingers) - 1
+    others = (np.arange(1, 2**count)[:, None] >> np.arange(count)) & 1 == 1
+    favoured = np.isin(np.arange(1, 2**count), (0b1, 0b11 & (2**count - 1), 2**count - 1))
+    shares = _FAVOURED * favoured / favoured.sum() + (1 - _FAVOURED) / len(others)
+    return np.insert(others, 0, True, axis=1), shares.astype(np.float32)
+
+
+def chosen_fingers(known: Collection[str], goal: Goal) -> Array | None:
+    """(B, G) bool: fingers that count for the hand centre, all of them where no set is active; None for all always.
+
+    Args:
+      known: names of the constraints that the task knows or a request may have.
+      goal: after the priority rules.
+    """
+    if "fingers" not in known:
+        return None
+    return goal["fingers"].allowed | ~goal.active["fingers"][:, None]
+
+
+def keypoint_weights(hand: Hand, chosen: Array | None) -> Array:
+    """Weights (P,) or (B, P) of the keypoints in the distance reward, for fingers of `chosen_fingers`.
+
+    Keypoints of other fingers do not count; those of the set and the palm share the whole weight.
+    """
+    weights = jnp.array(hand.keypoint_weights)
+    if chosen is None:
+        return weights
+    owner = hand.link_fingers[hand.keypoint_links]
+    kept = jnp.where((owner < 0) | chosen[:, owner], weights, 0.0)
+    return kept * (jnp.sum(weights) / jnp.sum(kept, -1, keepdims=True))
 
 
 def _room(scene: Scene) -> Array:

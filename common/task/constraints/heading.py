@@ -12,7 +12,8 @@ from common.hands import kinematics
 from common.hands.kinematics import grasp_frame
 from common.hands.spec import Hand
 from common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Scene, Weight
-from common.task.geometry import flat, in_world
+from common.task.constraints.fingers import chosen_fingers
+from common.task.geometry import flat, hand_center, in_world
 from common.task.types import Array, Goal
 
 if TYPE_CHECKING:
@@ -98,7 +99,8 @@ class Heading(Constraint):
 
     def initial_wrist(self, hand: Hand, back_off: Array, goal: Goal, q: Array) -> tuple[Array, Array, Array]:
         """Aligned with the heading and backed off (paper, section Hand Initialization)."""
-        center = kinematics.hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)))
+        points = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
+        center = hand_center(hand, points, chosen_fingers(goal.values, goal))
         position, quaternion = heading_wrist_pose(hand, goal["heading"], center)
         position = position - back_off[:, None] * goal["heading"].direction
         return jnp.ones(position.shape[0], bool), position, quaternion
@@ -166,10 +168,15 @@ def heading_wrist_pose(hand: Hand, heading: HeadingGoal, center: Array) -> tuple
     return heading.position - rotations.rotate(quaternion, center), quaternion
 
 
-def heading_of_wrist(hand: Hand, q: Array, position: Array, quaternion: Array) -> dict[str, Array]:
-    """The heading (B, 3) each that a wrist pose (B, 3), (B, 4) with finger angles (B, F) has, in the same frame."""
+def heading_of_wrist(
+    hand: Hand, q: Array, position: Array, quaternion: Array, fingers: Array | None = None
+) -> dict[str, Array]:
+    """The heading (B, 3) each that a wrist pose (B, 3), (B, 4) with finger angles (B, F) has, in the same frame.
+
+    `fingers` (B, G) bool are those whose tips make the hand centre; all by default.
+    """
     frame = grasp_frame(hand)
-    center = kinematics.hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)))
+    center = hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)), fingers)
     axes = [jnp.broadcast_to(jnp.array(axis), center.shape) for axis in (frame.heading, frame.cross)]
     return {
         "position": position + rotations.rotate(quaternion, center),

@@ -290,6 +290,7 @@ def _set(
         trajectory_quaternion=_twice(quaternion),
         pose_valid=np.stack([clear.T, (clear & nearer[:, None]).T]),
         weight=np.float32(1.0),
+        mass=np.float32(fitting.mass),
         renewable=np.bool_(False),
         grasps=np.zeros(2, int),
     )

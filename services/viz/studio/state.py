@@ -117,7 +117,7 @@ class Studio:
     def choose(self, constraint: str, field: str, values: Any) -> None:
         """Sets the flags of a constraint without tools of its own, and asks for it."""
         require_known([constraint], self.task)
-        if constraint not in self.others or field not in self.others[constraint]:
+        if constraint not in self.others or field not in get_constraint(constraint).labels(self.hand):
             raise CongraspError(f"There is nothing to choose for '{constraint}'.", f"Choose for: {list(self.others)}.")
         flags = self.others[constraint][field]
         if not isinstance(values, list) or len(values) != len(flags):

@@ -38,6 +38,7 @@ def _sample(success, held, **columns) -> Sample:
         "trajectory_m",
         "affordance_ratio",
         "fingers_ratio",
+        "force_ratio",
         *(f"mask_{name}" for name in BLOCKS),
     )
     values = {name: np.zeros(count, np.float32) for name in names}
@@ -128,6 +129,14 @@ def test_joined_samples_keep_forces_beside_their_episodes():
     assert len(odd.link_force) == PROBED_EPISODES // 2 and odd.link_force[0].min() == 1.0
 
 
+def test_peak_and_mean_of_the_strongest_links_force():
+    """By hand: two episodes of two steps and two links; peaks 4 and 8 N, strongest links 3, 4, 8 and 1 N."""
+    force = np.array([[[3, 1], [0, 4]], [[8, 2], [1, 0]]], np.float16)
+    sample = dataclasses.replace(_sample([1, 1], [1, 1]), link_force=force)
+    row = summarise("heading", "human", sample, held_2s=True, objects=["a"]).to_json()
+    assert (row["force_peak_n"], row["force_mean_n"]) == (6.0, 4.0)
+
+
 def test_objects_are_grouped_by_terciles_and_family():
     sizes, masses = np.array([0.03, 0.09, 0.06, 0.12, 0.15, 0.18]), np.array([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
     groups = dict(object_groups(sizes, masses, np.array(["mug", "ball", "mug", "mug", "ball", "ball"])))
@@ -144,11 +153,11 @@ def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
     rows.append(dataclasses.replace(rows[0], group="small (up to 8 cm)", paper=None))
     write_json(rows, tmp_path / "new" / "rows.json", {"seed": 0})
     read = json.loads((tmp_path / "new" / "rows.json").read_text())
-    assert read["seed"] == 0 and len(read["rows"]) == len(rows) == 9
+    assert read["seed"] == 0 and len(read["rows"]) == len(rows) == 10
     for row in read["rows"]:
         assert set(REQUIRED) <= set(row) and row["method"] == "ours"
     assert read["rows"][0]["pose_rad"] is None and read["rows"][0]["heading_rad"] == 0.0
-    assert all(table.row_count == 9 for table in tables_of(rows, "title"))
+    assert all(table.row_count == 10 for table in tables_of(rows, "title"))
 
 
 def test_rows_of_several_policies_stand_together_and_missing_ones_are_named():

@@ -12,11 +12,12 @@ from common.config import TaskConfig
 from common.errors import CongraspError
 from common.hands import get_hand
 from common.hands.files import hand_text
+from common.task.constraints import PAPER
 from common.wire.codec import Message
 from services.serve.requests import Layout
 
 HAND = get_hand("human")
-LAYOUT = Layout(HAND, TaskConfig(surface_points=8, trajectory_points=3))
+LAYOUT = Layout(HAND, TaskConfig(constraints=PAPER, surface_points=8, trajectory_points=3))
 COMPLETE = jax.jit(LAYOUT.complete)
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 coordinate = st.floats(-1.0, 1.0, width=32)
@@ -133,7 +134,7 @@ def test_a_packed_query_is_the_vector_of_the_named_one():
     meta = {"constraints": ["heading"], "layout": LAYOUT.digest}
     packed = LAYOUT.parse(Message({"packed": vector[None]}, meta))
     np.testing.assert_array_equal(packed.vectors, named.vectors)
-    other = Layout(HAND, TaskConfig(surface_points=8, trajectory_points=4)).digest
+    other = Layout(HAND, TaskConfig(constraints=PAPER, surface_points=8, trajectory_points=4)).digest
     for count in (0, 65):
         with pytest.raises(CongraspError, match=f"The query has {count} states"):
             LAYOUT.parse(Message({"packed": np.tile(vector, (count, 1))}, meta))

@@ -1,0 +1,101 @@
+"""A force limit, requested of policies that know it and of one that does not."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+import trimesh
+
+from common.config import NetworkConfig, RunConfig, TaskConfig
+from common.errors import CongraspError
+from common.hands import get_hand
+from common.objects import procedural
+from common.policy.bundle import PolicyBundle
+from common.task.constraints import OURS, PAPER
+from common.wire.codec import Message
+from services.cli.main import load
+from services.evaluate.evaluator import Evaluator
+from services.export.motion_file import load_motion, save_motion
+from services.export.policy import describe
+from services.grasp.grasper import Grasper
+from services.grasp.parse import read_request
+from services.serve.inference import Inference, PolicyFunction
+from services.train.command import untrained
+from services.viz.studio import description
+from services.viz.studio.state import Studio
+from tests.services.test_fingers import query
+
+__all__ = ["query"]
+HAND = get_hand("human")
+TASK = TaskConfig(constraints=OURS)
+MUG = procedural.generate(1, "mug")
+
+
+@pytest.fixture(scope="module")
+def policy() -> PolicyBundle:
+    """A policy that knows all constraints and has learnt nothing."""
+    return untrained(RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4)))
+
+
+@pytest.mark.parametrize("option", [["--force", "3"], ["--gentle"]])
+def test_a_policy_that_does_not_know_it_says_so(tmp_path: pathlib.Path, monkeypatch, capsys, option) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
+    assert load("grasp")([str(tmp_path / "block.stl"), "--out", str(tmp_path / "out"), "--no-pictures", *option])() == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
+    assert line.startswith("congrasp: error: The policy does not know the constraint 'force'. It knows heading, ")
+
+
+def test_a_grasp_is_made_with_a_limit(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
+    grasper = Grasper(policy, attempts=2, rounds=1, seconds=0.25, threads=1)
+    found = grasper.grasp(MUG, read_request(MUG, HAND, 15, force="3"))
+    grasper.close()
+    assert found.motion.constraints == ("heading", "force") and 0.0 <= found.facts()["force_ratio"] <= 1.0
+    assert "No link may press harder than the force limit." in found.active
+    save_motion(tmp_path / "grasp.npz", found.motion)
+    assert load_motion(tmp_path / "grasp.npz").goal["force_limit"] == 3.0
+    arrays = found.episode.arrays
+    links = np.linalg.norm(arrays["contact_force"], axis=-1)
+    np.testing.assert_array_equal(arrays["error/force_ratio"] > 0, (links > 3.0).any(-1))
+
+
+def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: dict[str, np.ndarray]) -> None:
+    function = PolicyFunction(HAND, TASK)
+    layout = function.layout
+    assert layout.shapes["force_limit"] == ()
+
+    def ask(constraints: list[str], **more: np.ndarray) -> Inference | Exception:
+        queries = [layout.parse(Message({**query, **more}, {"constraints": constraints}))]
+        (answer,) = function(policy.inference_parameters, queries)
+        return answer
+
+    soft, firm = (ask(["heading", "force"], force_limit=np.float32(limit)) for limit in (2.0, 15.0))
+    assert isinstance(soft, Inference) and isinstance(firm, Inference)
+    assert np.abs(soft.vectors - firm.vectors).max() > 1e-6
+    assert "takes a limit between 0.5 and 50 N" in str(ask(["heading", "force"], force_limit=np.float32(0.0)))
+    with pytest.raises(CongraspError, match="lacks the field 'force_limit'"):
+        ask(["heading", "force"])
+
+
+def test_the_studio_has_a_box_for_it() -> None:
+    studio = Studio(HAND, TASK, MUG)
+    studio.ask("force", True)
+    assert {"name": "force", "title": "force limit", "flags": {}} in json.loads(
+        json.dumps(description.describe(studio)["others"])
+    )
+    assert studio.request.given("force", "limit") == 5.0 and studio.trouble == ""
+    with pytest.raises(CongraspError, match="nothing to choose for 'force'"):
+        studio.choose("force", "limit", [True])
+
+
+def test_an_evaluation_has_its_row(policy: PolicyBundle) -> None:
+    evaluator = Evaluator(policy, procedural.generate_many(2, 1_000_000), physics="native", batch=8)
+    sample = evaluator.samples(["force"], 6)["force"]
+    assert (sample.values["mask_force_limit"] == 1).all() and (sample.values["force_ratio"] <= 1).all()
+    row = evaluator.row("force", sample)
+    assert "force_ratio" in row.errors and {"force_peak_n", "force_mean_n"} <= set(row.to_json())
+
+
+def test_the_exported_policy_describes_it(policy: PolicyBundle) -> None:
+    assert describe(policy)["masks"][-1] == "force_limit" and OURS[:4] == PAPER
