@@ -94,6 +94,8 @@ class Transition(NamedTuple):
     """(B,)."""
     terminal: Array
     """(B,) bool: the episode ended with this step."""
+    truncated: Array
+    """(B,) bool: it ended because the clock ran out while the object was up, in a state that has a value."""
     terms: Array
     """(B, terms) weighted reward terms."""
     errors: dict[str, tuple[Array, Array]]
@@ -236,7 +238,16 @@ class GraspEnv:
             counts, terminal = counts | fell, terminal | fell
         finished = jnp.where(counts[:, None], self._episode(state, up), state.finished)
         state = state._replace(finished=finished, has_finished=state.has_finished | counts)
-        return state, Transition(reward, terminal, stacked, error, physics_state.occupancy)
+        # Without the object up an end is final, whatever brought it about: the fall has been paid for.
+        transition = Transition(
+            reward=reward,
+            terminal=terminal,
+            truncated=terminal & up,
+            terms=stacked,
+            errors=error,
+            occupancy=physics_state.occupancy,
+        )
+        return state, transition
 
     def with_scene(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
         """The environments with the scene that the engine shows, as the carried frame sees it."""

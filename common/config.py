@@ -252,6 +252,8 @@ class PPOConfig:
     """Discount."""
     gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimate."""
+    bootstrap_truncated: bool = True
+    """Bootstraps from the critic where the time limit ends an episode whose object is up, instead of from zero."""
     learning_rate: float = 5e-4
     """Adam's rate at the start."""
     learning_rate_range: tuple[float, float] = (1e-5, 3e-3)

@@ -45,6 +45,7 @@ RECORDED: Schema = {
     "log_probability": ArraySpec(F32, ("T", "B")),
     "reward": ArraySpec(F32, ("T", "B")),
     "terminal": ArraySpec(("bool",), ("T", "B")),
+    "truncated": ArraySpec(("bool",), ("T", "B")),
     "last_observation": ArraySpec(_OBSERVATION, ("B", "D")),
 }
 """What actors record of any rollout (`actors.rollout.Rollout`)."""

@@ -214,6 +214,9 @@ class _Evaluation(NamedTuple):
     returns: Array
     advantage_std: Array
     """() over all ranks."""
+    td_error: Array
+    truncated_error: Array
+    """TD error of a final step without bootstrap, r - V."""
 
 
 def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: Layout) -> _Evaluation:
@@ -233,9 +236,9 @@ def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: L
     value = values(observation)
     last_value = values(normalizer.apply(given.observations, batch["last_observation"]))
     reward = batch["reward"] * hyper["reward_scale"]
-    advantage, returns = gae.advantages(
-        reward, value, last_value, batch["terminal"], hyper["gamma"], hyper["gae_lambda"]
-    )
+    truncated = batch["truncated"] & hyper["bootstrap_truncated"]
+    chunk = reward, value, last_value, batch["terminal"]
+    advantage, returns = gae.advantages(*chunk, hyper["gamma"], hyper["gae_lambda"], truncated)
     advantage_std = jnp.sqrt(collectives.variance(advantage))
     samples = losses.Sample(
         observation=batch["observation"],
@@ -246,7 +249,16 @@ def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: L
         advantage=(advantage - collectives.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
         target=(returns - given.returns.shift) * given.returns.scale,
     )
-    return _Evaluation(samples, log_exact - behaviour, weight, value, returns, advantage_std)
+    return _Evaluation(
+        samples=samples,
+        log_weight=log_exact - behaviour,
+        weight=weight,
+        value=value,
+        returns=returns,
+        advantage_std=advantage_std,
+        td_error=gae.td_errors(*chunk, hyper["gamma"], truncated),
+        truncated_error=reward - value,
+    )
 
 
 def _program(
@@ -297,6 +309,8 @@ def _batch_metrics(given: _Given, evaluation: _Evaluation, collectives: Collecti
         "importance_max": collectives.max(jnp.max(evaluation.weight)),
         "explained_variance": 1.0 - residual / (variance + 1e-8),
         "advantage_std": evaluation.advantage_std,
+        "td_error_std": jnp.sqrt(collectives.variance(evaluation.td_error)),
+        **_truncation_metrics(given, evaluation, collectives),
         **collectives.mean(
             {
                 "importance_mean": jnp.mean(evaluation.weight),
@@ -308,6 +322,18 @@ def _batch_metrics(given: _Given, evaluation: _Evaluation, collectives: Collecti
             }
         ),
     }
+
+
+def _truncation_metrics(given: _Given, evaluation: _Evaluation, collectives: Collectives) -> dict[str, Array]:
+    """Share of truncated steps, and their mean TD error with and without bootstrap; 0 in a batch without any."""
+    truncated = (given.batch["truncated"] & given.batch["terminal"]).astype(jnp.float32)
+    cut = evaluation.truncated_error
+    bootstrapped = cut + given.hyper["gamma"] * evaluation.value
+    sums = {"td_error_truncated": bootstrapped, "td_error_truncated_as_terminal": cut}
+    share, means = collectives.mean(
+        (jnp.mean(truncated), {name: jnp.mean(truncated * error) for name, error in sums.items()})
+    )
+    return {"truncated": share, **{name: mean / jnp.maximum(share, 1e-9) for name, mean in means.items()}}
 
 
 def _epochs(

@@ -42,7 +42,8 @@ def rollout(number, bundle):
         "action": rng.normal(size=(STEPS, WORLDS, bundle.meta["action_size"])).astype(np.float32),
         "log_probability": rng.normal(-40.0, 1.0, size=(STEPS, WORLDS)).astype(np.float32),
         "reward": rng.normal(size=(STEPS, WORLDS)).astype(np.float32),
-        "terminal": rng.random((STEPS, WORLDS)) < 0.3,
+        "terminal": (terminal := rng.random((STEPS, WORLDS)) < 0.3),
+        "truncated": terminal & (rng.random((STEPS, WORLDS)) < 0.5),
     }
     who = {"actor": "a", "incarnation": "01", "sequence": number, "ticket": ""}
     return Message(arrays, {**who, **{name: bundle.meta[name] for name in ("version", "epoch", "schema")}, "steps": 8})

@@ -57,7 +57,8 @@ class MadeUpActor(threading.Thread):
                 "action": np.asarray(action),
                 "log_probability": np.asarray(log_probability),
                 "reward": self.reward * rng.normal(size=(4, 2)).astype(np.float32),
-                "terminal": rng.random((4, 2)) < 0.3,
+                "terminal": (terminal := rng.random((4, 2)) < 0.3),
+                "truncated": terminal & (rng.random((4, 2)) < 0.5),
             }
             arrays = {name: recorded[name] for name in names} | {
                 "episode/success": np.array([0.0, 1.0, 1.0, 1.0], np.float32),

@@ -99,6 +99,31 @@ def test_moving_the_value_statistics_does_not_move_the_values():
     np.testing.assert_allclose(values(after), before, rtol=1e-4, atol=1e-4)
 
 
+def test_truncated_ends_have_the_td_errors_of_both_rules():
+    """With a critic of zeros but for its bias, V = 0.7 everywhere."""
+    state = fresh()
+    critic = jax.tree.map(jnp.zeros_like, state.params["critic"])
+    critic["output"] = {**critic["output"], "bias": jnp.array([0.7])}
+    state = state._replace(params={**state.params, "critic": critic})
+    batch = rollout(toy.bundle_of(state), 0)
+    _, none = step(state, batch)
+    assert none["truncated"] == none["td_error_truncated"] == none["td_error_truncated_as_terminal"] == 0.0
+    batch["truncated"][-1, :16] = True
+    reward, ended = batch["reward"], batch["reward"][-1, :16].mean()
+    errors = {}
+    for bootstrap in (True, False):
+        _, metrics = changed(bootstrap_truncated=bootstrap).update(fresh()._replace(params=state.params), batch)
+        # Episodes of ten steps, a quarter of which were truncated: one step of forty.
+        assert metrics["truncated"] == pytest.approx(1 / 40)
+        assert metrics["td_error_truncated"] == pytest.approx(ended + 0.9 * 0.7 - 0.7, abs=1e-5)
+        assert metrics["td_error_truncated_as_terminal"] == pytest.approx(ended - 0.7, abs=1e-5)
+        continues = np.full(reward.shape, 0.9, np.float32)
+        continues[-1, 16 * bootstrap :] = 0.0
+        errors[bootstrap] = np.std(reward + 0.7 * continues - 0.7)
+        assert metrics["td_error_std"] == pytest.approx(errors[bootstrap], abs=1e-5)
+    assert errors[True] != errors[False]
+
+
 @pytest.mark.parametrize(
     ("kl", "rate"),
     [(0.05, 2e-3 / 1.5), (0.004, 3e-3), (0.02, 2e-3), (0.006, 2e-3), (float("inf"), 2e-3 / 1.5)],

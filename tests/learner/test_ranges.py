@@ -34,7 +34,7 @@ def _rollouts(*spreads):
     physics = NativePhysics(hand, TASK, objects, 2)
     bank = build_bank(hand, TASK, objects, 0)
     worker = RolloutWorker(hand, TASK, physics, bank, noise, batch=WORLDS, seed=0, half_precision=True)
-    names = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
+    names = ("observation", "action", "log_probability", "reward", "terminal", "truncated", "last_observation")
     for spread in spreads:
         rollout = worker.collect(jnp.float32(spread), STEPS)
         yield Message({name: np.asarray(getattr(rollout, name)) for name in names} | finished_episodes(rollout, TASK))
