@@ -19,7 +19,7 @@ from actors.success import Success
 from common.config import ControlConfig, RewardWeights, TaskConfig
 from common.hands.motors import motor_positions
 from common.hands.spec import Hand
-from common.task import metrics, sensing
+from common.task import metrics, privileged, sensing
 from common.task.constraints import blocks
 from common.task.constraints.base import Scene
 from common.task.control import decode
@@ -39,6 +39,8 @@ class Settings(NamedTuple):
     """What is done to hand and object after the table's removal; nothing by default."""
     probe_data: Any = None
     """Arrays that the probe of a rollout reads beside the scene."""
+    masses: Array | None = None
+    """(N,) kg, of the engine's objects, where the critic's privileged inputs are recorded."""
 
 
 class EnvState(NamedTuple):
@@ -296,6 +298,19 @@ class GraspEnv:
     def privileged(self, state: EnvState) -> Scene:
         """The present control step as a policy sees it that sees all."""
         return self.scene_of(state)._replace(task=dataclasses.replace(self.task, observation="full"))
+
+    def critic_inputs(self, state: EnvState, masses: Array) -> Array:
+        """(B, P) privileged inputs of the critic; `masses` are those of `Settings`."""
+        start = state.reset_state
+        parameters = privileged.Parameters(
+            mass=masses[start.object_index] * start.mass_scale,
+            friction=start.friction,
+            gain_scale=start.gain_scale,
+            stationary=start.stationary,
+            hold=state.hold,
+            sensors=None if state.tracker is None else state.tracker.sensors,
+        )
+        return privileged.observe(self.scene_of(state), parameters)
 
     def _first_readings(self, initial: InitialConditions) -> dict[str, Any]:
         """Tracker and readings of episodes that begin; None where the policy needs none."""

@@ -85,7 +85,11 @@ class Rollout(NamedTuple):
     probed: Any
     """What the probe returned, with leading axis T; None without a probe."""
     teacher_observation: Array | None = None
-    """(T, B, P) what a policy sees that sees all, where a teacher is to say what it would do."""
+    """(T, B, S) what a policy sees that sees all, where a teacher is to say what it would do."""
+    privileged: Array | None = None
+    """(T, B, P) privileged inputs of the critic (`common.task.privileged`), where they are recorded."""
+    last_privileged: Array | None = None
+    """(B, P)."""
 
 
 class _Seen(NamedTuple):
@@ -94,7 +98,9 @@ class _Seen(NamedTuple):
     observation: Array
     """(B, D)."""
     teacher_observation: Array | None
-    """(B, P) of a policy that sees all, if that is recorded."""
+    """(B, S) of a policy that sees all, if that is recorded."""
+    privileged: Array | None
+    """(B, P) of the critic, likewise."""
 
 
 class _Decision(NamedTuple):
@@ -126,6 +132,7 @@ class RolloutWorker:
         traced: int | slice = 0,
         staggered: bool = False,
         taught: bool = False,
+        privileged: Sequence[GraspObject] = (),
     ):
         """Starts fresh episodes, if there is a bank.
 
@@ -143,6 +150,7 @@ class RolloutWorker:
           staggered: the first episodes end early, each at a time of its own, so that short rollouts show all phases of
             the task from then on.
           taught: `Rollout.teacher_observation` is recorded.
+          privileged: the engine's objects, if `Rollout.privileged` is recorded.
         """
         self.physics, self.env = physics, GraspEnv(hand, task, physics)
         self._hand, self._task, self._bank, self._policy = hand, task, _on_device(bank), policy
@@ -150,6 +158,8 @@ class RolloutWorker:
         self._taught = taught
         self._dtype = jnp.float16 if half_precision else jnp.float32
         self._settings, self._stationary = self.env.settings, np.array(False)
+        if privileged:
+            self.adjust(masses=_masses(privileged))
         self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
         self._sample_jit = jax.jit(self._sample)
         self._begin_jit = jax.jit(self._begin)
@@ -174,6 +184,8 @@ class RolloutWorker:
         """Episodes that start from now on are drawn from these objects, as many as before, and their bank."""
         physics = self.physics.replace_objects(self.state.physics if self.state else None, objects)
         self._bank = _on_device(bank)
+        if self._settings.masses is not None:
+            self.adjust(masses=_masses(objects))
         if self.state is not None:
             self.state = self.state._replace(physics=physics if self.physics.compiled else None)
             self.take_grasps()
@@ -270,15 +282,17 @@ class RolloutWorker:
         """Fresh episodes in the masked environments (B,), whose engine was reset apart."""
         return self.env.merge(state, mask, self.env.state_of(fresh, None))
 
-    def _look(self, state: EnvState) -> _Seen:
+    def _look(self, state: EnvState, settings: Settings) -> _Seen:
         """Observations of the present control step."""
         observation = observe(self.env.seen(state)).astype(self._dtype)
         everything = observe(self.env.privileged(state)).astype(self._dtype) if self._taught else None
-        return _Seen(observation, everything)
+        masses = settings.masses
+        inputs = None if masses is None else self.env.critic_inputs(state, masses).astype(self._dtype)
+        return _Seen(observation, everything, inputs)
 
     def _decide(self, parameters: Any, settings: Settings, state: EnvState, key: Array) -> _Decision:
         """Observation, action and joint targets of the coming step."""
-        seen = self._look(state)
+        seen = self._look(state, settings)
         action, log_probability = self._policy(parameters, seen.observation.astype(jnp.float32), key)
         target, command = self.env.targets(state, action, settings)
         return _Decision(seen, action, log_probability, target, command)
@@ -341,7 +355,7 @@ class RolloutWorker:
             progress(step)
         self.state = self._with_scene_jit(state, physics_state)
         columns, (trace, probed) = jax.tree.map(lambda *x: np.stack(x), *zip(rows, extras, strict=True))
-        return _rollout(self.state, columns, decision.seen.observation, trace, probed)
+        return _rollout(self.state, columns, decision.seen, trace, probed)
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         """A rollout as one program; see `collect`."""
@@ -373,7 +387,7 @@ class RolloutWorker:
 
         def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
             state, episode_key = carry
-            seen = self._look(state)
+            seen = self._look(state, settings)
             action, log_probability = self._policy(parameters, seen.observation.astype(jnp.float32), step_key)
             state, transition = self.env.step(state, action, settings)
             kept = self._kept(state, action, transition, settings)
@@ -385,12 +399,17 @@ class RolloutWorker:
 
         carry, (columns, (trace, probed)) = jax.lax.scan(body, carry, jax.random.split(key, steps))
         state, _ = carry
-        return carry, _rollout(state, columns, self._look(state).observation, trace, probed)
+        return carry, _rollout(state, columns, self._look(state, settings), trace, probed)
 
 
 def _on_device(tree: Any) -> Any:
     """The arrays committed to this process's device: those that are not would have programs compiled once more."""
     return jax.device_put(tree, jax.local_devices()[0])
+
+
+def _masses(objects: Sequence[GraspObject]) -> Array:
+    """(N,) kg."""
+    return _on_device(np.array([obj.mass for obj in objects], np.float32))
 
 
 def _row(seen: _Seen, action: Array, log_probability: Array, transition: Transition) -> dict[str, Any]:
@@ -406,11 +425,12 @@ def _row(seen: _Seen, action: Array, log_probability: Array, transition: Transit
     }
 
 
-def _rollout(state: EnvState, columns: dict[str, Any], last_observation: Array, trace: Trace, probed: Any) -> Rollout:
-    """The rollout of stacked rows (`_row`) that ends in this state."""
+def _rollout(state: EnvState, columns: dict[str, Any], last: _Seen, trace: Trace, probed: Any) -> Rollout:
+    """The rollout of stacked rows (`_row`) that ends in this state, whose observations are `last`."""
     return Rollout(
         **columns,
-        last_observation=last_observation,
+        last_observation=last.observation,
+        last_privileged=last.privileged,
         episodes=state.finished,
         has_episode=state.has_finished,
         trace=trace,

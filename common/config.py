@@ -227,6 +227,9 @@ class NetworkConfig:
     """Units of each optional constraint's encoder."""
     initial_std: float = 0.6
     """Standard deviation of the action at the start, in units of action."""
+    privileged_critic: bool = True
+    """The critic also sees what the actor lacks: the episode's true parameters, such as the object's mass, and the true
+    state where the policy has sensors (`common.task.privileged`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -391,6 +394,8 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
             raise ValueError("it is no object")
         if "task" in fields:
             fields["task"] = with_older_physics(fields["task"])
+        if isinstance(fields.get("network"), dict):
+            fields["network"] = with_older_critic(fields["network"])
         config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
     except (ValueError, RecursionError) as error:  # no UTF-8, or nested too deep
         raise CongraspError(
@@ -413,6 +418,11 @@ def with_older_physics(task: Any) -> Any:
         return task
     then = {"wrist_acceleration": 0.0, "wrist_angular_acceleration": 0.0, "hold_acceleration": 1.0}
     return {"contact_time": 0.016, **task, "control": {**then, **control}}
+
+
+def with_older_critic(network: dict[str, Any]) -> dict[str, Any]:
+    """A `NetworkConfig` from JSON; the critic of an older file sees the observation alone."""
+    return {"privileged_critic": False, **network}
 
 
 def _no_constant(name: str) -> float:

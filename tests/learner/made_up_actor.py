@@ -51,7 +51,10 @@ class MadeUpActor(threading.Thread):
                 observation[:-1],
                 jax.random.PRNGKey(len(self.versions)),
             )
+            inputs = rng.uniform(0.0, 1.0, (5, 2, bundle.spec.privileged_size)).astype(np.float16)
             recorded = {
+                "privileged": inputs[:-1],
+                "last_privileged": inputs[-1],
                 "observation": observation[:-1],
                 "last_observation": observation[-1],
                 "action": np.asarray(action),
