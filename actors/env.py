@@ -19,7 +19,7 @@ from actors.success import Success
 from common.config import ControlConfig, RewardWeights, TaskConfig
 from common.hands.motors import motor_positions
 from common.hands.spec import Hand
-from common.task import metrics, sensing
+from common.task import metrics, privileged, sensing
 from common.task.constraints import blocks
 from common.task.constraints.base import Scene
 from common.task.control import decode, track_load, wrist_load
@@ -39,6 +39,8 @@ class Settings(NamedTuple):
     """What is done to hand and object after the table's removal; nothing by default."""
     probe_data: Any = None
     """Arrays that the probe of a rollout reads beside the scene."""
+    masses: Array | None = None
+    """(N,) kg, of the engine's objects, where the critic's privileged inputs are recorded."""
 
 
 class EnvState(NamedTuple):
@@ -96,6 +98,8 @@ class Transition(NamedTuple):
     """(B,)."""
     terminal: Array
     """(B,) bool: the episode ended with this step."""
+    truncated: Array
+    """(B,) bool: it ended because the clock ran out while the object was up, in a state that has a value."""
     terms: Array
     """(B, terms) weighted reward terms."""
     errors: dict[str, tuple[Array, Array]]
@@ -242,7 +246,16 @@ class GraspEnv:
             counts, terminal = counts | fell, terminal | fell
         finished = jnp.where(counts[:, None], self._episode(state, up), state.finished)
         state = state._replace(finished=finished, has_finished=state.has_finished | counts)
-        return state, Transition(reward, terminal, stacked, error, physics_state.occupancy)
+        # Without the object up an end is final, whatever brought it about: the fall has been paid for.
+        transition = Transition(
+            reward=reward,
+            terminal=terminal,
+            truncated=terminal & up,
+            terms=stacked,
+            errors=error,
+            occupancy=physics_state.occupancy,
+        )
+        return state, transition
 
     def with_scene(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
         """The environments with the scene that the engine shows, as the carried frame sees it."""
@@ -292,6 +305,19 @@ class GraspEnv:
     def privileged(self, state: EnvState) -> Scene:
         """The present control step as a policy sees it that sees all."""
         return self.scene_of(state)._replace(task=dataclasses.replace(self.task, observation="full"))
+
+    def critic_inputs(self, state: EnvState, masses: Array) -> Array:
+        """(B, P) privileged inputs of the critic; `masses` are those of `Settings`."""
+        start = state.reset_state
+        parameters = privileged.Parameters(
+            mass=masses[start.object_index] * start.mass_scale,
+            friction=start.friction,
+            gain_scale=start.gain_scale,
+            stationary=start.stationary,
+            hold=state.hold,
+            sensors=None if state.tracker is None else state.tracker.sensors,
+        )
+        return privileged.observe(self.scene_of(state), parameters)
 
     def _first_readings(self, initial: InitialConditions) -> dict[str, Any]:
         """Tracker and readings of episodes that begin; None where the policy needs none."""

@@ -29,7 +29,7 @@ from common.task.bank import ConstraintBank
 from common.task.types import Array
 from common.transport.base import Transport
 from common.wire.codec import Message, finite
-from common.wire.schema import RECORDABLE, TAUGHT
+from common.wire.schema import PRIVILEGED, RECORDABLE, TAUGHT
 
 _TICKET_SECONDS = 1.0
 _FLUSH_SECONDS = 2.0
@@ -124,6 +124,7 @@ class _Actor:
                 half_precision=config.half_observations,
                 staggered=True,
                 taught=not TAUGHT.keys().isdisjoint(arrays),
+                privileged=() if PRIVILEGED.keys().isdisjoint(arrays) else self._objects,
             )
         self._failures = self._failure_weights(bank)
         self._on_rollout = on_rollout

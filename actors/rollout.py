@@ -70,7 +70,9 @@ class Rollout(NamedTuple):
     reward: Array
     """(T, B)."""
     terminal: Array
-    """(T, B) bool."""
+    """(T, B) bool: the episode ended with this step."""
+    truncated: Array
+    """(T, B) bool: it ended by its time limit with the object up (`actors.env.Transition`)."""
     occupancy: Array
     """(T, 2), see `actors.physics.engine.PhysicsState`."""
     last_observation: Array
@@ -83,14 +85,28 @@ class Rollout(NamedTuple):
     probed: Any
     """What the probe returned, with leading axis T; None without a probe."""
     teacher_observation: Array | None = None
-    """(T, B, P) what a policy sees that sees all, where a teacher is to say what it would do."""
+    """(T, B, S) what a policy sees that sees all, where a teacher is to say what it would do."""
+    privileged: Array | None = None
+    """(T, B, P) privileged inputs of the critic (`common.task.privileged`), where they are recorded."""
+    last_privileged: Array | None = None
+    """(B, P)."""
+
+
+class _Seen(NamedTuple):
+    """Observations of one control step, in the precision that the learner gets."""
+
+    observation: Array
+    """(B, D)."""
+    teacher_observation: Array | None
+    """(B, S) of a policy that sees all, if that is recorded."""
+    privileged: Array | None
+    """(B, P) of the critic, likewise."""
 
 
 class _Decision(NamedTuple):
     """What the policy wants of the coming control step."""
 
-    observation: Array
-    teacher_observation: Array | None
+    seen: _Seen
     action: Array
     log_probability: Array
     target: Action
@@ -116,6 +132,7 @@ class RolloutWorker:
         traced: int | slice = 0,
         staggered: bool = False,
         taught: bool = False,
+        privileged: Sequence[GraspObject] = (),
     ):
         """Starts fresh episodes, if there is a bank.
 
@@ -133,6 +150,7 @@ class RolloutWorker:
           staggered: the first episodes end early, each at a time of its own, so that short rollouts show all phases of
             the task from then on.
           taught: `Rollout.teacher_observation` is recorded.
+          privileged: the engine's objects, if `Rollout.privileged` is recorded.
         """
         self.physics, self.env = physics, GraspEnv(hand, task, physics)
         self._hand, self._task, self._bank, self._policy = hand, task, _on_device(bank), policy
@@ -140,6 +158,8 @@ class RolloutWorker:
         self._taught = taught
         self._dtype = jnp.float16 if half_precision else jnp.float32
         self._settings, self._stationary = self.env.settings, np.array(False)
+        if privileged:
+            self.adjust(masses=_masses(privileged))
         self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
         self._sample_jit = jax.jit(self._sample)
         self._begin_jit = jax.jit(self._begin)
@@ -164,6 +184,8 @@ class RolloutWorker:
         """Episodes that start from now on are drawn from these objects, as many as before, and their bank."""
         physics = self.physics.replace_objects(self.state.physics if self.state else None, objects)
         self._bank = _on_device(bank)
+        if self._settings.masses is not None:
+            self.adjust(masses=_masses(objects))
         if self.state is not None:
             self.state = self.state._replace(physics=physics if self.physics.compiled else None)
             self.take_grasps()
@@ -260,20 +282,20 @@ class RolloutWorker:
         """Fresh episodes in the masked environments (B,), whose engine was reset apart."""
         return self.env.merge(state, mask, self.env.state_of(fresh, None))
 
-    def _observe(self, state: EnvState) -> Array:
-        """(B, D) observation, in the precision that the learner gets."""
-        return observe(self.env.seen(state)).astype(self._dtype)
-
-    def _observe_all(self, state: EnvState) -> Array | None:
-        """(B, P) what a policy sees that sees all, if that is wanted."""
-        return observe(self.env.privileged(state)).astype(self._dtype) if self._taught else None
+    def _look(self, state: EnvState, settings: Settings) -> _Seen:
+        """Observations of the present control step."""
+        observation = observe(self.env.seen(state)).astype(self._dtype)
+        everything = observe(self.env.privileged(state)).astype(self._dtype) if self._taught else None
+        masses = settings.masses
+        inputs = None if masses is None else self.env.critic_inputs(state, masses).astype(self._dtype)
+        return _Seen(observation, everything, inputs)
 
     def _decide(self, parameters: Any, settings: Settings, state: EnvState, key: Array) -> _Decision:
         """Observation, action and joint targets of the coming step."""
-        observation = self._observe(state)
-        action, log_probability = self._policy(parameters, observation.astype(jnp.float32), key)
-        targets = self.env.targets(state, action, settings)
-        return _Decision(observation, self._observe_all(state), action, log_probability, *targets)
+        seen = self._look(state, settings)
+        action, log_probability = self._policy(parameters, seen.observation.astype(jnp.float32), key)
+        target, command = self.env.targets(state, action, settings)
+        return _Decision(seen, action, log_probability, target, command)
 
     def _kept(self, state: EnvState, action: Array, transition: Transition, settings: Settings) -> tuple[Trace, Any]:
         """What trace and probe keep of a step."""
@@ -310,15 +332,16 @@ class RolloutWorker:
         assert self.state is not None
         decision = self._decide_jit(parameters, settings, self.state, keys[0])
         state = self.state._replace(scene=())
-        rows, extras = [], []
+        rows: list[dict[str, Any]] = []
+        extras = []
         for step in range(1, steps + 1):
             _, physics_state = self.physics.step(None, *map(np.asarray, decision.command))
-            row = decision[:4]
+            decided = decision
             changed, transition, kept, decision = self._advance_jit(
                 parameters, settings, state, physics_state, decision, key_data, step
             )
             state = state._replace(**changed)
-            rows.append((*row, transition.reward, transition.terminal, transition.occupancy))
+            rows.append(_row(decided.seen, decided.action, decided.log_probability, transition))
             extras.append(kept)
             if self._bank is not None and np.asarray(transition.terminal).any():
                 self._episode_key, episode_key = _split(self._episode_key)
@@ -331,13 +354,8 @@ class RolloutWorker:
                 )
             progress(step)
         self.state = self._with_scene_jit(state, physics_state)
-        observation, teacher_observation, *columns = (
-            None if column[0] is None else np.stack(column) for column in zip(*rows, strict=True)
-        )
-        trace, probed = jax.tree.map(lambda *x: np.stack(x), *extras)
-        finished = self.state.finished, self.state.has_finished
-        last = decision.observation
-        return Rollout(*(observation, *columns, last, *finished, trace, probed, teacher_observation))
+        columns, (trace, probed) = jax.tree.map(lambda *x: np.stack(x), *zip(rows, extras, strict=True))
+        return _rollout(self.state, columns, decision.seen, trace, probed)
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         """A rollout as one program; see `collect`."""
@@ -369,29 +387,55 @@ class RolloutWorker:
 
         def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
             state, episode_key = carry
-            observation, teacher_observation = self._observe(state), self._observe_all(state)
-            action, log_probability = self._policy(parameters, observation.astype(jnp.float32), step_key)
+            seen = self._look(state, settings)
+            action, log_probability = self._policy(parameters, seen.observation.astype(jnp.float32), step_key)
             state, transition = self.env.step(state, action, settings)
             kept = self._kept(state, action, transition, settings)
             carry = state, episode_key
             if bank is not None:
                 ended = jnp.any(transition.terminal)
                 carry = jax.lax.cond(ended, renew, lambda x: x[:2], (*carry, transition.terminal))
-            row = (observation, action, log_probability, transition.reward, transition.terminal, transition.occupancy)
-            return carry, (*row, teacher_observation, kept)
+            return carry, (_row(seen, action, log_probability, transition), kept)
 
-        carry, (*columns, teacher_observation, (trace, probed)) = jax.lax.scan(
-            body, carry, jax.random.split(key, steps)
-        )
+        carry, (columns, (trace, probed)) = jax.lax.scan(body, carry, jax.random.split(key, steps))
         state, _ = carry
-        finished = state.finished, state.has_finished
-        last = self._observe(state)
-        return carry, Rollout(*(*columns, last, *finished, trace, probed, teacher_observation))
+        return carry, _rollout(state, columns, self._look(state, settings), trace, probed)
 
 
 def _on_device(tree: Any) -> Any:
     """The arrays committed to this process's device: those that are not would have programs compiled once more."""
     return jax.device_put(tree, jax.local_devices()[0])
+
+
+def _masses(objects: Sequence[GraspObject]) -> Array:
+    """(N,) kg."""
+    return _on_device(np.array([obj.mass for obj in objects], np.float32))
+
+
+def _row(seen: _Seen, action: Array, log_probability: Array, transition: Transition) -> dict[str, Any]:
+    """A control step's part of a `Rollout`, by its fields."""
+    return {
+        **seen._asdict(),
+        "action": action,
+        "log_probability": log_probability,
+        "reward": transition.reward,
+        "terminal": transition.terminal,
+        "truncated": transition.truncated,
+        "occupancy": transition.occupancy,
+    }
+
+
+def _rollout(state: EnvState, columns: dict[str, Any], last: _Seen, trace: Trace, probed: Any) -> Rollout:
+    """The rollout of stacked rows (`_row`) that ends in this state, whose observations are `last`."""
+    return Rollout(
+        **columns,
+        last_observation=last.observation,
+        last_privileged=last.privileged,
+        episodes=state.finished,
+        has_episode=state.has_finished,
+        trace=trace,
+        probed=probed,
+    )
 
 
 _split = jax.jit(lambda key: tuple(jax.random.split(key)))

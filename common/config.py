@@ -253,6 +253,9 @@ class NetworkConfig:
     """Units of each optional constraint's encoder."""
     initial_std: float = 0.6
     """Standard deviation of the action at the start, in units of action."""
+    privileged_critic: bool = True
+    """The critic also sees what the actor lacks: the episode's true parameters, such as the object's mass, and the true
+    state where the policy has sensors (`common.task.privileged`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -278,6 +281,8 @@ class PPOConfig:
     """Discount."""
     gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimate."""
+    bootstrap_truncated: bool = True
+    """Bootstraps from the critic where the time limit ends an episode whose object is up, instead of from zero."""
     learning_rate: float = 5e-4
     """Adam's rate at the start."""
     learning_rate_range: tuple[float, float] = (1e-5, 3e-3)
@@ -415,6 +420,8 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
             raise ValueError("it is no object")
         if "task" in fields:
             fields["task"] = with_older_physics(fields["task"])
+        if isinstance(fields.get("network"), dict):
+            fields["network"] = with_older_critic(fields["network"])
         config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
     except (ValueError, RecursionError) as error:  # no UTF-8, or nested too deep
         raise CongraspError(
@@ -453,6 +460,11 @@ def with_older_physics(task: Any) -> Any:
         "back_off_range": [back_off, back_off],
     }
     return {"contact_time": 0.016, **begun, **task, "control": {**then, **control}}
+
+
+def with_older_critic(network: dict[str, Any]) -> dict[str, Any]:
+    """A `NetworkConfig` from JSON; the critic of an older file sees the observation alone."""
+    return {"privileged_critic": False, **network}
 
 
 def _no_constant(name: str) -> float:

@@ -34,6 +34,8 @@ class Ranges(NamedTuple):
     episodes: dict[str, tuple[float, float]]
     """Least and largest value of each metric of an episode, by its name on the wire: no others are known."""
     teacher_observation: np.ndarray = np.zeros(0)
+    """(S,)."""
+    privileged: np.ndarray = np.zeros(0)
     """(P,)."""
 
 
@@ -68,6 +70,8 @@ class Admission:
                 _check_observations(name, array, ranges.observation)
             elif name == "teacher_observation":
                 _check_observations(name, array, ranges.teacher_observation)
+            elif name in ("privileged", "last_privileged"):
+                _check_observations(name, array, ranges.privileged)
             elif name == "reward":
                 _within(name, array, -ranges.reward, ranges.reward)
             elif name == "action":

@@ -17,13 +17,14 @@ from learner.collectives import AXIS
 def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> RolloutForm:
     """The arrays and sizes of a run's rollouts, of which its algorithm learns from those of `schema`."""
     return RolloutForm(
-        config.rollout_steps,
-        config.environments,
-        sum(size for _, size in spec.layout),
-        spec.action_size,
-        config.half_observations,
-        0 if TAUGHT.keys().isdisjoint(schema) else sum(size for _, size in full_layout(config.task)),
-        schema,
+        steps=config.rollout_steps,
+        worlds=config.environments,
+        observation=sum(size for _, size in spec.layout),
+        action=spec.action_size,
+        half=config.half_observations,
+        teacher=0 if TAUGHT.keys().isdisjoint(schema) else sum(size for _, size in full_layout(config.task)),
+        privileged=spec.privileged_size,
+        arrays=schema,
     )
 
 

@@ -195,7 +195,7 @@ class _Learner:
         initial = None
         if ranks.rank == 0 and not resume and (self._run_dir / INITIAL_FILE).exists():
             given = bundles.load(self._run_dir / INITIAL_FILE)
-            initial = Policy(given.params, given.observation, given.value)
+            initial = Policy(given.params, given.observation, given.value, given.privileged)
         state = self._algorithm.init(config.seed, initial)
         meta: dict[str, Any] = {"run_id": secrets.token_hex(8), "skipped": 0, "hubs": []}
         if ranks.rank == 0:
@@ -228,7 +228,14 @@ class _Learner:
     def bundle(self) -> PolicyBundle:
         """The newest policy."""
         policy = self._algorithm.policy(self._state)
-        return PolicyBundle(self._spec, self._config.task, *policy, self.version, self._run_id, self._state.transitions)
+        return PolicyBundle(
+            spec=self._spec,
+            task=self._config.task,
+            version=self.version,
+            run_id=self._run_id,
+            transitions=self._state.transitions,
+            **policy._asdict(),
+        )
 
     def train(self, stop: threading.Event, deaths: list[str], on_update: Callable[[dict[str, float]], None]) -> None:
         """Updates until the end, a stop, or a thread's death; leaves a checkpoint behind in each case."""

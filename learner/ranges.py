@@ -17,13 +17,15 @@ from common.config import CurriculumConfig, RewardWeights, TaskConfig
 from common.hands import get_hand
 from common.hands.spec import Hand
 from common.ranges import MAX_DISTANCE, MAX_SPEED
+from common.task import privileged
 from common.task.constraints import known
 from common.task.constraints.base import symbol_sizes
 from common.task.features import scene_of
 from common.task.metrics import DIVERGED, FORCES, episode_fields
 from common.task.observation import observe
+from common.task.privileged import Parameters
 from common.task.reward import reward_terms
-from common.task.sensing import Readings
+from common.task.sensing import Readings, draw_sensors
 from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from learner.admission import Ranges
 
@@ -35,6 +37,7 @@ _FORCE = 1e3  # N; terms and observations clip or squash forces far below
 _FLAGS = ("success", "held", DIVERGED)
 _LARGEST = 1e6  # of an error or a force, in its unit
 _ACTION = 1e3
+_MASS = 1e3  # kg
 
 
 @functools.lru_cache(maxsize=8)
@@ -61,22 +64,29 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
         if name.startswith("episode/mask_") or name in {f"episode/{flag}" for flag in _FLAGS}
     }
     # Some observations are zero in every state here, and nothing is refused for a rounding error.
-    own, teacher = (_SLACK * np.abs(found).max(0) + 1.0 for found in observed)
-    return Ranges(own, reward, _ACTION, episodes, teacher)
+    own, teacher, critic = (_SLACK * np.abs(found).max(0) + 1.0 for found in observed)
+    return Ranges(own, reward, _ACTION, episodes, teacher, critic)
 
 
 def _evaluate(
-    hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal, readings: Readings
-) -> tuple[Any, Any, Any]:
-    """Observations (B, D), those (B, P) that see all, and the terms (B,) of the reward, each under a weight of one."""
+    hand: Hand,
+    task: TaskConfig,
+    state: SceneState,
+    surface: Surface,
+    goal: Goal,
+    readings: Readings,
+    parameters: Parameters,
+) -> tuple[Any, Any, Any, Any]:
+    """Observations (B, D), (B, S) of a policy that sees all and (B, P) of the critic, and unweighted reward terms."""
     full = dataclasses.replace(task, observation="full")
     scene = scene_of(hand, full, state, surface, goal)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
     terms = reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
-    return observe(scene._replace(task=task, readings=readings)), observe(scene), terms
+    own = scene._replace(task=task, readings=readings)
+    return observe(own), observe(scene), privileged.observe(own, parameters), terms
 
 
-def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, Readings]:
+def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, Readings, Parameters]:
     """Random states out to what engines let pass, with random surfaces and goals in which everything is active.
 
     The readings before a state are those of other ones.
@@ -138,4 +148,12 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
     others = rng.integers(0, _STATES, (_STATES, task.history))
     others[:, 0] = np.arange(_STATES)
     readings = Readings(*(getattr(state, name)[others] for name in Readings._fields))
-    return jax.tree.map(jnp.asarray, (state, surface, Goal(values, everything), readings))
+    parameters = Parameters(
+        mass=rng.uniform(0.0, _MASS, _STATES),
+        friction=rng.uniform(*task.friction_range, _STATES),
+        gain_scale=rng.uniform(*task.gain_range, _STATES),
+        stationary=rng.random(_STATES) < 0.5,
+        hold=rng.integers(0, max(task.hold_steps, task.hold_steps_max) + 1, _STATES),
+        sensors=draw_sensors(task.sensing, task.control_dt, jax.random.key(0), _STATES) if task.sensed else None,
+    )
+    return jax.tree.map(jnp.asarray, (state, surface, Goal(values, everything), readings, parameters))

@@ -43,7 +43,8 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
     Args:
       run_dir: where.
       config: the run.
-      initial: a policy to begin with instead of random weights: its networks and normalisers.
+      initial: a policy to begin with instead of random weights: its networks and normalisers. Privileged inputs that
+        its critic lacks start at zero weight.
 
     Raises:
       CongraspError: there is a run in it already, or what is left of one, or the initial policy does not fit the run.
@@ -58,9 +59,10 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
             "Put that back and add --resume, or choose another --run-dir.",
         )
     if initial is not None:
-        bundles.policy_spec(config.task, config.network).require(initial.spec, "to begin with")
+        spec = bundles.policy_spec(config.task, config.network)
+        spec.require(initial.spec, "to begin with")
         run_dir.mkdir(parents=True, exist_ok=True)
-        bundles.save(initial, run_dir / INITIAL_FILE)
+        bundles.save(bundles.with_critic_of(spec, initial), run_dir / INITIAL_FILE)
     write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
     (run_dir / LOGS).mkdir(exist_ok=True)
 

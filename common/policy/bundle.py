@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.config import NetworkConfig, TaskConfig, with_older_physics
+from common.config import NetworkConfig, TaskConfig, with_older_critic, with_older_physics
 from common.errors import CongraspError
 from common.files import write_atomically
 from common.hands import check_reference, get_hand
@@ -28,6 +28,7 @@ from common.policy.network import Layout, Params
 from common.policy.normalizer import Affine, Statistics
 from common.ranges import network_faults, task_faults
 from common.task import observation as task_observation
+from common.task import privileged
 from common.task.types import Array
 from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
@@ -48,6 +49,14 @@ class PolicySpec:
     """A."""
     network: NetworkConfig
     """Sizes of the networks."""
+    privileged: Layout = ()
+    """Names and sizes of the critic's privileged inputs (`common.task.privileged`); no part of the schema, because
+    acting needs none of them."""
+
+    @property
+    def privileged_size(self) -> int:
+        """P."""
+        return sum(size for _, size in self.privileged)
 
     @property
     def hand_name(self) -> str:
@@ -74,7 +83,13 @@ class PolicySpec:
 def policy_spec(task: TaskConfig, sizes: NetworkConfig) -> PolicySpec:
     """The spec of a task's policy."""
     hand = get_hand(task.hand)
-    return PolicySpec(hand.reference, task_observation.layout(hand, task), len(hand.motors) + 6, sizes)
+    return PolicySpec(
+        hand=hand.reference,
+        layout=task_observation.layout(hand, task),
+        action_size=len(hand.motors) + 6,
+        network=sizes,
+        privileged=privileged.layout(hand, task) if sizes.privileged_critic else (),
+    )
 
 
 def full_layout(task: TaskConfig) -> Layout:
@@ -109,6 +124,8 @@ class PolicyBundle:
     """Identity of the run's beginning: another one when training restarts from scratch, the same after a resume."""
     transitions: int
     """Environment steps that it was trained on."""
+    privileged: Statistics | None = None
+    """Of the critic's privileged inputs; None: it has none, or there are no samples."""
 
     @functools.cached_property
     def inference_parameters(self) -> InferenceParameters:
@@ -119,6 +136,8 @@ class PolicyBundle:
     def to_message(self) -> Message:
         """The bundle as arrays and meta data; arrays are shared, not copied."""
         tree = {**self.params, "observation": self.observation._asdict(), "value": self.value._asdict()}
+        if self.spec.privileged:
+            tree["privileged"] = (self.privileged or normalizer.empty((self.spec.privileged_size,)))._asdict()
         meta = {
             "format": FORMAT,
             "version": self.version,
@@ -128,6 +147,7 @@ class PolicyBundle:
             "hand": self.spec.hand,
             "layout": [[name, size] for name, size in self.spec.layout],
             "action_size": self.spec.action_size,
+            "privileged": [[name, size] for name, size in self.spec.privileged],
             "network": dataclasses.asdict(self.spec.network),
             "task": dataclasses.asdict(self.task),
         }
@@ -152,11 +172,13 @@ class PolicyBundle:
                 hand=check_reference(meta["hand"]),
                 layout=tuple((str(name), int(size)) for name, size in meta["layout"]),
                 action_size=int(meta["action_size"]),
-                network=_dataclass(NetworkConfig, meta["network"]),
+                network=_dataclass(NetworkConfig, with_older_critic(meta["network"])),
+                privileged=tuple((str(name), int(size)) for name, size in meta.get("privileged", ())),
             )
             task = _dataclass(TaskConfig, with_older_physics(meta["task"]))
             version, run_id, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
-            for fault in (*network_faults(spec.network, spec.layout, spec.action_size), *task_faults(task)):
+            inputs = (*spec.layout, *spec.privileged)
+            for fault in (*network_faults(spec.network, inputs, spec.action_size), *task_faults(task)):
                 raise ValueError(fault)
             shapes = _shapes(spec)
         except (*_MALFORMED, CongraspError, dacite.DaciteError) as error:
@@ -166,8 +188,19 @@ class PolicyBundle:
             raise CongraspError(f"The policy {source} names a schema that is not its own.", _REMEDY)
         _check_arrays(message.arrays, shapes, source)
         tree = flax.traverse_util.unflatten_dict(dict(message.arrays), sep="/")
-        observation, value = (Statistics(**tree.pop(name)) for name in ("observation", "value"))
-        return PolicyBundle(spec, task, tree, observation, value, version, run_id, transitions)
+        names = ("observation", "value", *(["privileged"] if spec.privileged else []))
+        statistics = {name: Statistics(**tree.pop(name)) for name in names}
+        return PolicyBundle(
+            spec=spec, task=task, params=tree, version=version, run_id=run_id, transitions=transitions, **statistics
+        )
+
+
+def with_critic_of(spec: PolicySpec, bundle: PolicyBundle) -> PolicyBundle:
+    """The bundle with the privileged inputs of another spec of its schema, at zero weight where they are others."""
+    if bundle.spec.privileged == spec.privileged:
+        return bundle
+    params = network.with_privileged(bundle.params, bundle.spec.privileged_size, spec.privileged_size)
+    return dataclasses.replace(bundle, spec=spec, params=params, privileged=None)
 
 
 def content_hash(encoded: bytes) -> str:
@@ -224,9 +257,11 @@ def _dataclass(cls: type, fields: Any) -> Any:
 @functools.lru_cache(maxsize=8)
 def _shapes(spec: PolicySpec) -> dict[str, tuple[int, ...]]:
     """The shape of every array in a bundle."""
-    params = network.shapes(spec.layout, spec.action_size, spec.network)
+    params = network.shapes(spec.layout, spec.action_size, spec.network, spec.privileged_size)
     size = sum(width for _, width in spec.layout)
     statistics = {"observation": normalizer.empty((size,))._asdict(), "value": normalizer.empty()._asdict()}
+    if spec.privileged:
+        statistics["privileged"] = normalizer.empty((spec.privileged_size,))._asdict()
     flat = flax.traverse_util.flatten_dict({**params, **statistics}, sep="/")
     return {name: tuple(leaf.shape) for name, leaf in flat.items()}
 

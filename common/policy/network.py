@@ -32,6 +32,8 @@ Params = dict[str, Any]
 
 TRUNK = ("state", "heading", "mask")
 """Blocks that go into the trunk as they are, in this order; the codes of the gated blocks follow."""
+PRIVILEGED = "privileged"
+"""Block of the critic's privileged inputs, which follow the codes into its trunk."""
 _HIDDEN_GAIN = math.sqrt(2.0)
 _ACTION_GAIN = 0.01  # first actions are noise around zero, whatever the observation
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -39,7 +41,7 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 def gated(layout: Layout) -> tuple[str, ...]:
     """Names of the optional blocks, each of which a bit of the mask gates, in the order of the bits."""
-    return tuple(name for name, _ in layout if name not in TRUNK)
+    return tuple(name for name, _ in layout if name not in (*TRUNK, PRIVILEGED))
 
 
 def check_layout(layout: Layout) -> None:
@@ -80,6 +82,8 @@ class GatedNetwork(nn.Module):
         for bit, name in enumerate(gated(self.layout)):
             code = nn.elu(self._dense(self.encoder, name)(blocks[name]))
             inputs.append(code * blocks["mask"][..., bit : bit + 1])
+        if PRIVILEGED in blocks:
+            inputs.append(blocks[PRIVILEGED])
         x = jnp.concatenate(inputs, -1)
         for depth, units in enumerate(self.hidden):
             x = nn.elu(self._dense(units, f"trunk_{depth}")(x))
@@ -108,29 +112,43 @@ def _sizes(tree: Params) -> tuple[tuple[int, ...], int, int]:
     return hidden, encoders[0] if encoders else 0, tree["output"]["kernel"].shape[-1]
 
 
-def shapes(layout: Layout, action_size: int, config: NetworkConfig) -> Params:
+def _critic_layout(layout: Layout, privileged: int) -> Layout:
+    """Blocks of the critic's input: the observation's, and that of so many privileged inputs."""
+    return (*layout, (PRIVILEGED, privileged)) if privileged else layout
+
+
+def shapes(layout: Layout, action_size: int, config: NetworkConfig, privileged: int = 0) -> Params:
     """What `init` returns, with `jax.ShapeDtypeStruct` leaves; nothing is computed."""
     check_layout(layout)
-    observation = jax.ShapeDtypeStruct((1, sum(size for _, size in layout)), jnp.float32)
+    size = sum(size for _, size in layout)
+    observation = jax.ShapeDtypeStruct((1, size), jnp.float32)
+    critic_input = jax.ShapeDtypeStruct((1, size + privileged), jnp.float32)
     actor = _exact(layout, config.hidden, config.encoder, action_size)
-    critic = _fast(layout, config.hidden, config.encoder, 1)
+    critic = _fast(_critic_layout(layout, privileged), config.hidden, config.encoder, 1)
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     return {
         "actor": {
             "network": jax.eval_shape(actor.init, key, observation)["params"],
             "log_std": jax.ShapeDtypeStruct((action_size,), jnp.float32),
         },
-        "critic": jax.eval_shape(critic.init, key, observation)["params"],
+        "critic": jax.eval_shape(critic.init, key, critic_input)["params"],
     }
 
 
-def init(seed: int, layout: Layout, action_size: int, config: NetworkConfig) -> Params:
+def init(seed: int, layout: Layout, action_size: int, config: NetworkConfig, privileged: int = 0) -> Params:
     """Orthogonal weights and zero biases: `{"actor": {"network", "log_std"}, "critic": {...}}`.
 
     Drawn with NumPy: compiling a QR decomposition for each kernel's shape would take seconds.
+
+    Args:
+      seed: of the weights; those of the actor do not depend on `privileged`.
+      layout: of the observation.
+      action_size: A.
+      config: sizes of the networks.
+      privileged: P, the critic's privileged inputs.
     """
     rng = np.random.default_rng(seed)
-    tree = shapes(layout, action_size, config)
+    tree = shapes(layout, action_size, config, privileged)
 
     def fill(layers: Params, output_gain: float) -> Params:
         """Layers of one network, the last with its own gain."""
@@ -166,11 +184,25 @@ def policy(params: Params, layout: Layout, observation: Array, *, exact: bool = 
     return build(layout, *_sizes(actor["network"])).apply({"params": actor["network"]}, observation), actor["log_std"]
 
 
-def value(params: Params, layout: Layout, observation: Array) -> Array:
-    """The critic's estimate (...,) of the normalised return."""
+def value(params: Params, layout: Layout, observation: Array, privileged: Array | None = None) -> Array:
+    """The critic's estimate (...,) of the normalised return from observations and its privileged inputs (..., P)."""
     critic = params["critic"]
+    if privileged is not None:
+        layout = _critic_layout(layout, privileged.shape[-1])
+        observation = jnp.concatenate([observation, privileged], -1)
     output: Array = _fast(layout, *_sizes(critic)).apply({"params": critic}, observation)
     return output[..., 0]
+
+
+def with_privileged(params: Params, before: int, after: int) -> Params:
+    """The parameters with `after` privileged inputs of the critic in place of its `before`.
+
+    The weights of the new ones are zero: a critic that had none estimates the same as before, and learns to use them.
+    """
+    first = params["critic"]["trunk_0"]
+    kernel = np.asarray(first["kernel"])
+    kernel = np.concatenate([kernel[: len(kernel) - before], np.zeros((after, kernel.shape[1]), kernel.dtype)])
+    return {**params, "critic": {**params["critic"], "trunk_0": {**first, "kernel": kernel}}}
 
 
 def log_probability(mean: Array, log_std: Array, action: Array) -> Array:

@@ -106,6 +106,13 @@ def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
     return Affine(shift.astype(np.float32), scale.astype(np.float32))
 
 
+def privileged_affine(statistics: Statistics) -> Affine:
+    """Normalisation of the critic's privileged inputs (..., P) by mean and standard deviation, or the identity."""
+    if statistics.count == 0:
+        return Affine(np.zeros_like(statistics.mean, np.float32), np.ones_like(statistics.mean, np.float32))
+    return Affine(statistics.mean.astype(np.float32), (1.0 / _std(statistics)).astype(np.float32))
+
+
 def apply(affine: Affine, observation: Array) -> Array:
     """Normalised observations (..., D) in float32, clipped to `LIMIT`; before gating, so inactive blocks stay zero."""
     return jnp.clip((observation.astype(jnp.float32) - affine.shift) * affine.scale, -LIMIT, LIMIT)

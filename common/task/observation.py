@@ -59,7 +59,8 @@ def _state_fields(hand: Hand) -> tuple[ObservationField, ...]:
         ("object_angular_velocity", 3, "rad/s, wrist frame", True),
         ("object_displacement", 3, "m since the start, wrist frame"),
         ("object_rotation", 3, "twice the vector part of the rotation since the start (w >= 0), wrist frame"),
-        ("time", 1, "control steps over (approach_steps + hold_steps), at most 1"),
+        # It saturates: how long a hold lasts is hidden from the policy, which must hold for ever, not until a deadline.
+        ("time", 1, "control steps over (approach_steps + hold_steps), at most 1; the hold that remains is hidden"),
         ("table", 1, "1 while the table is there"),
     )
     return tuple(ObservationField(*field) for field in state)

@@ -52,8 +52,9 @@ ROLLOUT = MessageSpec(
         "steps": int,
     },
 )
-"""Actor to learner: T control steps of B worlds, D observation and A action sizes, E episodes that ended. Of the arrays
-of the steps there are those that the run's algorithm learns from. `epoch` is the run's id."""
+"""Actor to learner: T control steps of B worlds, D observation and A action sizes, P and S of what the critic and a
+teacher see, E episodes that ended. Of the arrays of the steps there are those that the run's algorithm learns from.
+`epoch` is the run's id."""
 
 BUNDLE = MessageSpec(
     "bundle",
@@ -63,6 +64,9 @@ BUNDLE = MessageSpec(
         "observation/mean": ArraySpec(REAL, ("D",)),
         "observation/m2": ArraySpec(REAL, ("D",)),
         "observation/count": ArraySpec(REAL, ()),
+        "privileged/mean": ArraySpec(REAL, ("P",), optional=True),
+        "privileged/m2": ArraySpec(REAL, ("P",), optional=True),
+        "privileged/count": ArraySpec(REAL, (), optional=True),
         "value/mean": ArraySpec(REAL, ()),
         "value/m2": ArraySpec(REAL, ()),
         "value/count": ArraySpec(REAL, ()),

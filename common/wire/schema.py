@@ -33,8 +33,8 @@ class ArraySpec:
 
 
 Schema = Mapping[str, ArraySpec]
-"""Arrays by name; their shapes are made of T control steps, B worlds, D observation and A action sizes, and P of the
-observation of a policy that sees all."""
+"""Arrays by name; their shapes are made of T control steps, B worlds, D observation and A action sizes, P of the
+critic's privileged inputs, and S of the observation of a policy that sees all."""
 
 F32 = ("float32",)
 _OBSERVATION = ("float16", "float32")
@@ -45,13 +45,19 @@ RECORDED: Schema = {
     "log_probability": ArraySpec(F32, ("T", "B")),
     "reward": ArraySpec(F32, ("T", "B")),
     "terminal": ArraySpec(("bool",), ("T", "B")),
+    "truncated": ArraySpec(("bool",), ("T", "B")),
     "last_observation": ArraySpec(_OBSERVATION, ("B", "D")),
 }
 """What actors record of any rollout (`actors.rollout.Rollout`)."""
-TAUGHT: Schema = {"teacher_observation": ArraySpec(_OBSERVATION, ("T", "B", "P"))}
+PRIVILEGED: Schema = {
+    "privileged": ArraySpec(_OBSERVATION, ("T", "B", "P")),
+    "last_privileged": ArraySpec(_OBSERVATION, ("B", "P")),
+}
+"""What they record in addition for a critic with privileged inputs (`common.task.privileged`)."""
+TAUGHT: Schema = {"teacher_observation": ArraySpec(_OBSERVATION, ("T", "B", "S"))}
 """What they record beside it where a teacher is to say what it would have done: what a policy sees that sees all."""
-RECORDABLE: Schema = {**RECORDED, **TAUGHT}
-"""Both."""
+RECORDABLE: Schema = {**RECORDED, **PRIVILEGED, **TAUGHT}
+"""All of these."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +75,8 @@ class RolloutForm:
     half: bool
     """Observations are float16, or else float32."""
     teacher: int = 0
+    """S."""
+    privileged: int = 0
     """P."""
     arrays: Schema = dataclasses.field(default_factory=lambda: RECORDED)
     """The arrays that the run's algorithm learns from."""
@@ -76,7 +84,14 @@ class RolloutForm:
     @property
     def sizes(self) -> dict[str, int]:
         """Values of the symbols."""
-        return {"T": self.steps, WORLDS: self.worlds, "D": self.observation, "A": self.action, "P": self.teacher}
+        return {
+            "T": self.steps,
+            WORLDS: self.worlds,
+            "D": self.observation,
+            "A": self.action,
+            "P": self.privileged,
+            "S": self.teacher,
+        }
 
     @property
     def specs(self) -> dict[str, ArraySpec]:

@@ -78,11 +78,20 @@ class Distillation:
         params = jax.tree.map(jnp.asarray, initial.params)
         params["actor"] = {**params["actor"], "log_std": self._teacher.params["actor"]["log_std"]}
         optimizer = _transform(self._config.max_grad_norm).init(params["actor"])
-        return TrainState(params, optimizer, jax.random.PRNGKey(seed), initial.observation, initial.value, 0, 0)
+        return TrainState(
+            params=params,
+            optimizer=optimizer,
+            key=jax.random.PRNGKey(seed),
+            observation=initial.observation,
+            value=initial.value,
+            version=0,
+            transitions=0,
+            privileged=initial.privileged,
+        )
 
     def policy(self, state: TrainState) -> Policy:
         """Parameters and normalisers."""
-        return Policy(state.params, state.observation, state.value)
+        return Policy(state.params, state.observation, state.value, state.privileged)
 
     def update(
         self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None

@@ -33,6 +33,8 @@ class Sample(NamedTuple):
     """(M,) normalised."""
     target: Array
     """(M,) normalised return."""
+    privileged: Array | None = None
+    """(M, P) normalised privileged inputs of the critic, if it has any."""
 
 
 class Coefficients(NamedTuple):
@@ -73,7 +75,7 @@ def objective(
     """The scalar to minimise and its terms: surrogate + c_v (V - target)^2 - c_e entropy, means over the minibatch."""
     mean, log_std = network.policy(params, layout, sample.observation, exact=False)
     log_ratio = network.log_probability(mean, log_std, sample.action) - sample.log_proximal
-    error = network.value(params, layout, sample.observation) - sample.target
+    error = network.value(params, layout, sample.observation, sample.privileged) - sample.target
     terms = Terms(
         policy_loss=jnp.mean(surrogate(log_ratio, sample.advantage, sample.weight, coefficients.clip)),
         value_loss=jnp.mean(error * error),

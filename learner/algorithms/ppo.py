@@ -12,13 +12,13 @@ so that all of them come to the same weights and statistics, bit for bit.
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from jax.sharding import Mesh
+from jax.sharding import Mesh, PartitionSpec
 
 from common.config import PPOConfig
 from common.errors import CongraspError
@@ -27,14 +27,14 @@ from common.policy.bundle import PolicySpec
 from common.policy.network import Layout, Params
 from common.policy.normalizer import Affine, Statistics
 from common.task.types import Array
-from common.wire.schema import RECORDED, Schema
+from common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
 from learner.algorithms import gae, losses
 from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
 from learner.batch import partition_specs
 from learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
-_SPECS = partition_specs(RECORDED)
-_CHECKED_INPUTS = tuple(name for name, spec in RECORDED.items() if spec.dtypes != ("bool",))
+_SPECS = partition_specs(RECORDABLE)
+_CHECKED_INPUTS = tuple(name for name, spec in {**RECORDED, **PRIVILEGED}.items() if spec.dtypes != ("bool",))
 _CHECKED = (
     *_CHECKED_INPUTS,
     "value",
@@ -45,6 +45,8 @@ _CHECKED = (
     "critic gradient",
     "policy (a KL divergence out of all reason)",
 )
+_NORMALISED = ("observation", "privileged")
+"""Arrays of a batch with running statistics, which have the same names in a `TrainState`."""
 _FINE = -1  # no term was non-finite; otherwise an index into _CHECKED
 _UNREASONABLE_KL = 10.0  # nats between the policies before and after an update; a hundredth of one is aimed at
 _RATE_FACTOR = 1.5
@@ -61,6 +63,8 @@ class _Given(NamedTuple):
     batch: dict[str, Array]
     observations: Affine
     """Normalisation of observations, frozen."""
+    privileged: Affine | None
+    """Normalisation of the critic's privileged inputs, frozen; None if it has none."""
     returns: Affine
     """Normalisation of returns, frozen."""
     hyper: dict[str, Any]
@@ -70,29 +74,32 @@ class _Given(NamedTuple):
 class PPO:
     """Decoupled PPO, an `Algorithm`."""
 
-    batch_schema: Schema = RECORDED
-
     def __init__(self, spec: PolicySpec, config: PPOConfig, updates: int = 0):
         """For a policy's networks, with these hyperparameters, in a run of so many updates (`PPOConfig.settling`)."""
         self._spec, self._config, self._updates = spec, config, updates
+        self.batch_schema: Schema = {**RECORDED, **PRIVILEGED} if spec.privileged else RECORDED
 
     def init(self, seed: int, initial: Policy | None = None) -> TrainState:
         """The state before the first update."""
         initial = initial or random_policy(seed, self._spec)
         params = jax.tree.map(jnp.asarray, initial.params)
+        privileged = initial.privileged
+        if privileged is None and self._spec.privileged:
+            privileged = normalizer.empty((self._spec.privileged_size,))
         return TrainState(
-            params,
-            jax.jit(_optimizer(self._config.learning_rate, self._config.max_grad_norm).init)(params),
-            jax.random.PRNGKey(seed),
-            initial.observation,
-            initial.value,
+            params=params,
+            optimizer=jax.jit(_optimizer(self._config.learning_rate, self._config.max_grad_norm).init)(params),
+            key=jax.random.PRNGKey(seed),
+            observation=initial.observation,
+            value=initial.value,
             version=0,
             transitions=0,
+            privileged=privileged,
         )
 
     def policy(self, state: TrainState) -> Policy:
         """Parameters and normalisers."""
-        return Policy(state.params, state.observation, state.value)
+        return Policy(state.params, state.observation, state.value, state.privileged)
 
     def update(
         self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None
@@ -117,14 +124,15 @@ class PPO:
                 f"A batch of {batch['reward'].size} transitions does not make {config.minibatches} minibatches.",
                 "Use fewer minibatches, more environments or longer rollouts.",
             )
-        arrays = shard({name: batch[name] for name in RECORDED}, mesh, _SPECS)
-        moments = _observed(arrays["observation"], mesh=mesh)
-        frozen = state.observation if state.observation.count else normalizer.merge(*_ranks(unreplicate(moments, mesh)))
+        arrays = shard({name: batch[name] for name in self.batch_schema}, mesh, _specs(self.batch_schema))
+        moments = {name: _observed(arrays[name], mesh=mesh) for name in _NORMALISED if name in arrays}
+        frozen = {name: _first(getattr(state, name), found, mesh) for name, found in moments.items()}
         given = _Given(
-            arrays,
-            normalizer.observation_affine(frozen, layout),
-            normalizer.value_affine(state.value),
-            {name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)}
+            batch=arrays,
+            observations=normalizer.observation_affine(frozen["observation"], layout),
+            privileged=normalizer.privileged_affine(frozen["privileged"]) if "privileged" in frozen else None,
+            returns=normalizer.value_affine(state.value),
+            hyper={name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)}
             | {"kl_target": config.kl_target_at(state.version, self._updates)},
         )
         learnt, returns, failure, scalars = _optimise(
@@ -144,10 +152,10 @@ class PPO:
         value = normalizer.merge(state.value, *_ranks(returns))
         state = state._replace(
             params=_preserve_values(state.params, normalizer.value_affine(state.value), normalizer.value_affine(value)),
-            observation=normalizer.merge(state.observation, *_ranks(moments)),
             value=value,
             version=state.version + 1,
             transitions=state.transitions + arrays["reward"].size,
+            **{name: normalizer.merge(getattr(state, name), *_ranks(found)) for name, found in moments.items()},
         )
         return state, {name: float(scalar) for name, scalar in scalars.items()}
 
@@ -168,6 +176,16 @@ def _with(optimizer: Any, **hyperparams: Array) -> Any:
 def _ranks(gathered: Statistics) -> list[Statistics]:
     """The statistics of each rank from those that `Collectives.gather` stacked."""
     return [Statistics(*(entry[i] for entry in gathered)) for i in range(len(gathered.count))]
+
+
+def _specs(names: Iterable[str]) -> dict[str, PartitionSpec]:
+    """Partition of the arrays of a batch."""
+    return {name: _SPECS[name] for name in names}
+
+
+def _first(statistics: Statistics, moments: Statistics, mesh: Mesh | None) -> Statistics:
+    """The statistics, or those of the batch where there are no samples yet."""
+    return statistics if statistics.count else normalizer.merge(*_ranks(unreplicate(moments, mesh)))
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
@@ -196,7 +214,7 @@ def _optimise(
     program = functools.partial(
         _program, collectives=Collectives(mesh), layout=layout, epochs=epochs, minibatches=minibatches
     )
-    specs = REPLICATED, _Given._make([_SPECS, *[REPLICATED] * 3])
+    specs = REPLICATED, _Given._make([_specs(given.batch), *[REPLICATED] * 4])
     return shard_map(mesh, program, specs)((params, optimizer, key), given)
 
 
@@ -204,7 +222,7 @@ class _Evaluation(NamedTuple):
     """A batch as the proximal policy and the critic see it; leading axes (T, B)."""
 
     samples: losses.Sample
-    """Observations are not normalised yet: gathering a minibatch's rows in half precision is cheaper."""
+    """Inputs of the networks are not normalised yet: gathering a minibatch's rows in half precision is cheaper."""
     log_weight: Array
     """Log of proximal over behaviour probability."""
     weight: Array
@@ -214,6 +232,14 @@ class _Evaluation(NamedTuple):
     returns: Array
     advantage_std: Array
     """() over all ranks."""
+    td_error: Array
+    truncated_error: Array
+    """TD error of a final step without bootstrap, r - V."""
+
+
+def _normalised(affine: Affine | None, privileged: Array | None) -> Array | None:
+    """Normalised privileged inputs of the critic, if it has any."""
+    return None if affine is None or privileged is None else normalizer.apply(affine, privileged)
 
 
 def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: Layout) -> _Evaluation:
@@ -227,15 +253,17 @@ def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: L
     weight = losses.importance_weight(log_exact, behaviour, hyper["importance_max"])
     mean, _ = network.policy(params, layout, observation, exact=False)
 
-    def values(normalised: Array) -> Array:
-        return network.value(params, layout, normalised) / given.returns.scale + given.returns.shift
+    def values(normalised: Array, privileged: Array | None) -> Array:
+        inputs = _normalised(given.privileged, privileged)
+        return network.value(params, layout, normalised, inputs) / given.returns.scale + given.returns.shift
 
-    value = values(observation)
-    last_value = values(normalizer.apply(given.observations, batch["last_observation"]))
+    value = values(observation, batch.get("privileged"))
+    last_observation = normalizer.apply(given.observations, batch["last_observation"])
+    last_value = values(last_observation, batch.get("last_privileged"))
     reward = batch["reward"] * hyper["reward_scale"]
-    advantage, returns = gae.advantages(
-        reward, value, last_value, batch["terminal"], hyper["gamma"], hyper["gae_lambda"]
-    )
+    truncated = batch["truncated"] & hyper["bootstrap_truncated"]
+    chunk = reward, value, last_value, batch["terminal"]
+    advantage, returns = gae.advantages(*chunk, hyper["gamma"], hyper["gae_lambda"], truncated)
     advantage_std = jnp.sqrt(collectives.variance(advantage))
     samples = losses.Sample(
         observation=batch["observation"],
@@ -245,8 +273,18 @@ def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: L
         weight=jnp.where(hyper["decoupled"], weight, 1.0),
         advantage=(advantage - collectives.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
         target=(returns - given.returns.shift) * given.returns.scale,
+        privileged=batch.get("privileged"),
     )
-    return _Evaluation(samples, log_exact - behaviour, weight, value, returns, advantage_std)
+    return _Evaluation(
+        samples=samples,
+        log_weight=log_exact - behaviour,
+        weight=weight,
+        value=value,
+        returns=returns,
+        advantage_std=advantage_std,
+        td_error=gae.td_errors(*chunk, hyper["gamma"], truncated),
+        truncated_error=reward - value,
+    )
 
 
 def _program(
@@ -255,7 +293,7 @@ def _program(
     """What `_optimise` compiles, for one rank."""
     (params, optimizer, key), hyper = learnt, given.hyper
     evaluation = _evaluate(params, given, collectives, layout)
-    inputs = [given.batch[name] for name in _CHECKED_INPUTS]
+    inputs = [given.batch.get(name, jnp.zeros(())) for name in _CHECKED_INPUTS]
     failure = collectives.max(_first_failure(jnp.int32(_FINE), 0, *inputs, evaluation.value))
     key, epochs_key = jax.random.split(key)
     learning_rate = optimizer.hyperparams["learning_rate"]
@@ -297,6 +335,8 @@ def _batch_metrics(given: _Given, evaluation: _Evaluation, collectives: Collecti
         "importance_max": collectives.max(jnp.max(evaluation.weight)),
         "explained_variance": 1.0 - residual / (variance + 1e-8),
         "advantage_std": evaluation.advantage_std,
+        "td_error_std": jnp.sqrt(collectives.variance(evaluation.td_error)),
+        **_truncation_metrics(given, evaluation, collectives),
         **collectives.mean(
             {
                 "importance_mean": jnp.mean(evaluation.weight),
@@ -308,6 +348,18 @@ def _batch_metrics(given: _Given, evaluation: _Evaluation, collectives: Collecti
             }
         ),
     }
+
+
+def _truncation_metrics(given: _Given, evaluation: _Evaluation, collectives: Collectives) -> dict[str, Array]:
+    """Share of truncated steps, and their mean TD error with and without bootstrap; 0 in a batch without any."""
+    truncated = (given.batch["truncated"] & given.batch["terminal"]).astype(jnp.float32)
+    cut = evaluation.truncated_error
+    bootstrapped = cut + given.hyper["gamma"] * evaluation.value
+    sums = {"td_error_truncated": bootstrapped, "td_error_truncated_as_terminal": cut}
+    share, means = collectives.mean(
+        (jnp.mean(truncated), {name: jnp.mean(truncated * error) for name, error in sums.items()})
+    )
+    return {"truncated": share, **{name: mean / jnp.maximum(share, 1e-9) for name, mean in means.items()}}
 
 
 def _epochs(
@@ -335,7 +387,10 @@ def _epochs(
     def step(carry: tuple[Params, Any, Array], rows: Array):
         params, optimizer, failure = carry
         minibatch = jax.tree.map(lambda x: x[rows], samples)
-        minibatch = minibatch._replace(observation=normalizer.apply(given.observations, minibatch.observation))
+        minibatch = minibatch._replace(
+            observation=normalizer.apply(given.observations, minibatch.observation),
+            privileged=_normalised(given.privileged, minibatch.privileged),
+        )
         (_, terms), gradients = gradient(params, layout, log_std_proximal, minibatch, coefficients)
         terms, gradients = collectives.mean((terms, gradients))
         norms = {name: optax.tree.norm(tree) for name, tree in gradients.items()}

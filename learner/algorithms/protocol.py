@@ -27,11 +27,13 @@ class Policy(NamedTuple):
     """Of observations (D,), on the host; inference normalises by them."""
     value: Statistics
     """Of returns (), on the host."""
+    privileged: Statistics | None = None
+    """Of the critic's privileged inputs (P,), on the host; None: it has none, or there are no samples."""
 
 
 def random_policy(seed: int, spec: PolicySpec) -> Policy:
     """Networks with random weights, and normalisers that have seen nothing."""
-    params = network.init(seed, spec.layout, spec.action_size, spec.network)
+    params = network.init(seed, spec.layout, spec.action_size, spec.network, spec.privileged_size)
     return Policy(params, normalizer.empty((sum(size for _, size in spec.layout),)), normalizer.empty())
 
 
@@ -51,6 +53,8 @@ class TrainState(NamedTuple):
     """Updates so far."""
     transitions: int
     """Environment steps consumed so far, by all ranks."""
+    privileged: Statistics | None = None
+    """Of the critic's privileged inputs (P,), on the host; None if it has none."""
 
 
 class Algorithm(Protocol):

@@ -49,8 +49,9 @@ def episode(
         action, log_probability = (np.asarray(x) for x in act(observation))
         position = position + 0.5 * np.clip(action[:, 0], -1, 1)
         terminal = np.full(worlds, step == STEPS - 1)
-        rows.append((observation, action, log_probability, -np.abs(goal - position).astype(np.float32), terminal))
-    names = ("observation", "action", "log_probability", "reward", "terminal")
+        reward = -np.abs(goal - position).astype(np.float32)
+        rows.append((observation, action, log_probability, reward, terminal, np.zeros(worlds, bool)))
+    names = ("observation", "action", "log_probability", "reward", "terminal", "truncated")
     batch = {name: np.stack(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
     return {**batch, "last_observation": observe(position, goal)}
 

@@ -180,7 +180,14 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
     if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / CONFIG_FILE).exists():
         raise CongraspError(f"{run_dir} is not empty and is no run.", "Choose another --run-dir.")
     _check(config)
-    create_run(run_dir, config, None if initial is None else bundles.load(initial))
+    policy = None if initial is None else bundles.load(initial)
+    create_run(run_dir, config, policy)
+    if policy is not None and policy.spec.privileged != policy_spec(config.task, config.network).privileged:
+        console.print(
+            f"The critic of {initial} has other privileged inputs than this run's, which start at zero weight.",
+            markup=False,
+            soft_wrap=True,
+        )
 
 
 def _announce(config: RunConfig, run_dir: pathlib.Path, plan: _Plan) -> bool:
@@ -236,7 +243,8 @@ def untrained(config: RunConfig) -> PolicyBundle:
     """The policy that the run starts from."""
     spec = policy_spec(config.task, config.network)
     algorithm = make_algorithm(spec, config)
-    return PolicyBundle(spec, config.task, *algorithm.policy(algorithm.init(config.seed)), 0, "untrained", 0)
+    policy = algorithm.policy(algorithm.init(config.seed))
+    return PolicyBundle(spec=spec, task=config.task, version=0, run_id="untrained", transitions=0, **policy._asdict())
 
 
 class _Progress:

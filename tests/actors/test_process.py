@@ -27,8 +27,9 @@ from common.transport.keys import Keys
 from common.transport.memory import MemoryHub, MemoryTransport
 from common.wire.codec import encode
 from common.wire.messages import EPISODE, validate
-from common.wire.schema import RolloutForm
+from common.wire.schema import PRIVILEGED, RECORDED
 from learner.algorithms import make_algorithm
+from learner.batch import rollout_form
 from learner.hub import LearnerHub
 from learner.staleness import StalenessManager
 
@@ -45,7 +46,7 @@ CONFIG = RunConfig(
 )
 HAND = get_hand("human")
 SPEC = policy_spec(CONFIG.task, CONFIG.network)
-FORM = RolloutForm(T, B, sum(size for _, size in SPEC.layout), SPEC.action_size, half=True)
+FORM = rollout_form(CONFIG, SPEC, {**RECORDED, **PRIVILEGED})
 FIELDS = episode_fields(CONFIG.task)
 
 

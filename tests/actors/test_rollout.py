@@ -133,7 +133,9 @@ def test_success_needs_the_object_to_stay_up(bank):
     physics = NativePhysics(HAND, task, OBJECTS, 2)
     still = lambda p, o, k: (jnp.zeros((o.shape[0], 26)).at[:, 20:23].set(-20.0), jnp.zeros(o.shape[0]))  # noqa: E731
     worker = RolloutWorker(HAND, task, physics, away, still, batch=BATCH, seed=0, half_precision=True)
-    episodes = finished_episodes(worker.collect(None, 75), task)
+    rollout = worker.collect(None, 75)
+    episodes = finished_episodes(rollout, task)
+    assert np.asarray(rollout.terminal)[-1].all() and not np.asarray(rollout.truncated).any()
     untouched = episodes["episode/links_at_removal"] == 0
     assert untouched.any()
     assert not episodes["episode/success"][untouched].any()
@@ -185,7 +187,7 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(bank, end_when_fal
     )
     found[:, 0, 0] = True
     advance = _advance(env, Action(state.q_target, state.u_target))
-    terminal = []
+    terminal, truncated = [], []
     for step in range(1, 91):
         position = np.array(after.object_position)
         position[1, 2] -= 0.06 if step > 80 else 0.0
@@ -194,8 +196,11 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(bank, end_when_fal
         shown = after._replace(object_position=position, contact_found=found, contact_force=pressed)
         state, transition = advance(state, shown)
         terminal.append(np.asarray(transition.terminal))
+        truncated.append(np.asarray(transition.truncated))
     finished = dict(zip(episode_fields(task), np.asarray(state.finished).T, strict=True))
     np.testing.assert_array_equal(np.argmax(terminal, 0) + 1, ends)
+    # The clock ends both episodes at step 90: of an object that is up it is truncation, of a fallen one it is not.
+    np.testing.assert_array_equal(np.argwhere(truncated), [[89, 0]])
     np.testing.assert_array_equal(finished["episode/success"], [1.0, 1.0])
     np.testing.assert_array_equal(finished["episode/held"], [1.0, 0.0])
     np.testing.assert_allclose(finished["episode/force_sum"], [3.0, 3.0], rtol=1e-5)
@@ -258,6 +263,7 @@ def test_an_environment_that_goes_on_keeps_its_contacts_when_another_restarts(ba
     )
     rollout = worker.collect(None, 7)
     flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation
+    assert np.argwhere(rollout.truncated).tolist() == [[4, 0]]
     touching = np.asarray(rollout.observation)[..., flags : flags + len(HAND.links)].all(-1)
     assert np.asarray(rollout.terminal)[:, 0].tolist() == [False] * 4 + [True, False, False]
     # World 0 begins anew at step 5 and has not touched yet; in the very first step nobody has.

@@ -14,7 +14,7 @@ from common.config import SensingConfig, TaskConfig
 from common.hands import get_hand
 from common.objects import procedural
 from common.policy.bundle import full_layout
-from common.task import observation
+from common.task import observation, privileged
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(0, "cylinder")]
@@ -38,8 +38,9 @@ def worker(task):
 
     physics = NativePhysics(HAND, task, OBJECTS, 1)
     return RolloutWorker(
-        HAND, task, physics, bank(), close, batch=BATCH, seed=0, half_precision=False, traced=slice(None), taught=True
-    )
+        HAND, task, physics, bank(), close, batch=BATCH, seed=0, half_precision=False, traced=slice(None), taught=True,
+        privileged=OBJECTS,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +82,23 @@ def test_a_teacher_sees_all_beside_a_student(late):
         elif field.name == "object_displacement":
             away = np.linalg.norm(rollout.trace.object_position[:-1] - running_start(late), axis=-1)
             np.testing.assert_allclose(np.linalg.norm(part, axis=-1), away, atol=1e-6)
+
+
+def test_the_critic_sees_the_trackers_and_the_true_state(late):
+    running, rollout = late
+    task = dataclasses.replace(TASK, observation="tracked", sensing=SensingConfig(delay=(0.03, 0.03)))
+    names = [name for name, _ in privileged.layout(HAND, task)]
+    size = sum(size for _, size in privileged.layout(HAND, task))
+    assert rollout.privileged.shape == (18, BATCH, size) and rollout.last_privileged.shape == (BATCH, size)
+    numbers = dict(zip(names, np.moveaxis(rollout.privileged, -1, 0), strict=False))
+    np.testing.assert_array_equal(numbers["delay"], DELAY)
+    np.testing.assert_array_equal(numbers["period"], 1.0)
+    np.testing.assert_allclose(numbers["mass"], OBJECTS[0].mass, rtol=1e-6)
+    # 16 steps of approach, then the hold's four run down.
+    np.testing.assert_allclose(numbers["hold_remaining"][:, 0], [1.0] * 17 + [0.75])
+    np.testing.assert_array_equal(rollout.privileged[..., len(names) - 1 :], rollout.teacher_observation)
+    scene = running.env.privileged(running.state)
+    np.testing.assert_allclose(rollout.last_privileged[:, len(names) - 1 :], observation.observe(scene), atol=1e-6)
 
 
 def running_start(late):

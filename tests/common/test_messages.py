@@ -118,6 +118,7 @@ def test_zeros_have_the_forms_sizes_and_dtypes():
         "log_probability": ((T, 3 * B), "float32"),
         "reward": ((T, 3 * B), "float32"),
         "terminal": ((T, 3 * B), "bool"),
+        "truncated": ((T, 3 * B), "bool"),
         "last_observation": ((3 * B, D), "float32"),
     }
 

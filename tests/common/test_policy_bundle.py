@@ -168,3 +168,30 @@ def test_spec_of_the_real_task():
     spec = bundles.policy_spec(config.task, config.network)
     assert (spec.hand, spec.action_size) == ("human", 26)
     network.check_layout(spec.layout)
+
+
+def test_a_bundle_says_what_its_critic_sees(bundle, tmp_path):
+    seen = (("mass", 1), ("observation", 4))
+    statistics = Statistics(np.float64(3), np.arange(5.0), np.ones(5))
+    wide = bundles.with_critic_of(dataclasses.replace(SPEC, privileged=seen), bundle)
+    assert wide.spec.schema == bundle.spec.schema and wide.spec.privileged_size == 5
+    bundles.save(dataclasses.replace(wide, privileged=statistics), tmp_path / "p")
+    loaded = bundles.load(tmp_path / "p")
+    assert loaded.spec.privileged == seen
+    np.testing.assert_array_equal(loaded.privileged.mean, statistics.mean)
+    raw = np.random.default_rng(1).normal(size=(5, 17)).astype(np.float16)
+    same = [np.asarray(bundles.mean_action(LAYOUT, one.inference_parameters, raw)) for one in (bundle, loaded)]
+    np.testing.assert_array_equal(*same)
+    message = wide.to_message()
+    for wrong in ([["mass", -5]], [["mass", 1 << 20]], [["mass", 4]], [["mass"]], 7):
+        with pytest.raises(CongraspError, match=r"p\.safetensors"):
+            PolicyBundle.from_message(Message(message.arrays, {**message.meta, "privileged": wrong}), "p.safetensors")
+
+
+def test_a_policy_of_before_privileged_critics_has_a_critic_of_the_observation(bundle):
+    message = bundle.to_message()
+    network_meta = {name: value for name, value in message.meta["network"].items() if name != "privileged_critic"}
+    meta = {name: value for name, value in message.meta.items() if name != "privileged"}
+    older = PolicyBundle.from_message(Message(message.arrays, {**meta, "network": network_meta}))
+    assert older.spec.privileged == () and not older.spec.network.privileged_critic and older.privileged is None
+    assert older.spec.schema == bundle.spec.schema

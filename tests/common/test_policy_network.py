@@ -102,3 +102,21 @@ def test_samples_have_the_gaussians_moments():
 def test_foreign_layouts_are_refused(layout):
     with pytest.raises(CongraspError, match="layout"):
         network.init(0, layout, ACTIONS, CONFIG)
+
+
+def test_privileged_inputs_reach_the_critic_alone(params):
+    wide = network.init(0, LAYOUT, ACTIONS, CONFIG, 3)
+    jax.tree.map(np.testing.assert_array_equal, wide["actor"], params["actor"])
+    x, inputs = np.ones((2, SIZE), np.float32), np.zeros((2, 3), np.float32)
+    inputs[1, 2] = 1.0
+    assert len(wide["critic"]["trunk_0"]["kernel"]) == len(params["critic"]["trunk_0"]["kernel"]) + 3
+    first, second = network.value(wide, LAYOUT, x, inputs)
+    assert first != second
+
+
+def test_new_privileged_inputs_leave_a_critic_s_estimates_unchanged(params):
+    rng = np.random.default_rng(0)
+    x, inputs = rng.normal(size=(5, SIZE)).astype(np.float32), rng.normal(size=(5, 3)).astype(np.float32)
+    wide = network.with_privileged(params, 0, 3)
+    np.testing.assert_allclose(network.value(wide, LAYOUT, x, inputs), network.value(params, LAYOUT, x), rtol=1e-5)
+    jax.tree.map(np.testing.assert_array_equal, network.with_privileged(wide, 3, 0), jax.device_get(params))

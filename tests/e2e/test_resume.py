@@ -36,13 +36,18 @@ def rollout(number, bundle):
     observation = rng.uniform(-1.0, 1.0, (STEPS + 1, WORLDS, size)).astype(
         np.float16
     )  # what every entry of a task can be
+    privileged = sum(width for _, width in bundle.meta["privileged"])
+    inputs = rng.uniform(0.0, 1.0, (STEPS + 1, WORLDS, privileged)).astype(np.float16)
     arrays = {
         "observation": observation[:-1],
+        "privileged": inputs[:-1],
+        "last_privileged": inputs[-1],
         "last_observation": observation[-1],
         "action": rng.normal(size=(STEPS, WORLDS, bundle.meta["action_size"])).astype(np.float32),
         "log_probability": rng.normal(-40.0, 1.0, size=(STEPS, WORLDS)).astype(np.float32),
         "reward": rng.normal(size=(STEPS, WORLDS)).astype(np.float32),
-        "terminal": rng.random((STEPS, WORLDS)) < 0.3,
+        "terminal": (terminal := rng.random((STEPS, WORLDS)) < 0.3),
+        "truncated": terminal & (rng.random((STEPS, WORLDS)) < 0.5),
     }
     who = {"actor": "a", "incarnation": "01", "sequence": number, "ticket": ""}
     return Message(arrays, {**who, **{name: bundle.meta[name] for name in ("version", "epoch", "schema")}, "steps": 8})

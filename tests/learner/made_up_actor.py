@@ -51,13 +51,17 @@ class MadeUpActor(threading.Thread):
                 observation[:-1],
                 jax.random.PRNGKey(len(self.versions)),
             )
+            inputs = rng.uniform(0.0, 1.0, (5, 2, bundle.spec.privileged_size)).astype(np.float16)
             recorded = {
+                "privileged": inputs[:-1],
+                "last_privileged": inputs[-1],
                 "observation": observation[:-1],
                 "last_observation": observation[-1],
                 "action": np.asarray(action),
                 "log_probability": np.asarray(log_probability),
                 "reward": self.reward * rng.normal(size=(4, 2)).astype(np.float32),
-                "terminal": rng.random((4, 2)) < 0.3,
+                "terminal": (terminal := rng.random((4, 2)) < 0.3),
+                "truncated": terminal & (rng.random((4, 2)) < 0.5),
             }
             arrays = {name: recorded[name] for name in names} | {
                 "episode/success": np.array([0.0, 1.0, 1.0, 1.0], np.float32),

@@ -40,6 +40,36 @@ def test_the_last_value_counts_only_where_the_chunk_is_cut():
     np.testing.assert_allclose(advantage[:, 1], [1.5, 1.0])
 
 
+def test_a_truncated_step_bootstraps_from_the_value_it_was_acted_on_and_cuts_the_chain():
+    # gamma 0.5, lambda 0.5; both worlds end an episode at step 1, and in world 0 the clock did.
+    reward = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]], np.float32)
+    value = np.array([[0.5, 0.5], [1.0, 1.0], [1.5, 1.5]], np.float32)
+    terminal = np.array([[False, False], [True, True], [False, False]])
+    truncated = np.array([[False, False], [True, False], [False, False]])
+    advantage, returns = gae.advantages(reward, value, np.full(2, 2.0, np.float32), terminal, 0.5, 0.5, truncated)
+    # World 0: delta_1 = 2 + .5 * 1 - 1 = 1.5, A_0 = (1 + .5 * 1 - .5) + .25 * 1.5. World 1: delta_1 = 2 - 1 = 1.
+    expected = [[1.375, 1.25], [1.5, 1.0], [2.5, 2.5]]
+    np.testing.assert_allclose(advantage, expected, rtol=1e-6)
+    np.testing.assert_allclose(returns, np.array(expected) + value, rtol=1e-6)
+
+
+@hypothesis.settings(max_examples=25, deadline=None)
+@hypothesis.given(seed=st.integers(0, 10_000), gamma=st.floats(0.5, 1.0), gae_lambda=st.floats(0.0, 1.0))
+def test_truncation_adds_the_discounted_value_within_its_own_episode_alone(seed, gamma, gae_lambda):
+    rng = np.random.default_rng(seed)
+    reward, value = rng.normal(size=(2, 7, 3)).astype(np.float32)
+    terminal, marked = rng.random((2, 7, 3)) < 0.3
+    last = rng.normal(size=3).astype(np.float32)
+    cut, _ = gae.advantages(reward, value, last, terminal, gamma, gae_lambda)
+    bootstrapped, _ = gae.advantages(reward, value, last, terminal, gamma, gae_lambda, marked)
+    # A mark on a step that ends nothing is ignored; the others reach back to their episode's start, no further.
+    expected, reached = np.empty((7, 3)), np.zeros(3)
+    for t in reversed(range(7)):
+        reached = np.where(terminal[t], gamma * value[t] * marked[t], gamma * gae_lambda * reached)
+        expected[t] = reached
+    np.testing.assert_allclose(bootstrapped - cut, expected, atol=1e-4)
+
+
 @hypothesis.settings(max_examples=25, deadline=None)
 @hypothesis.given(seed=st.integers(0, 10_000), gamma=st.floats(0.5, 1.0))
 def test_lambda_one_is_the_discounted_sum_of_rewards(seed, gamma):

@@ -12,7 +12,7 @@ from common.policy import bundle as bundles
 from common.policy import network, normalizer
 from learner.algorithms import ppo
 from learner.algorithms.ppo import PPO
-from learner.algorithms.protocol import NonFiniteUpdate, TrainState
+from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
 from services.bench import toy
 
 ALGORITHM = PPO(toy.SPEC, toy.SETTINGS)
@@ -97,6 +97,31 @@ def test_moving_the_value_statistics_does_not_move_the_values():
     after, _ = frozen.update(state, batch)
     assert after.value.count > 0
     np.testing.assert_allclose(values(after), before, rtol=1e-4, atol=1e-4)
+
+
+def test_truncated_ends_have_the_td_errors_of_both_rules():
+    """With a critic of zeros but for its bias, V = 0.7 everywhere."""
+    state = fresh()
+    critic = jax.tree.map(jnp.zeros_like, state.params["critic"])
+    critic["output"] = {**critic["output"], "bias": jnp.array([0.7])}
+    state = state._replace(params={**state.params, "critic": critic})
+    batch = rollout(toy.bundle_of(state), 0)
+    _, none = step(state, batch)
+    assert none["truncated"] == none["td_error_truncated"] == none["td_error_truncated_as_terminal"] == 0.0
+    batch["truncated"][-1, :16] = True
+    reward, ended = batch["reward"], batch["reward"][-1, :16].mean()
+    errors = {}
+    for bootstrap in (True, False):
+        _, metrics = changed(bootstrap_truncated=bootstrap).update(fresh()._replace(params=state.params), batch)
+        # Episodes of ten steps, a quarter of which were truncated: one step of forty.
+        assert metrics["truncated"] == pytest.approx(1 / 40)
+        assert metrics["td_error_truncated"] == pytest.approx(ended + 0.9 * 0.7 - 0.7, abs=1e-5)
+        assert metrics["td_error_truncated_as_terminal"] == pytest.approx(ended - 0.7, abs=1e-5)
+        continues = np.full(reward.shape, 0.9, np.float32)
+        continues[-1, 16 * bootstrap :] = 0.0
+        errors[bootstrap] = np.std(reward + 0.7 * continues - 0.7)
+        assert metrics["td_error_std"] == pytest.approx(errors[bootstrap], abs=1e-5)
+    assert errors[True] != errors[False]
 
 
 @pytest.mark.parametrize(
@@ -220,3 +245,51 @@ def test_published_weights_outlive_the_next_update():
     step(state, rollout(bundle, 0))
     assert np.isfinite(np.asarray(bundle.params["actor"]["log_std"])).all()
     assert np.isfinite(np.asarray(bundle.inference_parameters.normalization.scale)).all()
+
+
+WIDE = dataclasses.replace(toy.SPEC, privileged=(("future", 1),))
+
+
+def with_future(batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Rewards that no observation predicts, and a privileged input that tells which world has which."""
+    sign = np.where(np.arange(batch["reward"].shape[1]) % 2, 1.0, -1.0).astype(np.float32)
+    inputs = np.broadcast_to(3.0 + 0.1 * sign, batch["reward"].shape)[..., None]
+    rewards = batch["reward"] + 2.0 * sign
+    return {**batch, "reward": rewards, "privileged": inputs.astype(np.float16), "last_privileged": inputs[-1].copy()}
+
+
+def test_a_privileged_critic_explains_what_the_observation_does_not():
+    explained = {}
+    for spec in (toy.SPEC, WIDE):
+        algorithm = PPO(spec, toy.SETTINGS)
+        state = algorithm.init(0)
+        for seed in range(15):
+            batch = with_future(rollout(toy.bundle_of(state), seed))
+            state, metrics = algorithm.update(state, {name: batch[name] for name in algorithm.batch_schema})
+        explained[bool(spec.privileged)] = metrics["explained_variance"]
+    assert explained[True] > 0.8 > 0.4 > explained[False]
+    assert state.privileged.count == 15 * 64 * toy.STEPS
+    np.testing.assert_allclose(state.privileged.mean, [3.0], atol=1e-3)
+    np.testing.assert_array_equal(algorithm.policy(state).privileged.mean, state.privileged.mean)
+
+
+@pytest.mark.parametrize("field", ["privileged", "last_privileged"])
+def test_a_privileged_input_that_is_not_finite_is_named(field):
+    algorithm = PPO(WIDE, toy.SETTINGS)
+    state = algorithm.init(0)
+    batch = with_future(rollout(toy.bundle_of(state), 0))
+    batch[field].flat[5] = np.nan
+    with pytest.raises(NonFiniteUpdate, match=f"rollouts of update 1: {field}"):
+        algorithm.update(state, batch)
+
+
+def test_a_policy_without_privileged_inputs_begins_with_the_same_values():
+    state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 0))
+    wide = bundles.with_critic_of(WIDE, toy.bundle_of(state))
+    algorithm = PPO(WIDE, toy.SETTINGS)
+    begun = algorithm.init(0, Policy(wide.params, wide.observation, wide.value, wide.privileged))
+    assert begun.privileged.count == 0
+    batch = with_future(rollout(wide, 1))
+    _, wider = algorithm.update(begun, batch)
+    _, before = ALGORITHM.update(ALGORITHM.init(0, ALGORITHM.policy(state)), batch)
+    assert wider["value_mean"] == pytest.approx(before["value_mean"], rel=1e-4)

@@ -15,6 +15,7 @@ from common.objects import procedural
 from common.task.constraints import PAPER
 from common.task.metrics import episode_fields
 from common.wire.codec import Message
+from common.wire.schema import PRIVILEGED, RECORDED
 from learner.admission import Admission
 from learner.ranges import task_ranges
 
@@ -34,8 +35,10 @@ def _rollouts(*spreads):
 
     physics = NativePhysics(hand, TASK, objects, 2)
     bank = build_bank(hand, TASK, objects, 0)
-    worker = RolloutWorker(hand, TASK, physics, bank, noise, batch=WORLDS, seed=0, half_precision=True)
-    names = ("observation", "action", "log_probability", "reward", "terminal", "last_observation")
+    worker = RolloutWorker(
+        hand, TASK, physics, bank, noise, batch=WORLDS, seed=0, half_precision=True, privileged=objects
+    )
+    names = {**RECORDED, **PRIVILEGED}
     for spread in spreads:
         rollout = worker.collect(jnp.float32(spread), STEPS)
         yield Message({name: np.asarray(getattr(rollout, name)) for name in names} | finished_episodes(rollout, TASK))
@@ -49,6 +52,10 @@ def test_whatever_an_engine_produces_is_within_the_ranges():
         worst = Message({**rollout.arrays, "reward": rollout.arrays["reward"] * np.float32(1e15)})
         with pytest.raises(CongraspError, match="'reward' holds"):
             admission.check(worst)
+    heavy = np.array(rollout.arrays["privileged"])
+    heavy[0, 0, 0] = 3e3
+    with pytest.raises(CongraspError, match=r"'privileged\[0\]' holds"):
+        admission.check(Message({**rollout.arrays, "privileged": heavy}))
 
 
 def test_names_and_bounds_follow_from_the_task():

@@ -234,7 +234,7 @@ def _files(folder: pathlib.Path):
     task, sizes = TaskConfig(surface_points=4, trajectory_points=2), NetworkConfig((2,), 2)
     spec = bundles.policy_spec(task, sizes)
     seen = normalizer.empty((sum(size for _, size in spec.layout),))
-    params = network.init(0, spec.layout, spec.action_size, sizes)
+    params = network.init(0, spec.layout, spec.action_size, sizes, spec.privileged_size)
     bundles.save(PolicyBundle(spec, task, params, seen, normalizer.empty(), 7, "e", 1), folder / "policy")
 
 

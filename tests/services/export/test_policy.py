@@ -44,7 +44,7 @@ def bundle() -> PolicyBundle:
     spec = policy_spec(TaskConfig(), NetworkConfig(hidden=(32, 16), encoder=8))
     rng = np.random.default_rng(0)
     size = sum(width for _, width in spec.layout)
-    params = network.init(1, spec.layout, spec.action_size, spec.network)
+    params = network.init(1, spec.layout, spec.action_size, spec.network, spec.privileged_size)
     for layer in params["actor"]["network"].values():
         layer["bias"] = rng.normal(size=layer["bias"].shape).astype(np.float32)
     seen = Statistics(np.float64(1000), rng.normal(size=size), 1000 * rng.uniform(0.1, 4.0, size))
