@@ -14,6 +14,7 @@ from actors.initial import initial_hand, sample
 from common.config import TaskConfig
 from common.hands.kinematics import hand_center, keypoints, link_transforms
 from common.task.bank import ConstraintBank
+from common.task.constraints import optional
 from common.task.constraints.heading import heading_wrist_pose
 from common.task.constraints.priority import resolve
 from common.task.constraints.trajectory import closing
@@ -183,7 +184,7 @@ def test_heading_guidance_and_reward_know_one_center(dynamic, on):
     """
     task = dataclasses.replace(TASK, dynamic_center=dynamic)
     state, surface, goal = scene(21)
-    goal, q = _begun(surface, goal, {name: np.full(4, name in on) for name in ("affordance", "pose", "trajectory")})
+    goal, q = _begun(surface, goal, {c.name: np.full(4, c.name in on) for c in optional(TASK)})
     if on == {"trajectory"}:
         q = jnp.tile(closing(HAND), (4, 1))
     wrist = goal["trajectory"] if "trajectory" in on else goal["pose"] if on else None
