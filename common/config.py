@@ -268,7 +268,7 @@ class PPOConfig:
     """Share of the run's updates, its last ones, over which `kl_target` falls linearly to a tenth and the action's
     standard deviation to `final_std`, so that the policy settles; 0 keeps both."""
     final_std: float = 0.1
-    """Standard deviation of the action at the end of `settling`, in units of action. With n updates left, one caps it
+    """Standard deviation of the action at the end of `settling`, in units of action. With n updates left, it is capped
     at std (final_std / std)^(1/n): a geometric fall. Smaller deviations stay; 0 sets no cap."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
