@@ -7,6 +7,7 @@ every actor that connects, so that an actor needs no other argument than an addr
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
@@ -290,8 +291,11 @@ class PPOConfig:
     kl_target: float = 0.012
     """The rate falls above twice this and rises below half of it."""
     settling: float = 0.0
-    """Share of the run's updates, its last ones, over which `kl_target` falls linearly to a tenth, so that the policy
-    settles; 0 keeps it."""
+    """Share of the run's updates, its last ones, over which `kl_target` falls linearly to a tenth and the action's
+    standard deviation to `final_std`, so that the policy settles; 0 keeps both."""
+    final_std: float = 0.1
+    """Standard deviation of the action at the end of `settling`, in units of action. With n updates left, it is capped
+    at std (final_std / std)^(1/n): a geometric fall. Smaller deviations stay; 0 sets no cap."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     value_coefficient: float = 0.5
@@ -305,8 +309,20 @@ class PPOConfig:
 
     def kl_target_at(self, version: int, updates: int) -> float:
         """The KL target of the update of this version, in a run of so many updates."""
-        settled = 1.0 - (updates - version) / (self.settling * updates) if self.settling and updates else 0.0
-        return self.kl_target * (1.0 - 0.9 * min(max(settled, 0.0), 1.0))
+        return self.kl_target * (1.0 - 0.9 * min(max(self._settled(version, updates), 0.0), 1.0))
+
+    def noise_kept_at(self, version: int, updates: int) -> float:
+        """Share k of log(std / final_std) that the update of this version keeps at most; infinity before `settling`.
+
+        With n updates left k = 1 - 1/n. After j of m updates std is at most std_0^(1 - j/m) final_std^(j/m).
+        """
+        if self.final_std <= 0.0 or not self.settling or self._settled(version, updates) < 0.0:
+            return math.inf
+        return 1.0 - 1.0 / max(updates - version, 1)
+
+    def _settled(self, version: int, updates: int) -> float:
+        """Share of `settling` before the update of this version; negative before it begins."""
+        return 1.0 - (updates - version) / (self.settling * updates) if self.settling and updates else 0.0
 
 
 @dataclasses.dataclass(frozen=True)

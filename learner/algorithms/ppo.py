@@ -133,7 +133,10 @@ class PPO:
             privileged=normalizer.privileged_affine(frozen["privileged"]) if "privileged" in frozen else None,
             returns=normalizer.value_affine(state.value),
             hyper={name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)}
-            | {"kl_target": config.kl_target_at(state.version, self._updates)},
+            | {
+                "kl_target": config.kl_target_at(state.version, self._updates),
+                "noise_kept": config.noise_kept_at(state.version, self._updates),
+            },
         )
         learnt, returns, failure, scalars = _optimise(
             *shard(state[:_ON_DEVICE], mesh),
@@ -309,6 +312,7 @@ def _program(
         layout,
         minibatches,
     )
+    moved = _settle(moved, params["actor"]["log_std"], hyper)
     kl = jnp.mean(terms.kl[-1])
     failure = jnp.where((failure == _FINE) & (kl > _UNREASONABLE_KL), len(_CHECKED) - 1, failure)
     metrics = {name: jnp.mean(term) for name, term in terms._asdict().items()}
@@ -421,6 +425,17 @@ def _first_failure(failure: Array, offset: int, *terms: Array) -> Array:
     bad = jnp.stack([~jnp.all(jnp.isfinite(term)) for term in terms])
     found = jnp.where(jnp.any(bad), offset + jnp.argmax(bad).astype(jnp.int32), _FINE)
     return jnp.where(failure == _FINE, found, failure)
+
+
+def _settle(params: Params, log_std_before: Array, hyper: dict[str, Any]) -> Params:
+    """The parameters with log std at most log f + k max(log std_0 - log f, 0).
+
+    f is `PPOConfig.final_std`, k `PPOConfig.noise_kept_at` and std_0 the deviation before the update.
+    """
+    final, kept, log_std = jnp.log(hyper["final_std"]), hyper["noise_kept"], params["actor"]["log_std"]
+    ceiling = final + kept * jnp.maximum(log_std_before - final, 0.0)
+    log_std = jnp.where(kept <= 1.0, jnp.minimum(log_std, ceiling), log_std)
+    return {**params, "actor": {**params["actor"], "log_std": log_std}}
 
 
 def _adapt_rate(rate: Array, kl: Array, hyper: dict[str, Array]) -> Array:

@@ -127,7 +127,8 @@ def heard(monkeypatch):
             )  # fmt: skip
             algorithm = make_algorithm(SPEC, CONFIG)
             policy = jax.device_get(algorithm.policy(algorithm.init(0)))
-            hub.publish_weights(PolicyBundle(SPEC, CONFIG.task, *policy, 0, "e", 0).to_message(), 0)
+            bundle = PolicyBundle(spec=SPEC, task=CONFIG.task, version=0, run_id="e", transitions=0, **policy._asdict())
+            hub.publish_weights(bundle.to_message(), 0)
             actor = threading.Thread(
                 target=process.run_actor,
                 args=(peer,),

@@ -140,6 +140,37 @@ def test_the_target_falls_to_a_tenth_over_the_last_updates():
     assert PPOConfig(kl_target=0.01).kl_target_at(1000, 1000) == 0.01
 
 
+def test_the_ceiling_of_the_noise_falls_geometrically():
+    """From 0.8 to 0.1 in three updates: halves. What is below the ceiling stays, and nothing is capped before."""
+    settings = PPOConfig(settling=0.3, final_std=0.1)
+    kept = [settings.noise_kept_at(version, 10) for version in (0, 6, 7, 8, 9, 10)]
+    np.testing.assert_allclose(kept, [np.inf, np.inf, 2 / 3, 1 / 2, 0.0, 0.0])
+    assert PPOConfig(final_std=0.1).noise_kept_at(10, 10) == np.inf
+    assert PPOConfig(settling=0.3, final_std=0.0).noise_kept_at(9, 10) == np.inf
+    log_std, found = jnp.log(jnp.array([0.8, 0.8, 0.05])), []
+    for share in kept[1:5]:
+        # The update would raise the first and the last deviation by a half, and lower the second to 0.3.
+        risen = jnp.log(jnp.array([1.2, 0.3, 0.075])) if not found else log_std
+        hyper = {"final_std": 0.1, "noise_kept": share}
+        log_std = ppo._settle({"actor": {"log_std": risen}}, log_std, hyper)["actor"]["log_std"]
+        found.append(np.exp(log_std))
+        log_std = jnp.log(jnp.array([0.8, 0.3, 0.05])) if len(found) == 1 else log_std
+    np.testing.assert_allclose(found[0], [1.2, 0.3, 0.075], rtol=1e-5)
+    expected = [[0.4, 0.1 * 3 ** (2 / 3), 0.05], [0.2, 0.1 * 3 ** (1 / 3), 0.05], [0.1, 0.1, 0.05]]
+    np.testing.assert_allclose(found[1:], expected, rtol=1e-5)
+
+
+def test_the_last_update_of_a_run_that_settles_leaves_the_final_noise():
+    settings, batch = dataclasses.replace(toy.SETTINGS, settling=0.5, final_std=0.2), rollout(toy.bundle_of(fresh()), 0)
+    stds = {}
+    for version in (3, 4, 7):
+        moved, metrics = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
+        stds[version] = metrics["action_std"]
+        np.testing.assert_allclose(np.exp(moved.params["actor"]["log_std"]), metrics["action_std"], rtol=1e-6)
+    assert stds[3] > 0.5 and stds[7] == pytest.approx(0.2, rel=1e-5)
+    assert stds[4] <= 0.6 * (0.2 / 0.6) ** 0.25 * (1 + 1e-6)
+
+
 def test_a_run_that_settles_lowers_its_rate_in_its_last_update():
     """By the divergence that the rate of the first update suits."""
     batch = rollout(toy.bundle_of(fresh()), 0)
