@@ -3,11 +3,11 @@
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
-from common.task.constraints import CONSTRAINTS
-from services.evaluate.paper import PaperLine, paper_lines
-from services.evaluate.scores import Row
-from services.reproduce.evaluation import Result
-from services.reproduce.plan import Policy
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.services.evaluate.paper import PaperLine, paper_lines
+from congrasp.services.evaluate.scores import Row
+from congrasp.services.reproduce.evaluation import Result
+from congrasp.services.reproduce.plan import Policy
 
 SUCCESS = "success"
 UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from services.evaluate.paper import TABLES
-from services.reproduce.comparison import SUCCESS, UNITS, Cell
+from congrasp.services.evaluate.paper import TABLES
+from congrasp.services.reproduce.comparison import SUCCESS, UNITS, Cell
 
 COLUMNS = (
     ("constraint", ""),

@@ -2,11 +2,11 @@
 
 import pytest
 
-from common.objects.pool import HELD_OUT_SEED
-from common.objects.procedural import generate_many
-from common.policy import bundle as bundles
-from common.policy.pretrained import policy_file, pretrained_file
-from services.evaluate.evaluator import Evaluator
+from congrasp.common.objects.pool import HELD_OUT_SEED
+from congrasp.common.objects.procedural import generate_many
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import policy_file, pretrained_file
+from congrasp.services.evaluate.evaluator import Evaluator
 
 EPISODES = 24
 FAMILIES = ("bottle", "cylinder", "hammer", "ellipsoid")
