@@ -240,8 +240,11 @@ def headings_of(
             for headings, (cleared, _) in zip(sets, found, strict=True)
         ]
     )
-    # Reference poses are made at headings that some resting pose allows, where there are any.
-    chosen = [_some(rng, region.any(0)) for region in reachable]
+    chosen = [_spread(rng, region) for region in reachable]
+    at = [
+        np.stack([cleared[usable[r]].position[h] for r, h in zip(*some, strict=True)])
+        for some, (cleared, _) in zip(chosen, found, strict=True)
+    ]
     keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
     avoid = obj.non_graspable_points[keep]
     floats = {
@@ -249,10 +252,9 @@ def headings_of(
         "rest": rest,
         **{f"heading_{name}": np.stack([getattr(s, name) for s in sets]) for name in Headings._fields},
         "heading_back": np.take_along_axis(back, index, -1),
-        **{
-            f"chosen_{name}": np.stack([getattr(s, name)[c] for s, c in zip(sets, chosen, strict=True)])
-            for name in Headings._fields
-        },
+        "chosen_position": np.stack(at),
+        "chosen_direction": np.stack([s.direction[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
+        "chosen_cross": np.stack([s.cross[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
     }
     return {
         **{name: value.astype(np.float32) for name, value in floats.items()},
@@ -268,7 +270,12 @@ def _repeated(which: np.ndarray) -> np.ndarray:
     return np.resize(indices, HEADINGS) if len(indices) else np.zeros(HEADINGS, int)
 
 
-def _some(rng: np.random.Generator, which: np.ndarray) -> np.ndarray:
-    """(M,) random indices of what is true, of any where nothing is."""
-    candidates = np.flatnonzero(which) if which.any() else np.arange(len(which))
-    return rng.choice(candidates, POSES, replace=len(candidates) < POSES)
+def _spread(rng: np.random.Generator, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Resting poses (M,) and headings (M,) of reference poses, as many for each resting pose that allows any (R, H).
+
+    Where none does, every heading is as likely as another.
+    """
+    rests = np.flatnonzero(allowed.any(1)) if allowed.any() else np.arange(len(allowed))
+    rests = np.resize(rng.permutation(rests), POSES)
+    weights = allowed[rests] if allowed.any() else np.ones((POSES, allowed.shape[1]))
+    return rests, np.array([rng.choice(len(row), p=row / row.sum()) for row in weights])

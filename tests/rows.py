@@ -4,6 +4,7 @@ from congrasp.services.evaluate.paper import paper_row
 from congrasp.services.evaluate.scores import ERRORS, Row
 
 FORCES = {f"{name}_{of}": 1.0 for name in ("link_force", "force_sum", "torque_share") for of in ("mean", "p95")}
+FORCES |= dict.fromkeys(("force_peak_n", "force_mean_n"), 1.0)
 
 
 def row(constraint, success, low, high, *, hand="human", method="ours", group="", errors=None, margins=None, source=""):

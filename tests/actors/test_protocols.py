@@ -26,6 +26,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.task import plausibility
+from congrasp.common.task.constraints import CONSTRAINTS, optional
 from congrasp.common.task.types import Surface
 from congrasp.services.train.command import untrained
 from tests import draws, scripted
@@ -33,7 +34,14 @@ from tests import draws, scripted
 HAND = get_hand("human")
 WITHOUT_MESHES = set(protocols.ASSESSED) - {"hand_mesh_mm"}
 """What is measured of a hand whose file has no visual meshes."""
-TASK = TaskConfig(p_pose=0.0, p_trajectory=0.0, p_affordance=0.0, end_when_fallen=False)
+TASK = TaskConfig(
+    **{f"p_{constraint.name}": 0.0 for constraint in CONSTRAINTS if constraint.optional},
+    approach_steps=50,
+    back_off_range=(0.15, 0.15),
+    initial_speed=0.0,
+    preshape=False,
+    end_when_fallen=False,
+)
 OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "cylinder"])]
 BATCH = 2
 
@@ -93,10 +101,11 @@ def test_pushes_follow_one_another_along_the_axes_of_the_world():
 
 @functools.cache
 def start():
-    """Two objects at rest, with the hand far above them."""
+    """Two objects at rest, with the hand far above them and not quite aligned."""
     fresh = draws.sample(HAND, TASK, build_bank(HAND, TASK, OBJECTS, 0), jax.random.key(1), BATCH)
     rest = np.array([obj.rest_poses[0] for obj in OBJECTS], np.float32)
-    turns = Rotation.from_euler("xyz", [[180, 20, 0], [150, 0, 40]], degrees=True).as_quat(scalar_first=True)
+    aligned = Rotation.from_quat(fresh.reset_state.base_quaternion, scalar_first=True)
+    turns = (aligned * Rotation.from_euler("x", [[20], [-40]], degrees=True)).as_quat(scalar_first=True)
     state = fresh.reset_state._replace(
         object_index=np.arange(BATCH),
         object_position=rest[:, :3],
@@ -184,8 +193,8 @@ def lifted(action: np.ndarray, protocol: Protocol | None, steps: int):
 def test_a_lift_is_unseen_by_the_policy_and_takes_the_wrist_along():
     action = np.zeros((BATCH, len(HAND.joints) + 6), np.float32)
     masses = tuple(obj.mass for obj in OBJECTS)
-    still = lifted(action, None, 150)
-    moving = lifted(action, protocol(start=80, masses=masses), 150)  # when the wrist has come to its guidance
+    still = lifted(action, None, 215)
+    moving = lifted(action, protocol(start=145, masses=masses), 215)  # when the wrist has come to its guidance
     for (scene, features, frame, after), (other, others, none, _) in zip(moving, still, strict=True):
         assert not np.any(none.height)
         # What is seen is the same within half a millimetre: targets are held for a control step each.
@@ -272,24 +281,24 @@ def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
 
 
 def test_attempts_with_a_lift_end_higher_in_the_world():
-    task = dataclasses.replace(TASK, approach_steps=30, hold_steps=5)
+    task = dataclasses.replace(TASK, approach_steps=60, hold_steps=5)
     policy = untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,))))
     obj, count = OBJECTS[1], task.surface_points
     drawn = draws.sample(HAND, task, build_bank(HAND, task, [obj], 0), jax.random.key(0), 2)
     rest = np.concatenate([drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1)
     surface = Surface(np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1)))
-    asked = {name: np.zeros(2, bool) for name in ("affordance", "pose", "trajectory")}
+    asked = {constraint.name: np.zeros(2, bool) for constraint in optional(task)}
     attempts = Attempts(HAND, task, policy, hold=5, threads=1, lift=0.06)
     outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
     attempts.close()
     lift = protocols.lift_steps(task, 0.06)
-    assert attempts.steps == 30 + lift + 5 == len(outcome.trace.q)
+    assert attempts.steps == 60 + lift + 5 == len(outcome.trace.q)
     dt = task.control_dt
-    assert attempts.phases == {"grasp": 0.0, "lift": 30 * dt, "hold": pytest.approx((30 + lift) * dt)}
+    assert attempts.phases == {"grasp": 0.0, "lift": 60 * dt, "hold": pytest.approx((60 + lift) * dt)}
     assert set(outcome.metrics) > WITHOUT_MESHES
-    way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[29]
-    slid = (outcome.trace.u[-1] - outcome.trace.u[29])[:, :3]
-    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[30:, :, 2], axis=0).max() < 0.02)
+    way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[59]
+    slid = (outcome.trace.u[-1] - outcome.trace.u[59])[:, :3]
+    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[60:, :, 2], axis=0).max() < 0.02)
     # The untrained hand leaves the object, and the table under it stands: it is where it was, and not held.
     assert outcome.trace.table.all() and not outcome.metrics["held"].any()
     assert (outcome.trace.object_position[-1, :, 2] > 0.5 * rest[:, 2]).all()

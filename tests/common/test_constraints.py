@@ -257,9 +257,10 @@ def _same(some: InitialConditions, more: InitialConditions, but: str, moved: np.
     if moved is not None:
         position = np.where(moved[:, None], some.goal["heading"].position, more.goal["heading"].position)
         base = np.where(moved[:, None], some.reset_state.base_position, more.reset_state.base_position)
+        q = np.where(moved[:, None], some.reset_state.q, more.reset_state.q)  # opened to the width at the heading
         more = more._replace(
             goal=more.goal.replace("heading", position=position),
-            reset_state=more.reset_state._replace(base_position=base),
+            reset_state=more.reset_state._replace(base_position=base, q=q),
         )
     goals = [dict(part.goal.flat().items()) for part in (some, more)]
     actives = [part.goal.active for part in (some, more)]

@@ -182,7 +182,7 @@ def test_a_pinch_begins_and_ends_at_the_heading(seed):
     """The wrist is placed by the set's centre, so that a hand that only moves forward arrives with no error."""
     goal = dataclasses.replace(scene(seed)[2], active=active("fingers"))
     q = np.tile(HAND.q_open, (4, 1))
-    position, quaternion = HEADING.initial_wrist(HAND, TASK, goal, q)[1:]
+    position, quaternion = HEADING.initial_wrist(HAND, np.full(4, TASK.back_off), goal, q)[1:]
     position = position + TASK.back_off * goal["heading"].direction
     points = kinematics.keypoints(HAND, kinematics.link_transforms(HAND, q))
     center = hand_center(HAND, points, goal["fingers"].allowed)

@@ -19,7 +19,7 @@ from congrasp.common.wire.schema import PRIVILEGED, RECORDED
 from congrasp.learner.admission import Admission
 from congrasp.learner.ranges import task_ranges
 
-TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, hold_steps_max=40)
+TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, approach_steps=50, hold_steps_max=40)
 RANGES = task_ranges(TASK, CurriculumConfig())
 WORLDS, STEPS = 8, 90
 

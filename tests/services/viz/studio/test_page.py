@@ -235,7 +235,7 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     for name in ("index", "middle"):
         page.uncheck(f"#other-constraints label:has-text('{name}') input")
         eventually(lambda name=name: name not in fingers())
-    page.wait_for_selector("#trouble:has-text('fewer than two fingers. Allow two or more')")
+    page.wait_for_selector("#trouble:has-text('needs the thumb and another finger. Allow both')")
     assert page.is_disabled("#grasp")
     page.uncheck("[data-ask=fingers]")
     page.wait_for_selector("[data-mask=fingers][data-on=false]")

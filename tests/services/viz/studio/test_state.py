@@ -40,6 +40,7 @@ def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
 
 
 def test_the_hand_begins_before_the_arrow_and_aligned_with_it(studio: Studio) -> None:
+    studio.task = dataclasses.replace(studio.task, preshape=False)
     hand, rest = studio.hand, MUG.rest_poses[0]
     start = describe(studio)["start"]
     wrist, turn = np.array(start["position"][0]), matrix(np.array(start["quaternion"][0]))
