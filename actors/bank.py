@@ -211,7 +211,7 @@ def headings_of(
       hand: what must stay clear of the table.
 
     Raises:
-      CongraspError: it has no heading that the hand can reach in any resting pose.
+      CongraspError: it is too wide (`TooWideError`), or can be approached in none of its resting poses.
     """
     rng = np.random.default_rng(seed)
     inward, width = scale * INWARD, max_width(hand, scale)
@@ -230,7 +230,7 @@ def headings_of(
     if len(usable) == 0:
         raise CongraspError(
             f"The object '{obj.name}' cannot be approached in any of its resting poses.",
-            f"Scale it so that some part is narrower than {100 * width:.0f} cm, or leave it out.",
+            "Scale it, or leave it out.",
         )
     reachable, rest = reachable[:, usable], obj.rest_poses[usable]
     index = np.array([[_repeated(row) for row in region] for region in reachable])

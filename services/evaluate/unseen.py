@@ -24,6 +24,7 @@ from congrasp.common.engines import ENGINES, PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.common.files import write_atomically
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.outline import Outline, outline
 from congrasp.common.hands.spec import Hand
 from congrasp.common.inputs import read_file
 from congrasp.common.objects import procedural
@@ -244,7 +245,8 @@ def _with_bank(
             return objects, build_bank(hand, task, filled, seed)
         except CongraspError as error:
             scale, seeds = object_scale(hand, task), [(seed, n) for n in range(size)]
-            fine = parallel_map(_approachable, [task] * size, filled, seeds, [scale] * size)
+            own = itertools.repeat(outline(hand), size)
+            fine = parallel_map(_approachable, [task] * size, filled, seeds, [scale] * size, own)
             if all(fine):
                 raise
             _log.warning("%s", error)
@@ -253,10 +255,10 @@ def _with_bank(
     return [], None
 
 
-def _approachable(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float) -> bool:
-    """Whether an object has a heading."""
+def _approachable(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, own: Outline) -> bool:
+    """True if an object has a heading for the hand with this outline."""
     try:
-        headings_of(task, obj, seed, None, scale)
+        headings_of(task, obj, seed, None, scale, own)
     except CongraspError:
         return False
     return True

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from congrasp.common.errors import TooWideError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import CLOSURES
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
@@ -122,16 +123,18 @@ def test_the_first_surface_that_the_hand_meets_is_the_headings():
         assert not ((aside < 0.0099) & (depth < -INWARD - 0.0151) & (depth > -0.169)).any()
 
 
-def test_few_headings_are_repeated_and_none_falls_back_to_the_narrowest():
+def test_few_headings_are_repeated():
     obj = generate(0, "ball")
-    fallback = sample_headings(obj, np.random.default_rng(0), use_affordance=False, max_width=1e-3, attempts=1)
-    assert fallback.position.shape == (256, 3)
-    assert len(np.unique(fallback.position, axis=0)) == 20
-    np.testing.assert_allclose((fallback.direction * fallback.cross).sum(-1), 0, atol=1e-5)
-    tight = sample_headings(obj, np.random.default_rng(0), use_affordance=False, max_width=0.055, attempts=1)
+    tight = sample_headings(obj, np.random.default_rng(0), use_affordance=False, max_width=0.073, attempts=1)
+    assert tight.position.shape == (256, 3)
     different = len(np.unique(tight.position, axis=0))
     assert 0 < different < 256
-    np.testing.assert_array_equal(tight.position[different : 2 * different][:10], tight.position[:10])
+    np.testing.assert_array_equal(tight.position[different : 2 * different], tight.position[:different])
+
+
+def test_what_is_wider_than_the_hand_opens_has_no_heading():
+    with pytest.raises(TooWideError, match=r"^'ball_0' is too wide: 7\.\d cm .* which opens to 5\.0 cm"):
+        sample_headings(generate(0, "ball"), np.random.default_rng(0), use_affordance=False, max_width=0.05)
 
 
 def test_the_smaller_part_of_a_ball_cannot_be_held_alone():

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from congrasp.common.errors import TooWideError
 from congrasp.common.hands.outline import CENTER, Outline, depth_below
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
@@ -72,7 +73,8 @@ def sample_headings(
       paper's regions are those that people held, and can be held).
 
     If fewer than `count` remain after `attempts` batches, those found are repeated. If none remains on the whole
-    surface, the candidates that break the fewest of the rules but the first are taken, among them the narrowest.
+    surface, the candidates that break the fewest of the rules but the first are taken, among them the narrowest; the
+    first one holds.
 
     Args:
       obj: the object.
@@ -91,6 +93,9 @@ def sample_headings(
 
     Returns:
       H headings, float32; None if the graspable region cannot be approached.
+
+    Raises:
+      TooWideError: the object is wider than `max_width` wherever it can be approached.
     """
     avoid = obj.non_graspable_points & use_affordance
     sources = _sources(obj, avoid, along)
@@ -118,6 +123,10 @@ def sample_headings(
         last = _last_resort(points, avoid, position, direction, faults, rng, lenient=lenient)
         if last is None:
             return None
+        width = local_width(last, points)
+        if not avoid.any() and width.min() > max_width:
+            raise TooWideError(obj.name, width.min(), max_width)
+        last = Headings(*(part[width <= max(max_width, width.min())] for part in last))
         found.append(last)
     pool = Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     chosen = np.resize(np.arange(len(pool.position)), count)
