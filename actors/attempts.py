@@ -45,7 +45,15 @@ class Attempts:
     """A policy that grasps one object after another, each in several ways at once, by its mean action."""
 
     def __init__(
-        self, hand: Hand, task: TaskConfig, bundle: PolicyBundle, *, hold: int, threads: int, lift: float = 0.0
+        self,
+        hand: Hand,
+        task: TaskConfig,
+        bundle: PolicyBundle,
+        *,
+        hold: int,
+        threads: int,
+        lift: float = 0.0,
+        speed: float = 0.0,
     ):
         """Compiles nothing yet.
 
@@ -56,12 +64,14 @@ class Attempts:
           hold: control steps without the table, or after the lift.
           threads: threads of the physics.
           lift: metres by which the hand goes up after the approach; the table then stands to the end.
+          speed: of the wrist along the heading at the start, m/s.
         """
+        self.speed = speed
         self._lift = lift
         self._hand, self._task, self._bundle = hand, task, bundle
         self._hold, self._threads = protocols.lift_steps(task, lift) + hold, threads
         self._worker: RolloutWorker | None = None
-        self._initial = jax.jit(functools.partial(initial.given, hand, task, hold=self._hold))
+        self._initial = jax.jit(functools.partial(initial.given, hand, task, hold=self._hold, speed=speed))
 
     @property
     def steps(self) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.attempts import Attempts, Outcome
-from congrasp.actors.initial import RequestedEpisodes
+from congrasp.actors.initial import RequestedEpisodes, handover_speed
 from congrasp.actors.protocols import ASSESSED, SURVIVAL
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, ContradictionError
@@ -130,7 +130,15 @@ class Grasper:
         self._compiled = False
         self._approach, self._lift = approach, lift
         hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
-        self._attempts = Attempts(self.hand, self.task, policy, hold=hold, lift=lift, threads=threads or cores())
+        self._attempts = Attempts(
+            self.hand,
+            self.task,
+            policy,
+            hold=hold,
+            lift=lift,
+            threads=threads or cores(),
+            speed=handover_speed(self.task) if approach else 0.0,
+        )
 
     def grasp(
         self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
@@ -244,7 +252,9 @@ class Grasper:
         turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
         first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
         heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(arrays["goal/heading_direction"])
-        return plan_reach(self.hand, obj, rest, heading, first, self._approach, self.task.control_dt)
+        return plan_reach(
+            self.hand, obj, rest, heading, first, self._approach, self.task.control_dt, self._attempts.speed
+        )
 
 
 def grasp(
