@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from congrasp.actors import initial, protocols
+from congrasp.actors import initial
+from congrasp.actors import stress as protocols
 from congrasp.actors.env import metric_names
 from congrasp.actors.episode import episode_message
 from congrasp.actors.initial import RequestedEpisodes
@@ -36,7 +37,7 @@ class Outcome(NamedTuple):
     aligned: np.ndarray
     """(B,) bool."""
     metrics: dict[str, np.ndarray]
-    """(B,) each, by the names in `actors.env.metric_names` and those of `actors.protocols.assess`."""
+    """(B,) each, by the names in `actors.env.metric_names` and those of `actors.stress.assess`."""
     trace: Trace
     """(T, B, ...)."""
 

@@ -15,10 +15,10 @@ from congrasp.common.config import SensingConfig, TaskConfig
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.closure import MARGIN, preshape
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.bank import ConstraintBank, Draw
 from congrasp.common.task.constraints import known, optional
 from congrasp.common.task.constraints.force import least_force
 from congrasp.common.task.constraints.priority import Resolution, active_blocks, resolve
+from congrasp.common.task.sampling.bank import ConstraintBank, Draw
 from congrasp.common.task.sampling.headings import Headings, local_width
 from congrasp.common.task.sensing import Sensors, draw_sensors
 from congrasp.common.task.types import Array, Goal, Surface

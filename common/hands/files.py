@@ -17,7 +17,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.motors import motor_limits
 from congrasp.common.hands.spec import Hand, Solid, chain_of
-from congrasp.common.inputs import LONGEST_NAME, read_file
+from congrasp.common.io.inputs import LONGEST_NAME, read_file
 
 FORMAT = 1
 MAX_BYTES = 1 << 20

@@ -12,7 +12,7 @@ from congrasp.common.objects.families import BASIC, BUILDERS, HOUSEHOLD, Draft
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.surface import halves, mass_properties, sample_union
-from congrasp.common.parallel import parallel_map
+from congrasp.common.runtime.parallel import parallel_map
 
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)
 BASIC_FAMILIES = tuple(BASIC)

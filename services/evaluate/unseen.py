@@ -18,22 +18,22 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from congrasp.actors.bank import build_bank, headings_of
 from congrasp.common.config import TaskConfig
-from congrasp.common.engines import ENGINES, PhysicsName
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.outline import Outline, outline
 from congrasp.common.hands.spec import Hand
-from congrasp.common.inputs import read_file
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_file
 from congrasp.common.objects import procedural
 from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.pool import HELD_OUT_SEED, object_scale, scale_objects
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.parallel import parallel_map
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
-from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.runtime.parallel import parallel_map
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.build import build_bank, headings_of
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.evaluate.episodes import Episodes

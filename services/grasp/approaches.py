@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from congrasp.actors.bank import clear_of_table
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.outline import outline
 from congrasp.common.hands.spec import Hand
@@ -10,6 +9,7 @@ from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.sampling.build import clear_of_table
 from congrasp.common.task.sampling.headings import INWARD, above, max_width, sample_headings, within_reach
 
 

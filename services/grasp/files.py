@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
+from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.grasper import Grasp

@@ -13,17 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.attempts import Attempts, Outcome
 from congrasp.actors.initial import RequestedEpisodes, handover_speed
-from congrasp.actors.protocols import ASSESSED, SURVIVAL
+from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.parallel import cores
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
+from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional, require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.task.types import Goal, Surface

@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
-from congrasp.common.inputs import file_name
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import file_name
 from congrasp.common.objects.procedural import MASS_RANGE
 from congrasp.common.objects.resting import rest_tilts
 from congrasp.common.objects.spec import GraspObject

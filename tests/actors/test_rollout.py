@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.env import GraspEnv, episode_fields, metric_names
 from congrasp.actors.physics.engine import PhysicsState, where_environments
 from congrasp.actors.physics.native import NativePhysics
@@ -19,6 +18,7 @@ from congrasp.common.hands.kinematics import grasp_frame, hand_center, keypoints
 from congrasp.common.objects import procedural
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.observation import layout
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.types import CONTACTS_PER_LINK, Action
 from tests import draws
 

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.initial import InitialConditions, sample
 from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.errors import CongraspError
@@ -34,6 +33,7 @@ from congrasp.common.task.constraints.priority import active_blocks
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import GRASP, reward_terms, terms
+from congrasp.common.task.sampling.build import build_bank
 from tests.scenes import HAND, active, moved, scene
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)

@@ -15,13 +15,13 @@ from congrasp.common.hands import get_hand, kinematics
 from congrasp.common.policy.bundle import load
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.task import metrics
-from congrasp.common.task.bank import Draw
 from congrasp.common.task.constraints import PAPER, get_constraint
 from congrasp.common.task.constraints.fingers import FingersGoal, finger_sets, keypoint_weights
 from congrasp.common.task.features import features, scene_of
 from congrasp.common.task.geometry import hand_center
 from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import reward_terms, terms
+from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.types import Goal, Surface
 from tests.scenes import HAND, L, active, scene
 

@@ -73,12 +73,12 @@ def test_nothing_else_must_be_changed():
 
 def episodes(task):
     """Metrics of short episodes with it; it is sampled, observed, rewarded and measured in them."""
-    from congrasp.actors.bank import build_bank
     from congrasp.actors.physics.native import NativePhysics
     from congrasp.actors.rollout import RolloutWorker, finished_episodes
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
     from congrasp.common.task.observation import layout
+    from congrasp.common.task.sampling.build import build_bank
 
     hand, batch = get_hand("human"), 32
     objects = [procedural.generate(0, "box")]

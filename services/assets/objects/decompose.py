@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+import congrasp
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_PIECES
 from congrasp.services.assets.objects.pieces import DEPTH, GROWTH, deepest, merge, solid_hull
@@ -25,7 +26,7 @@ FALLBACK_LIMIT = 30.0
 """Seconds that V-HACD may take."""
 _MEMORY = 6 << 30  # bytes of address space
 _FINEST = 0.01  # the smallest threshold that CoACD takes, of half the longest side
-_ROOT = pathlib.Path(__file__).resolve().parents[3]
+_ROOT = pathlib.Path(congrasp.__file__).parents[1]
 
 
 class Decomposition(NamedTuple):

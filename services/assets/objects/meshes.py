@@ -14,13 +14,13 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import cache_folder
+from congrasp.common.io.files import cache_folder
 from congrasp.common.objects import shapes, store
 from congrasp.common.objects.procedural import MASS_RANGE
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.spec import Colours, GraspObject, Piece
 from congrasp.common.objects.surface import halves, mass_properties, sample_mesh
-from congrasp.common.parallel import cores
+from congrasp.common.runtime.parallel import cores
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.collision import convex_pieces
 from congrasp.services.assets.objects.colours import sample_colours

@@ -10,8 +10,8 @@ import trimesh
 from PIL import Image
 
 from congrasp.actors.attempts import Outcome
-from congrasp.actors.protocols import ASSESSED, SURVIVAL
 from congrasp.actors.rollout import Trace
+from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file

@@ -29,8 +29,8 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.metrics import ServerMetrics, exposed
-from congrasp.services.serve.client import PolicyClient
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.requests import Query
