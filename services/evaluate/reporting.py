@@ -5,14 +5,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from actors.physics import PhysicsName, resolve_physics
-from common.config import ObjectsConfig
 from common.engines import engine_title
 from common.errors import CongraspError
-from common.objects.pool import HELD_OUT_SEED, load_pool
 from common.parallel import cores
 from common.policy import bundle as bundles
 from services.assets.objects.named import objects_of
 from services.evaluate.evaluator import Evaluator
+from services.evaluate.exam import exam_pool
 from services.evaluate.failures import failure_sheets
 from services.evaluate.protocol import objects_label, two_seconds
 from services.evaluate.report import Commands, HandCheck, Picture, count_causes, curves_of, template, write_report
@@ -67,7 +66,7 @@ def report_on(
     policy, engine = bundles.load(file), resolve_physics(physics)
     names = known_rows(TABLES, policy.task)
     curves = list(curves_of(run_dir)) if run_dir else []
-    given = objects_of(objects, track=track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
+    given = objects_of(objects, track=track) if objects else exam_pool("figures", pool)
     track("Making constraints", None)
     held, threads = two_seconds(policy.task), cores()
     evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)

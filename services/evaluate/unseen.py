@@ -28,7 +28,7 @@ from common.hands.spec import Hand
 from common.inputs import read_file
 from common.objects import procedural
 from common.objects.distance import DistanceField, distance_field
-from common.objects.pool import HELD_OUT_SEED, object_scale, scale_objects
+from common.objects.pool import object_scale, scale_objects
 from common.objects.spec import GraspObject
 from common.parallel import parallel_map
 from common.policy.bundle import PolicyBundle, content_hash
@@ -37,6 +37,7 @@ from common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from services.assets.objects.named import ObjectAt, load_each, objects_at
 from services.evaluate.episodes import Episodes
 from services.evaluate.evaluator import MEASURED, STRESSED, batch_of, simulate
+from services.evaluate.exam import FAMILIES, Exam, first_seed
 from services.evaluate.plan import batches, plan_row
 from services.evaluate.protocol import protocol, two_seconds
 from services.evaluate.scores import Row, Sample, joined, object_groups, summarise
@@ -67,10 +68,11 @@ class Pools(NamedTuple):
     make: list[Callable[[], Loaded]]
 
 
-def procedural_pools(count: int, physics: PhysicsName, seed: int = HELD_OUT_SEED) -> Pools:
-    """At least `count` procedural objects of the seeds from `seed`, in pools of one size."""
+def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
+    """At least `count` procedural objects of an exam, in pools of one size."""
     number, size = _divided(count, _MOST[ENGINES[physics].on_device])
-    families = procedural.family_turns(number * size, seed)
+    seed = first_seed(exam, number * size)
+    families = procedural.family_turns(number * size, seed, FAMILIES)
 
     def make(start: int) -> Loaded:
         seeds = range(seed + start, seed + start + size)
@@ -308,7 +310,7 @@ def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
     for label, members in object_groups(sizes, masses, families):
         chosen = members[index]
         if chosen.any():
-            rows.append(row(sample=whole.where(chosen), group=label))
+            rows.append(row(sample=whole.where(chosen), pool=int(members.sum()), group=label))
     return rows
 
 

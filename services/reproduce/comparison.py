@@ -3,15 +3,12 @@
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
-from common.task.constraints import CONSTRAINTS
 from services.evaluate.paper import PaperLine, paper_lines
 from services.evaluate.scores import Row
 from services.reproduce.evaluation import Result
 from services.reproduce.plan import Policy
 
 SUCCESS = "success"
-UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
-"""Of errors, by their names in rows."""
 CAPTURED_DATA = {"captured": "GRAB and OakInk", "cross": "DexYCB"}
 CONDITIONS = (
     "MuJoCo stands in for the paper's simulator; contacts, friction, servos and the hands' models differ.",

@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from services.evaluate.paper import TABLES
-from services.reproduce.comparison import SUCCESS, UNITS, Cell
+from services.evaluate.scores import UNITS
+from services.reproduce.comparison import SUCCESS, Cell
 
 COLUMNS = (
     ("constraint", ""),

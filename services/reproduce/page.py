@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 from common.files import write_atomically
 from common.inputs import read_file
+from services.evaluate.cells import PLAUSIBILITY, RATES, plausibility_cells, rate_cells
 from services.evaluate.report import Picture, embedded, template
-from services.evaluate.scores import PLAUSIBILITY, RATES, Row, plausibility_cells, rate_cells
+from services.evaluate.scores import Row
 from services.reproduce.comparison import CONDITIONS, SUCCESS, Cell, unmatched
 from services.reproduce.evaluation import Result
 from services.reproduce.latex import latex

@@ -1,0 +1,33 @@
+"""Procedural objects of an exam: those that figures are made with, and those that development may look at."""
+
+from typing import Literal
+
+from common.config import ObjectsConfig
+from common.errors import CongraspError
+from common.objects import procedural
+from common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool
+from common.objects.spec import GraspObject
+
+Exam = Literal["figures", "development"]
+FAMILIES = ("all",)
+"""Families of an exam's objects, which take turns."""
+POOL = len(procedural.FAMILIES)
+"""Objects of an exam's rows where no number is given: one of each family."""
+_SEEDS: dict[Exam, int] = {"figures": FIGURES_SEED, "development": HELD_OUT_SEED}
+
+
+def first_seed(exam: Exam, count: int) -> int:
+    """Seed of the first of `count` objects of an exam.
+
+    Raises:
+      CongraspError: so many objects of the development exam would reach those for figures.
+    """
+    if exam == "development" and count > FIGURES_SEED - HELD_OUT_SEED:
+        raise CongraspError(f"The development exam has no {count} objects.", "Name a smaller --pool.")
+    return _SEEDS[exam]
+
+
+def exam_pool(exam: Exam, count: int = 0) -> list[GraspObject]:
+    """Objects of an exam; 0 takes `POOL`."""
+    count = count or POOL
+    return load_pool(ObjectsConfig(families=FAMILIES, count=count, seed=first_seed(exam, count)))
