@@ -48,11 +48,11 @@ def evaluate(
     """Evaluate policies by the paper's protocol, beside the paper's figures.
 
     An episode has 50 control steps with the table and 2 s without it. Success is counted after the paper's 25 steps
-    without the table, and again after the 2 s (held). Rates come with 95 % intervals whose clusters are objects (captured
-    sequences); 'of all objects' counts uncovered objects as failures. Errors and forces are those of successful episodes
-    in the paper's window of 25 steps. The policy acts by its mean. Every object has the same number of episodes in a
-    row, which is the same whatever other rows are requested. Reference poses and
-    trajectories are grasps of a reference policy, which never had any; the last fifth of each object's 20 is evaluated.
+    without the table, and again after the 2 s (held). Rates come with 95 % intervals whose clusters are objects
+    (captured sequences); 'of all objects' counts uncovered objects as failures. Errors and forces are those of
+    successful episodes in the paper's window of 25 steps. The policy acts by its mean. Every object has the same number
+    of episodes in a row, which is the same whatever other rows are requested. Reference poses and trajectories are
+    grasps of a reference policy, which never had any; the last fifth of each object's 20 is evaluated.
 
     Args:
       policy: Policy files (policy.safetensors of a run), as FILE or METHOD=FILE, or folders of runs; by default a
@@ -74,7 +74,8 @@ def evaluate(
         among them are left out, and rows of poses and trajectories are of the objects that have one among them.
       episodes: Episodes in each row; of the table 'objects', episodes in all.
       physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
-      pool: Number of procedural objects; 0 takes one of each family, and for the table 'objects' one an episode, at most 50,000.
+      pool: Number of procedural objects; 0 takes one of each family, and for the table 'objects' one an episode, at
+        most 50,000.
       batch: Worlds that run side by side; 0 chooses by the engine.
       seed: Seed of constraints and episodes.
       json: Also write the rows to this file.

@@ -72,6 +72,12 @@ def report_on(
     evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)
     names, left_out = evaluator.allowed(names)
     rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
+    rules = ""
+    if "heading" in names and policy.task.headings == "all":
+        advance = track("Episodes with other rules for headings", episodes)
+        by_center, found = evaluator.row_by_center(episodes, advance)
+        rows.insert(names.index("heading") + 1, by_center)
+        rules = f". {found.sentence(policy.spec.hand_name)}"
     advance = track("Pictures", len(names))
     sheets = []
     for name, sheet, causes in failure_sheets(evaluator, policy, names, _PICTURED, _PICTURED):
@@ -83,7 +89,7 @@ def report_on(
     )
     commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
     which = f"{len(given)} objects ({objects_label(policy, objects)})"
-    how = f"{episodes} episodes a row on {which}, {engine_title(engine)}, seed {seed}"
+    how = f"{episodes} episodes a row on {which}, {engine_title(engine)}, seed {seed}{rules}"
     write_report(out, policy, file.name, rows, how, sheets, curves, commands, check, _motion(evaluator, names))
     return Reported(rows, left_out)
 

@@ -44,7 +44,7 @@ class Cell:
     ours: float | None = None
     low: float | None = None
     high: float | None = None
-    """95 % interval: Wilson's of a rate, 1.96 standard errors around a mean error."""
+    """95 % interval: of a rate with objects as clusters, 1.96 standard errors around a mean error."""
     difference: float | None = None
     """Ours less the paper's."""
     nearest: float | None = None
