@@ -1,5 +1,6 @@
 """Procedural objects of an exam: those that figures are made with, and those that development may look at."""
 
+import zlib
 from typing import Literal
 
 from common.config import ObjectsConfig
@@ -9,8 +10,8 @@ from common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool
 from common.objects.spec import GraspObject
 
 Exam = Literal["figures", "development"]
-FAMILIES = ("all",)
-"""Families of an exam's objects, which take turns."""
+FAMILIES = tuple(sorted(procedural.FAMILIES, key=lambda family: zlib.crc32(family.encode())))
+"""All families, which take turns among an exam's objects, mixed so that a few objects are of all kinds of families."""
 POOL = len(procedural.FAMILIES)
 """Objects of an exam's rows where no number is given: one of each family."""
 _SEEDS: dict[Exam, int] = {"figures": FIGURES_SEED, "development": HELD_OUT_SEED}

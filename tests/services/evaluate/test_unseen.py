@@ -10,7 +10,7 @@ from common.config import NetworkConfig, RunConfig
 from common.errors import CongraspError
 from common.objects import procedural
 from common.objects.store import Catalogue
-from services.evaluate import unseen
+from services.evaluate import exam, unseen
 from services.evaluate.scores import Sample
 from services.evaluate.unseen import Loaded, Pools, evaluate_objects, folder_pools, procedural_pools
 from services.train.command import untrained
@@ -171,4 +171,4 @@ def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
     objects = [make().objects for make in pools.make]
     assert pools.size == 2 and [len(pool) for pool in objects] == [2, 2, 2]
     names = [obj.name for pool in objects for obj in pool]
-    assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000, ("all",))]
+    assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000, exam.FAMILIES)]
