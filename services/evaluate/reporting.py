@@ -64,18 +64,17 @@ def report_on(
     """
     template()  # fails before the evaluation if a package is missing
     policy, engine = bundles.load(file), resolve_physics(physics)
-    names = known_rows(TABLES, policy.task)
     curves = list(curves_of(run_dir)) if run_dir else []
     given = objects_of(objects, track=track) if objects else exam_pool("figures", pool)
     track("Making constraints", None)
-    held, threads = two_seconds(policy.task), cores()
-    evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)
-    names, left_out = evaluator.allowed(names)
+    evaluator = Evaluator(
+        policy, given, physics=engine, threads=cores(), seed=seed, hold_steps=two_seconds(policy.task)
+    )
+    names, left_out = evaluator.allowed(known_rows(TABLES, policy.task))
     rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
     rules = ""
     if "heading" in names and policy.task.headings == "all":
-        advance = track("Episodes with other rules for headings", episodes)
-        by_center, found = evaluator.row_by_center(episodes, advance)
+        by_center, found = evaluator.row_by_center(episodes, track("Episodes with other rules for headings", episodes))
         rows.insert(names.index("heading") + 1, by_center)
         rules = f". {found.sentence(policy.spec.hand_name)}"
     advance = track("Pictures", len(names))

@@ -181,10 +181,9 @@ def summarise(
     constraint = name.removesuffix(ALIGNED)
     group = group or ("aligned pairs" if name.endswith(ALIGNED) else "")
     values, pool = sample.values, pool or len(objects)
-    success, held = values["success"] > 0, values["held"] > 0
-    clusters = values["reference" if by_reference else "object_index"]
-    low, high = clustered(success, clusters)
-    held_low, held_high = clustered(held, clusters) if held_2s else (None, None)
+    success, index = values["success"] > 0, values["object_index"]
+    clusters = values["reference"] if by_reference else index
+    held = _rates(("held_2s", "held_all"), values["held"] > 0, clusters, index, pool)
     found = {name: values[source][success] for part in constraint.split("+") for source, name in ERRORS[part].items()}
     reached = {name: error for name, error in found.items() if len(error)}
     means = {name: float(error.mean()) for name, error in reached.items()}
@@ -194,19 +193,13 @@ def summarise(
         method=method,
         group=group,
         episodes=len(success),
-        covered=len(np.unique(values["object_index"])),
+        covered=len(np.unique(index)),
         pool=pool,
         distinct=len(np.unique(values["identity"])),
         independent=independent_episodes(success, clusters),
         mass_kg=float(values["mass_kg"].mean()),
-        success=float(success.mean()),
-        success_low=low,
-        success_high=high,
-        success_all=_of_all(success, values["object_index"], pool),
-        held_2s=float(held.mean()) if held_2s else None,
-        held_2s_low=held_low,
-        held_2s_high=held_high,
-        held_all=_of_all(held, values["object_index"], pool) if held_2s else None,
+        **_rates(("success", "success_all"), success, clusters, index, pool),
+        **(held if held_2s else dict.fromkeys(held)),
         errors={name: means.get(name) for names in ERRORS.values() for name in names.values()},
         forces=_forces(sample.where(success)),
         episode_return=float(values["return"].mean()),
@@ -220,10 +213,23 @@ def summarise(
     )
 
 
-def _of_all(outcomes: np.ndarray, objects: np.ndarray, pool: int) -> float:
-    """Mean over `pool` objects of each one's rate, of outcomes (E,) by object (E,); objects without episodes have 0."""
+def _rates(
+    names: tuple[str, str], outcomes: np.ndarray, clusters: np.ndarray, objects: np.ndarray, pool: int
+) -> dict[str, Any]:
+    """Columns of a rate: its mean over episodes with the interval, and over `pool` objects, of which some have none.
+
+    Args:
+      names: of the two means.
+      outcomes: (E,) bool.
+      clusters: (E,) see `services.evaluate.intervals`.
+      objects: (E,) index of each episode's object.
+      pool: number of objects; those without episodes have a rate of 0.
+    """
+    low, high = clustered(outcomes, clusters)
     _, members = np.unique(objects, return_inverse=True)
-    return float((np.bincount(members, outcomes) / np.bincount(members)).sum() / pool)
+    of_each = np.bincount(members, outcomes) / np.bincount(members)
+    found = {names[0]: float(outcomes.mean()), f"{names[0]}_low": low, f"{names[0]}_high": high}
+    return {**found, names[1]: float(of_each.sum() / pool)}
 
 
 def _by_object(values: dict[str, np.ndarray], objects: Sequence[str], held_2s: bool) -> list[dict[str, Any]]:

@@ -49,7 +49,7 @@ def test_the_command_measures_rows_by_the_protocol(policy, tmp_path, capsys, mon
         assert {obj["episodes"] for obj in row["objects"]} == {row["episodes"] // row["covered"]}
         assert all(obj["name"] in printed and obj.keys() >= {"success", "held_2s", "clean"} for obj in row["objects"])
         assert row["paper"] is None  # its composed rows are of captured constraints
-        assert np.all(sample.values["length"] == 250)  # 50 steps with the table, 2 s without
+        assert np.all(sample.values["length"] == CONFIG.task.approach_steps + 200)  # with the table, and 2 s without
         assert sample.link_force.shape == (row["episodes"], 25, 16)
         assert sample.torque.shape == (row["episodes"], 25, 20) and 0.0 < sample.torque.max() <= 1.0
 
