@@ -10,20 +10,20 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from actors import initial, protocols
-from actors.env import metric_names
-from actors.episode import episode_message
-from actors.initial import RequestedEpisodes
-from actors.physics.native import NativePhysics
-from actors.rollout import RolloutWorker, Trace
-from common.config import TaskConfig
-from common.hands.spec import Hand
-from common.objects.distance import distance_field
-from common.objects.spec import GraspObject
-from common.policy.bundle import PolicyBundle, act_by_mean
-from common.task import plausibility
-from common.task.types import Goal, Surface
-from common.wire.codec import Message
+from congrasp.actors import initial, protocols
+from congrasp.actors.env import metric_names
+from congrasp.actors.episode import episode_message
+from congrasp.actors.initial import RequestedEpisodes
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.rollout import RolloutWorker, Trace
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.distance import distance_field
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.policy.bundle import PolicyBundle, act_by_mean
+from congrasp.common.task import plausibility
+from congrasp.common.task.types import Goal, Surface
+from congrasp.common.wire.codec import Message
 
 
 class Outcome(NamedTuple):

@@ -8,21 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors.kept_banks import kept_bank
-from common import rotations
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import kinematics
-from common.hands.kinematics import grasp_frame
-from common.hands.outline import CENTER, Outline, outline
-from common.hands.spec import Hand
-from common.objects.pool import object_scale
-from common.objects.spec import SURFACE_POINTS, GraspObject
-from common.parallel import parallel_map
-from common.task.bank import ConstraintBank
-from common.task.sampling.approach_paths import make_trajectories
-from common.task.sampling.closed_poses import Poses, closed_poses
-from common.task.sampling.headings import (
+from congrasp.actors.kept_banks import kept_bank
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.outline import CENTER, Outline, outline
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.pool import object_scale
+from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
+from congrasp.common.parallel import parallel_map
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.sampling.approach_paths import make_trajectories
+from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
+from congrasp.common.task.sampling.headings import (
     INWARD,
     Headings,
     above,
@@ -30,7 +30,7 @@ from common.task.sampling.headings import (
     sample_headings,
     within_reach,
 )
-from common.task.types import Array
+from congrasp.common.task.types import Array
 
 HEADINGS = 256
 POSES = 20

@@ -10,24 +10,24 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from actors import harvest, protocols, success
-from actors.harvest import Grasps
-from actors.initial import InitialConditions
-from actors.physics.engine import Physics, PhysicsState, ResetState, where_environments
-from actors.protocols import Frame, Protocol
-from actors.success import Success
-from common.config import ControlConfig, RewardWeights, TaskConfig
-from common.hands.motors import motor_positions
-from common.hands.spec import Hand
-from common.task import metrics, privileged, sensing
-from common.task.constraints import blocks
-from common.task.constraints.base import Scene
-from common.task.control import decode, track_load, wrist_load
-from common.task.features import features
-from common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
-from common.task.reward import reward_terms, terms
-from common.task.sensing import Readings, Tracker
-from common.task.types import Action, Array, Goal, SceneState, Surface
+from congrasp.actors import harvest, protocols, success
+from congrasp.actors.harvest import Grasps
+from congrasp.actors.initial import InitialConditions
+from congrasp.actors.physics.engine import Physics, PhysicsState, ResetState, where_environments
+from congrasp.actors.protocols import Frame, Protocol
+from congrasp.actors.success import Success
+from congrasp.common.config import ControlConfig, RewardWeights, TaskConfig
+from congrasp.common.hands.motors import motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task import metrics, privileged, sensing
+from congrasp.common.task.constraints import blocks
+from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.control import decode, track_load, wrist_load
+from congrasp.common.task.features import features
+from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
+from congrasp.common.task.reward import reward_terms, terms
+from congrasp.common.task.sensing import Readings, Tracker
+from congrasp.common.task.types import Action, Array, Goal, SceneState, Surface
 
 
 class Settings(NamedTuple):

@@ -7,16 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors.rollout import Trace
-from common import rotations
-from common.config import TaskConfig
-from common.hands.kinematics import link_poses
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.task import metrics
-from common.task.reward import terms
-from common.task.types import Array, Goal, Surface
-from common.wire.codec import Message
+from congrasp.actors.rollout import Trace
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.kinematics import link_poses
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task import metrics
+from congrasp.common.task.reward import terms
+from congrasp.common.task.types import Array, Goal, Surface
+from congrasp.common.wire.codec import Message
 
 PIECE_KINDS = ("box", "cylinder", "capsule", "ellipsoid", "mesh")
 

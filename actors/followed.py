@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from actors.env import EnvState
-from actors.rollout import Trace
-from common.task.types import Goal, Surface
+from congrasp.actors.env import EnvState
+from congrasp.actors.rollout import Trace
+from congrasp.common.task.types import Goal, Surface
 
 
 class Followed(NamedTuple):

@@ -11,16 +11,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from actors.bank import make_references
-from actors.physics.engine import where_environments
-from common import rotations
-from common.config import TaskConfig
-from common.hands.spec import Hand
-from common.task.bank import ConstraintBank
-from common.task.constraints import get_constraint, optional
-from common.task.constraints.base import Scene
-from common.task.sampling.closed_poses import Poses
-from common.task.types import Array
+from congrasp.actors.bank import make_references
+from congrasp.actors.physics.engine import where_environments
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.constraints import get_constraint, optional
+from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.common.task.types import Array
 
 
 class Grasps(NamedTuple):

@@ -9,19 +9,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors.physics.engine import ResetState
-from common import rotations
-from common.config import SensingConfig, TaskConfig
-from common.hands import kinematics
-from common.hands.closure import MARGIN, preshape
-from common.hands.spec import Hand
-from common.task.bank import ConstraintBank, Draw
-from common.task.constraints import known, optional
-from common.task.constraints.force import least_force
-from common.task.constraints.priority import Resolution, active_blocks, resolve
-from common.task.sampling.headings import Headings, local_width
-from common.task.sensing import Sensors, draw_sensors
-from common.task.types import Array, Goal, Surface
+from congrasp.actors.physics.engine import ResetState
+from congrasp.common import rotations
+from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.closure import MARGIN, preshape
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.bank import ConstraintBank, Draw
+from congrasp.common.task.constraints import known, optional
+from congrasp.common.task.constraints.force import least_force
+from congrasp.common.task.constraints.priority import Resolution, active_blocks, resolve
+from congrasp.common.task.sampling.headings import Headings, local_width
+from congrasp.common.task.sensing import Sensors, draw_sensors
+from congrasp.common.task.types import Array, Goal, Surface
 
 _CLEARANCE = 0.005
 """Metres over the table that a hand begins with at least."""

@@ -8,16 +8,16 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
-import actors
-import common
-from common.caches import keep, read_kept, source_digest
-from common.config import TaskConfig
-from common.files import cache_folder
-from common.hands.spec import Hand
-from common.objects import store
-from common.objects.spec import GraspObject
-from common.task.bank import ConstraintBank
-from common.wire.codec import Message
+import congrasp.actors
+import congrasp.common
+from congrasp.common.caches import keep, read_kept, source_digest
+from congrasp.common.config import TaskConfig
+from congrasp.common.files import cache_folder
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects import store
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.wire.codec import Message
 
 LEAST_OBJECTS = 64
 """Pools from this size on are worth a file."""
@@ -46,7 +46,7 @@ def kept_bank(
 
 def _key(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> str:
     """What a bank depends on, the code and the device's arithmetic included, as a file's name."""
-    code = source_digest(actors, common)
+    code = source_digest(congrasp.actors, congrasp.common)
     settings = {name: value for name, value in dataclasses.asdict(task).items() if not name.startswith(_IRRELEVANT)}
     device = jax.local_devices()[0].device_kind
     digests = [store.digest(obj) for obj in objects]

@@ -13,12 +13,12 @@ import time
 from concurrent.futures import Future
 from typing import Any, NamedTuple, Self
 
-from actors.uploads import Outcome, Uploads, backoff, check_timeout
-from common.errors import CongraspError, RefusedError, TransportError
-from common.journal import Journal
-from common.transport.base import Transport
-from common.transport.keys import Keys
-from common.wire.codec import Message, SharedMessage, checksum
+from congrasp.actors.uploads import Outcome, Uploads, backoff, check_timeout
+from congrasp.common.errors import CongraspError, RefusedError, TransportError
+from congrasp.common.journal import Journal
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message, SharedMessage, checksum
 
 _POLL = 0.2
 

@@ -10,26 +10,26 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from actors.env import episode_fields
-from actors.episode import episode_message
-from actors.failure_weights import FailureWeights
-from actors.followed import Followed, Follower
-from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
-from actors.physics import make_physics
-from actors.rollout import Rollout, RolloutWorker, finished_episodes
-from actors.training_set import training_set
-from common.config import RunConfig, run_config_from_json
-from common.engines import PhysicsName
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.journal import Journal
-from common.policy.bundle import PolicyBundle, policy_spec, sample_action
-from common.stages import stage
-from common.task.bank import ConstraintBank
-from common.task.types import Array
-from common.transport.base import Transport
-from common.wire.codec import Message, finite
-from common.wire.schema import PRIVILEGED, RECORDABLE, TAUGHT
+from congrasp.actors.env import episode_fields
+from congrasp.actors.episode import episode_message
+from congrasp.actors.failure_weights import FailureWeights
+from congrasp.actors.followed import Followed, Follower
+from congrasp.actors.link import ActorLink, RunFinished, RunRestarted, Ticket
+from congrasp.actors.physics import make_physics
+from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
+from congrasp.actors.training_set import training_set
+from congrasp.common.config import RunConfig, run_config_from_json
+from congrasp.common.engines import PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.journal import Journal
+from congrasp.common.policy.bundle import PolicyBundle, policy_spec, sample_action
+from congrasp.common.stages import stage
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.types import Array
+from congrasp.common.transport.base import Transport
+from congrasp.common.wire.codec import Message, finite
+from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, TAUGHT
 
 _TICKET_SECONDS = 1.0
 _FLUSH_SECONDS = 2.0

@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors.physics.engine import PhysicsState
-from common import rotations
-from common.config import TaskConfig
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.task import plausibility
-from common.task.plausibility import Sample
-from common.task.types import Array
+from congrasp.actors.physics.engine import PhysicsState
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task import plausibility
+from congrasp.common.task.plausibility import Sample
+from congrasp.common.task.types import Array
 
 GRAVITY = 9.81
 """m/s^2."""

@@ -12,19 +12,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors import harvest, initial, protocols
-from actors.env import EnvState, GraspEnv, Settings, Transition, episode_fields
-from actors.harvest import Grasps
-from actors.initial import InitialConditions
-from actors.physics.engine import Physics, PhysicsState
-from common.config import RewardWeights, TaskConfig
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.task import metrics
-from common.task.bank import ConstraintBank
-from common.task.constraints.base import Scene
-from common.task.observation import observe
-from common.task.types import Action, Array
+from congrasp.actors import harvest, initial, protocols
+from congrasp.actors.env import EnvState, GraspEnv, Settings, Transition, episode_fields
+from congrasp.actors.harvest import Grasps
+from congrasp.actors.initial import InitialConditions
+from congrasp.actors.physics.engine import Physics, PhysicsState
+from congrasp.common.config import RewardWeights, TaskConfig
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task import metrics
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.observation import observe
+from congrasp.common.task.types import Action, Array
 
 Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
 """(parameters, observation (B, D) float32, random key) -> action (B, A), log-probability (B,)."""

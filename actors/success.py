@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from common.config import TaskConfig
-from common.task.constraints.base import Scene
-from common.task.reward import fallen
-from common.task.types import Array
+from congrasp.common.config import TaskConfig
+from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.reward import fallen
+from congrasp.common.task.types import Array
 
 
 class Success(NamedTuple):

@@ -6,16 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from actors.bank import build_bank
-from common.config import RunConfig
-from common.errors import CongraspError
-from common.hands.spec import Hand
-from common.objects.pool import load_pool, scale_objects
-from common.objects.spec import GraspObject
-from common.stages import stage
-from common.task.bank import ConstraintBank, rows_of, stacked
-from common.task.constraint_sets import bank_of, load_for
-from common.wire.codec import Message
+from congrasp.actors.bank import build_bank
+from congrasp.common.config import RunConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.pool import load_pool, scale_objects
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.stages import stage
+from congrasp.common.task.bank import ConstraintBank, rows_of, stacked
+from congrasp.common.task.constraint_sets import bank_of, load_for
+from congrasp.common.wire.codec import Message
 
 
 class TrainingSet(NamedTuple):

@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any, Literal, NamedTuple
 
-from common.errors import CongraspError, RefusedError, TransportError
-from common.journal import Journal
-from common.transport.base import Transport
-from common.wire.codec import Message
+from congrasp.common.errors import CongraspError, RefusedError, TransportError
+from congrasp.common.journal import Journal
+from congrasp.common.transport.base import Transport
+from congrasp.common.wire.codec import Message
 
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 """Outcome of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""

@@ -7,9 +7,9 @@ import os
 import pathlib
 from types import ModuleType
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.wire.codec import Message, decode, encode
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.wire.codec import Message, decode, encode
 
 
 @functools.cache

@@ -15,12 +15,12 @@ import dacite
 import jax
 from typing_extensions import Doc
 
-from common.engines import PhysicsName
-from common.errors import CongraspError
-from common.hands.spec import CONTACT_TIME
-from common.inputs import file_name
-from common.task.constraints import CONSTRAINTS, OURS, PAPER
-from common.task.reward import GRASP
+from congrasp.common.engines import PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import CONTACT_TIME
+from congrasp.common.inputs import file_name
+from congrasp.common.task.constraints import CONSTRAINTS, OURS, PAPER
+from congrasp.common.task.reward import GRASP
 
 MetricWriter = Literal["tensorboard", "wandb", "wandb-offline"]
 """Where else a learner's metrics are written, beside the recordings."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 
 class Engine(NamedTuple):

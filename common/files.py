@@ -4,7 +4,7 @@ import contextlib
 import os
 import pathlib
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 
 def write_atomically(path: pathlib.Path, data: bytes) -> None:

@@ -7,7 +7,7 @@ import re
 import stat
 from typing import Any, BinaryIO
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 LONGEST_NAME = 100
 """Characters of a name that becomes a file or a folder."""

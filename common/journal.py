@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 AUDIT = "audit"
 """Folder of a run directory where its journals are."""

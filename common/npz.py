@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.inputs import read_file
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import read_file
 
 MAX_BYTES = 512 << 20
 """Bytes that the arrays of a file may have together, unless the caller says otherwise."""

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 Result = TypeVar("Result")
 _WORTH_IT = 64  # calls; below, starting processes takes longer than it saves
 _MOST_WORKERS = 16
-_PRELOADED = ["common.one_thread", "common.objects.procedural", "common.task.constraints"]
+_PRELOADED = ["congrasp.common.one_thread", "congrasp.common.objects.procedural", "congrasp.common.task.constraints"]
 """Imported once, in this order, by the process that workers are forked from; what else a function needs, its worker
 imports."""
 

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.inputs import read_file
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import read_file
 
 _REMEDY = "Only pickles of plain values and arrays are read; get the file again."
 MAX_BYTES = 256 << 20

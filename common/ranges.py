@@ -5,8 +5,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from common.config import NetworkConfig, TaskConfig
-from common.objects.spec import SURFACE_POINTS
+from congrasp.common.config import NetworkConfig, TaskConfig
+from congrasp.common.objects.spec import SURFACE_POINTS
 
 MAX_SPEED = 400.0
 """A joint faster than this (m/s or rad/s) marks a diverged environment."""

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from common.task.types import Array
+from congrasp.common.task.types import Array
 
 _UNDECIDED = 1e-5
 """Cosine of the y angle from which on the x angle is left where it was (`quaternion_to_euler`)."""

@@ -15,10 +15,10 @@ from docutils.parsers.rst import Directive
 from sphinx.application import Sphinx
 from typing_extensions import Doc
 
-from common.config import RunConfig
-from common.wire import messages
-from common.wire.messages import MessageSpec
-from services.cli import main
+from congrasp.common.config import RunConfig
+from congrasp.common.wire import messages
+from congrasp.common.wire.messages import MessageSpec
+from congrasp.services.cli import main
 
 _WIDTH = 100
 _DEFAULT = 60

@@ -15,14 +15,14 @@ import numpy as np
 import tyro
 
 import congrasp
-from common.hands import get_hand
-from common.hands.mano import read_mano
-from common.objects.spec import GraspObject
-from common.wire.codec import Message
-from services.assets.captures.build import Options, import_sets
-from services.assets.captures.objects import Meshes
-from services.viz.render import episode_strip
-from services.viz.sheets import contact_sheet, save_png
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.mano import read_mano
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.captures.build import Options, import_sets
+from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.viz.render import episode_strip
+from congrasp.services.viz.sheets import contact_sheet, save_png
 
 _FRAMES = 4
 
@@ -54,7 +54,7 @@ def main(arguments: Arguments) -> None:
     model = read_mano(arguments.mano) if arguments.mano else None
     pictures: dict[str, tuple[list[np.ndarray], list[str]]] = {}
     for name in arguments.hand:
-        reader = importlib.import_module(f"services.assets.captures.{arguments.format}")
+        reader = importlib.import_module(f"congrasp.services.assets.captures.{arguments.format}")
         sequences = reader.read(arguments.demonstration, Meshes(arguments.meshes), model)
         options = Options(headings="demonstrated", affordance=arguments.affordance, beyond=np.pi)
         objects, sets, report = import_sets(sequences, get_hand(name), options, arguments.format)

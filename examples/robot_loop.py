@@ -20,17 +20,17 @@ import numpy as np
 import tyro
 
 import congrasp
-from actors.physics.physics_state import physics_state
-from actors.physics.scene import TABLE_AWAY, addresses, compile_scene
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.hands.spec import Hand
-from common.objects import procedural
-from common.objects.pool import scale_objects
-from common.policy import bundle as bundles
-from common.policy.pretrained import policy_file
-from common.transport.ports import local_url
-from services.serve.load import example_episode, wait_until_ready
+from congrasp.actors.physics.physics_state import physics_state
+from congrasp.actors.physics.scene import TABLE_AWAY, addresses, compile_scene
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.pool import scale_objects
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.transport.ports import local_url
+from congrasp.services.serve.load import example_episode, wait_until_ready
 
 BUFFER = 0.01
 """rad before the ends of the finger joints at which the robot's stops begin, which are springs in MuJoCo."""
@@ -128,7 +128,7 @@ class Server:
     def __init__(self, policy: pathlib.Path):
         """Starts it at a free port."""
         self.url = local_url()
-        self._command = [sys.executable, "-m", "services.cli.main", "serve", "--policy", str(policy)]
+        self._command = [sys.executable, "-m", "congrasp", "serve", "--policy", str(policy)]
         self.start()
 
     def start(self) -> None:

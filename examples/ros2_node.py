@@ -32,10 +32,10 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 import congrasp
-from common.hands import get_hand
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from services.assets.objects.named import find_object
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.services.assets.objects.named import find_object
 
 JOINTS, POSE = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
 INPUTS = {"joint_states": JOINTS, "wrist_pose": POSE, "object_pose": POSE}

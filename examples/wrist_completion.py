@@ -14,13 +14,13 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 import congrasp
-from common.hands import get_hand
-from services.assets.captures.extract import Surface, approach
-from services.assets.captures.transfer import followed
-from services.assets.objects.named import find_object
-from services.grasp.wrist_paths import read_wrist_path
-from services.viz.render import episode_sheet
-from services.viz.sheets import save_png
+from congrasp.common.hands import get_hand
+from congrasp.services.assets.captures.extract import Surface, approach
+from congrasp.services.assets.captures.transfer import followed
+from congrasp.services.assets.objects.named import find_object
+from congrasp.services.grasp.wrist_paths import read_wrist_path
+from congrasp.services.viz.render import episode_sheet
+from congrasp.services.viz.sheets import save_png
 
 
 @dataclasses.dataclass

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.wire.codec import Message
-from learner.rate_limit import PutOff
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message
+from congrasp.learner.rate_limit import PutOff
 
 _DENSITY = (-100.0, 10.0)  # nats of a log probability for each action; 14 standard deviations, and one of 2e-5
 _ACTIONS = 256  # where a rollout has a log probability and no action

@@ -9,9 +9,9 @@ import pathlib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
-from common.journal import AUDIT, Journal, JournalLines, has_fields, is_rows, read_journal
-from common.wire.codec import Message, checksum
-from learner.write_ahead import Identity
+from congrasp.common.journal import AUDIT, Journal, JournalLines, has_fields, is_rows, read_journal
+from congrasp.common.wire.codec import Message, checksum
+from congrasp.learner.write_ahead import Identity
 
 _ROWS = ("taken", "dropped", "spoilt", "unwritten", "end")
 

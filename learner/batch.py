@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from common.config import RunConfig
-from common.policy.bundle import PolicySpec, full_layout
-from common.task.types import Array
-from common.wire.schema import TAUGHT, WORLDS, RolloutForm, Schema
-from learner.collectives import AXIS
+from congrasp.common.config import RunConfig
+from congrasp.common.policy.bundle import PolicySpec, full_layout
+from congrasp.common.task.types import Array
+from congrasp.common.wire.schema import TAUGHT, WORLDS, RolloutForm, Schema
+from congrasp.learner.collectives import AXIS
 
 
 def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> RolloutForm:

@@ -19,10 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.errors import CongraspError
-from common.files import sync_directory, write_atomically
-from common.wire.codec import Message, decode, encode
-from common.wire.codec import checksum as checksum_of
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import sync_directory, write_atomically
+from congrasp.common.wire.codec import Message, decode, encode
+from congrasp.common.wire.codec import checksum as checksum_of
 
 KEPT = 3
 """How many checkpoints of a run are kept."""

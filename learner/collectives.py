@@ -13,7 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from common.task.types import Array
+from congrasp.common.task.types import Array
 
 AXIS = "rank"
 """Axis of a mesh with one device of each learner process."""

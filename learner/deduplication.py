@@ -5,9 +5,9 @@ import dataclasses
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from common.wire.messages import RolloutHeader
-from learner.rate_limit import certificate
-from learner.staleness import Owner
+from congrasp.common.wire.messages import RolloutHeader
+from congrasp.learner.rate_limit import certificate
+from congrasp.learner.staleness import Owner
 
 _INCARNATIONS = 1024  # whose sequences are kept
 _WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another

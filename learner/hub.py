@@ -16,18 +16,25 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from common.errors import CongraspError
-from common.transport.base import Transport
-from common.transport.keys import Keys, below, check_name, parse_alive
-from common.wire.codec import Message, SharedMessage
-from common.wire.messages import TICKET, RolloutForm, RolloutHeader, validate, validate_bundle, validate_rollout
-from learner.admission import Admission
-from learner.audit import AuditLog
-from learner.deduplication import SequenceTable
-from learner.members import Members
-from learner.rate_limit import DAMAGED, RateLimit
-from learner.staleness import Owner, StalenessManager
-from learner.write_ahead import Identity, Recovered, WriteAheadLog
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys, below, check_name, parse_alive
+from congrasp.common.wire.codec import Message, SharedMessage
+from congrasp.common.wire.messages import (
+    TICKET,
+    RolloutForm,
+    RolloutHeader,
+    validate,
+    validate_bundle,
+    validate_rollout,
+)
+from congrasp.learner.admission import Admission
+from congrasp.learner.audit import AuditLog
+from congrasp.learner.deduplication import SequenceTable
+from congrasp.learner.members import Members
+from congrasp.learner.rate_limit import DAMAGED, RateLimit
+from congrasp.learner.staleness import Owner, StalenessManager
+from congrasp.learner.write_ahead import Identity, Recovered, WriteAheadLog
 
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0

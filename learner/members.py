@@ -3,8 +3,8 @@
 import collections
 import itertools
 
-from common.transport.keys import Alive
-from learner.rate_limit import certificate
+from congrasp.common.transport.keys import Alive
+from congrasp.learner.rate_limit import certificate
 
 _EACH = 64
 """Listed tokens of one role and certificate."""

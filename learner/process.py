@@ -17,26 +17,26 @@ from typing import Any
 import jax
 import numpy as np
 
-from common.config import RunConfig, to_json
-from common.errors import CongraspError, PhysicsError, TransportError
-from common.files import write_atomically
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from common.stages import stage
-from common.transport.base import Transport
-from common.transport.keys import Keys
-from common.wire.codec import Message, encode, finite
-from learner.admission import Admission
-from learner.algorithms import make_algorithm
-from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
-from learner.audit import AuditLog
-from learner.batch import collate, rollout_form
-from learner.checkpoint import Checkpoints, checksum, flatten, restore
-from learner.collapse import CollapseWatch
-from learner.hub import LearnerHub
-from learner.ranges import task_ranges
-from learner.ranks import Ranks, ended_by
-from learner.run_directory import (
+from congrasp.common.config import RunConfig, to_json
+from congrasp.common.errors import CongraspError, PhysicsError, TransportError
+from congrasp.common.files import write_atomically
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.stages import stage
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message, encode, finite
+from congrasp.learner.admission import Admission
+from congrasp.learner.algorithms import make_algorithm
+from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
+from congrasp.learner.audit import AuditLog
+from congrasp.learner.batch import collate, rollout_form
+from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
+from congrasp.learner.collapse import CollapseWatch
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.ranges import task_ranges
+from congrasp.learner.ranks import Ranks, ended_by
+from congrasp.learner.run_directory import (
     CHECKPOINTS,
     CONFIG_FILE,
     INITIAL_FILE,
@@ -46,9 +46,9 @@ from learner.run_directory import (
     open_run,
     published_version,
 )
-from learner.staleness import Counters, StalenessManager
-from learner.statistics import Pace, overall, summary
-from learner.write_ahead import FOLDER, WriteAheadLog
+from congrasp.learner.staleness import Counters, StalenessManager
+from congrasp.learner.statistics import Pace, overall, summary
+from congrasp.learner.write_ahead import FOLDER, WriteAheadLog
 
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0

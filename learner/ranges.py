@@ -13,21 +13,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.config import CurriculumConfig, RewardWeights, TaskConfig
-from common.hands import get_hand
-from common.hands.spec import Hand
-from common.ranges import MAX_DISTANCE, MAX_SPEED
-from common.task import privileged
-from common.task.constraints import known
-from common.task.constraints.base import symbol_sizes
-from common.task.features import scene_of
-from common.task.metrics import DIVERGED, FORCES, episode_fields
-from common.task.observation import observe
-from common.task.privileged import Parameters
-from common.task.reward import reward_terms
-from common.task.sensing import Readings, draw_sensors
-from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
-from learner.admission import Ranges
+from congrasp.common.config import CurriculumConfig, RewardWeights, TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.ranges import MAX_DISTANCE, MAX_SPEED
+from congrasp.common.task import privileged
+from congrasp.common.task.constraints import known
+from congrasp.common.task.constraints.base import symbol_sizes
+from congrasp.common.task.features import scene_of
+from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields
+from congrasp.common.task.observation import observe
+from congrasp.common.task.privileged import Parameters
+from congrasp.common.task.reward import reward_terms
+from congrasp.common.task.sensing import Readings, draw_sensors
+from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
+from congrasp.learner.admission import Ranges
 
 _STATES = 128
 _SLACK = 2.0

@@ -22,9 +22,9 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from common.errors import CongraspError, TransportError
-from common.wire.codec import MAX_MESSAGE, Message, decode, encode
-from learner.collectives import AXIS
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
+from congrasp.learner.collectives import AXIS
 
 JOIN_SECONDS = 300.0
 """Seconds within which all ranks must have come."""

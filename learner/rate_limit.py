@@ -10,8 +10,8 @@ import threading
 import time
 from collections.abc import Callable
 
-from common.transport.base import Handler
-from common.wire.codec import Message
+from congrasp.common.transport.base import Handler
+from congrasp.common.wire.codec import Message
 
 DAMAGED = 1 << 20
 """Bytes that a message is charged for which cannot be decoded."""

@@ -14,14 +14,14 @@ import os
 import pathlib
 from collections.abc import Callable, Iterator
 
-from common.config import RunConfig, run_config_from_json, to_json
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.inputs import read_file
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from learner.audit import journalled_version
-from learner.checkpoint import Checkpoints, set_aside
+from congrasp.common.config import RunConfig, run_config_from_json, to_json
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.inputs import read_file
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.learner.audit import journalled_version
+from congrasp.learner.checkpoint import Checkpoints, set_aside
 
 POLICY_FILE = "policy.safetensors"
 INITIAL_FILE = "initial.safetensors"

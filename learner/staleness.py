@@ -24,8 +24,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Literal, NamedTuple
 
-from learner.rate_limit import certificate
-from learner.tickets import TicketBudget
+from congrasp.learner.rate_limit import certificate
+from congrasp.learner.tickets import TicketBudget
 
 Owner = tuple[str, str]
 """Actor and incarnation."""

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from common.task.constraints import CONSTRAINTS
-from common.wire.codec import Message
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.wire.codec import Message
 
 _EPISODE = ("episode/", "term/")
 _OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional)

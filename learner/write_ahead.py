@@ -16,10 +16,10 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from common.errors import CongraspError
-from common.wire.codec import Message, decode, encode
-from common.wire.messages import RolloutForm, RolloutHeader, validate_rollout
-from learner.checkpoint import set_aside
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message, decode, encode
+from congrasp.common.wire.messages import RolloutForm, RolloutHeader, validate_rollout
+from congrasp.learner.checkpoint import set_aside
 
 FOLDER = "accepted"
 """Folder of a run directory with a folder for each rank."""

@@ -10,12 +10,12 @@ import time
 
 import numpy as np
 
-from common.errors import TransportError
-from common.transport import urls
-from common.transport.base import Transport
-from common.transport.keys import Keys
-from common.wire.codec import Message
-from common.wire.schema import RolloutForm
+from congrasp.common.errors import TransportError
+from congrasp.common.transport import urls
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message
+from congrasp.common.wire.schema import RolloutForm
 
 IDENTITY = "9"
 """What the names of all its actors begin with, as those of one certificate do."""

@@ -19,19 +19,19 @@ import time
 
 import numpy as np
 
-from actors.link import ActorLink, RunFinished, RunRestarted
-from common.errors import TransportError
-from common.journal import AUDIT, Journal
-from common.transport import urls
-from common.transport.keys import FLOWS, Keys
-from common.transport.ports import free_port
-from common.wire.codec import Message
-from common.wire.schema import RolloutForm
-from learner.audit import AuditLog
-from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
-from learner.write_ahead import FOLDER, WriteAheadLog
-from services.ops.audit import FAULTS, audit
+from congrasp.actors.link import ActorLink, RunFinished, RunRestarted
+from congrasp.common.errors import TransportError
+from congrasp.common.journal import AUDIT, Journal
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import FLOWS, Keys
+from congrasp.common.transport.ports import free_port
+from congrasp.common.wire.codec import Message
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.audit import AuditLog
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.write_ahead import FOLDER, WriteAheadLog
+from congrasp.services.ops.audit import FAULTS, audit
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 KEYS = Keys("chaos")

@@ -2,7 +2,7 @@
 
 import jax
 
-from actors import initial
+from congrasp.actors import initial
 
 sample = jax.jit(initial.sample, static_argnames=("hand", "task", "batch"))
 """`initial.sample`, compiled as in a rollout."""

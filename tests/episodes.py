@@ -4,10 +4,10 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame
-from common.wire.codec import Message
-from services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 
 BLOCKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 """Blocks of the observation that a policy of the paper's constraints gates."""

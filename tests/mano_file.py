@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from common.hands import get_hand
-from common.hands.mano import MANO_FINGERS, TIP_VERTICES
-from common.hands.spec import link_origin
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.mano import MANO_FINGERS, TIP_VERTICES
+from congrasp.common.hands.spec import link_origin
 
 
 class Global(str):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from common.wire.codec import Message
-from common.wire.schema import RolloutForm
+from congrasp.common.wire.codec import Message
+from congrasp.common.wire.schema import RolloutForm
 
 OBSERVATION, ACTION, SCHEMA = 7, 3, "schema"
 FORM = RolloutForm(steps=4, worlds=2, observation=OBSERVATION, action=ACTION, half=True)

@@ -1,7 +1,7 @@
 """Rows of an evaluation that no evaluation made, for what shows and compares them."""
 
-from services.evaluate.paper import paper_row
-from services.evaluate.scores import ERRORS, Row
+from congrasp.services.evaluate.paper import paper_row
+from congrasp.services.evaluate.scores import ERRORS, Row
 
 FORCES = {f"{name}_{of}": 1.0 for name in ("link_force", "force_sum", "torque_share") for of in ("mean", "p95")}
 FORCES |= {"force_peak_n": 1.0, "force_mean_n": 1.0}

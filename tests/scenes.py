@@ -3,15 +3,15 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
-from common.task.constraints import CONSTRAINTS
-from common.task.constraints.affordance import AffordanceGoal
-from common.task.constraints.fingers import FingersGoal
-from common.task.constraints.force import ForceGoal
-from common.task.constraints.heading import HeadingGoal
-from common.task.constraints.pose import PoseGoal
-from common.task.constraints.trajectory import TrajectoryGoal
-from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
+from congrasp.common.hands import get_hand
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.constraints.affordance import AffordanceGoal
+from congrasp.common.task.constraints.fingers import FingersGoal
+from congrasp.common.task.constraints.force import ForceGoal
+from congrasp.common.task.constraints.heading import HeadingGoal
+from congrasp.common.task.constraints.pose import PoseGoal
+from congrasp.common.task.constraints.trajectory import TrajectoryGoal
+from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 
 HAND = get_hand("human")
 F, L, N, K = len(HAND.joints), len(HAND.links), 64, 15

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from actors.bank import build_bank
-from actors.physics.native import NativePhysics
-from actors.rollout import Rollout, RolloutWorker, finished_episodes
-from common.config import TaskConfig
-from common.hands.motors import motor_positions
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.task.observation import layout
+from congrasp.actors.bank import build_bank
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.motors import motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.observation import layout
 
 NEAR = 0.03
 """Distance (m) of the hand centre from its heading position at which the fingers begin to close."""

@@ -13,12 +13,12 @@ import threading
 import time
 from concurrent.futures import Future, InvalidStateError
 
-from common import errors
-from common.errors import CongraspError, RefusedError, TransportError
-from common.transport.base import Subscription
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.transport.urls import SCHEMES
-from common.wire.codec import decode, encode
+from congrasp.common import errors
+from congrasp.common.errors import CongraspError, RefusedError, TransportError
+from congrasp.common.transport.base import Subscription
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.transport.urls import SCHEMES
+from congrasp.common.wire.codec import decode, encode
 
 ERRORS = {name: one for name, one in vars(errors).items() if isinstance(one, type)}
 LENGTH = struct.Struct("<Q")

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from common.objects import shapes
-from common.objects.mjcf import GEOM_TYPES
-from common.objects.spec import Piece
+from congrasp.common.objects import shapes
+from congrasp.common.objects.mjcf import GEOM_TYPES
+from congrasp.common.objects.spec import Piece
 
 
 def mujoco_mass_properties(pieces: Sequence[Piece], densities: Sequence[float]) -> tuple[float, np.ndarray, np.ndarray]:

@@ -6,21 +6,21 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects import procedural
-from common.objects.spec import GraspObject
-from common.request import GraspRequest
-from common.transport.keys import Keys
-from common.wire.codec import Message
-from services.record.channels import JsonChannels
-from services.record.scene import episode_entries
-from services.record.writer import LogWriter
-from services.viz.studio.catalogue import Catalogue
-from services.viz.studio.jobs import Progress
-from services.viz.studio.session import Session
-from services.viz.studio.training import TrainingWindow
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.request import GraspRequest
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.channels import JsonChannels
+from congrasp.services.record.scene import episode_entries
+from congrasp.services.record.writer import LogWriter
+from congrasp.services.viz.studio.catalogue import Catalogue
+from congrasp.services.viz.studio.jobs import Progress
+from congrasp.services.viz.studio.session import Session
+from congrasp.services.viz.studio.training import TrainingWindow
 from tests.episodes import episode
 
 STEPS, REMOVAL = 60, 40

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 import congrasp
-from common.transport import urls
-from common.transport.ports import free_port
+from congrasp.common.transport import urls
+from congrasp.common.transport.ports import free_port
 
 BLOCKED = ("jax", "flax", "mujoco", "scipy", "trimesh", "mcap", "tyro", "rich", "dacite", "cryptography")
 CLIENT = """
@@ -18,7 +18,7 @@ import sys
 for name in {blocked}:
     sys.modules[name] = None
 import congrasp
-assert not [name for name in sys.modules if name.partition(".")[0] in ("common", "services", "numpy", "zenoh")]
+assert not [name for name in sys.modules if name.startswith(("congrasp.", "numpy", "zenoh"))]
 request = congrasp.GraspRequest({{"heading": {{"direction": (0, 0, -1)}}}})
 congrasp.Answer, congrasp.Policy, congrasp.UnknownConstraintError
 congrasp.Guard, congrasp.Command, congrasp.JointLimits, congrasp.Ticker

@@ -6,33 +6,33 @@ from typing import Any
 
 import jax
 
-from actors.physics.engine import Physics
-from common.config import TaskConfig
-from common.engines import ENGINES, Engine, PhysicsName
-from common.errors import CongraspError
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
+from congrasp.actors.physics.engine import Physics
+from congrasp.common.config import TaskConfig
+from congrasp.common.engines import ENGINES, Engine, PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 
 _NVIDIA = ("gpu", "cuda")
 
 
 def _make_warp(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int) -> Physics:
     """MuJoCo Warp; has no use for threads."""
-    from actors.physics.warp import WarpPhysics
+    from congrasp.actors.physics.warp import WarpPhysics
 
     return WarpPhysics(hand, task, objects)
 
 
 def _make_jax(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int) -> Physics:
     """MJX-JAX; has no use for threads."""
-    from actors.physics.mjx import MjxPhysics
+    from congrasp.actors.physics.mjx import MjxPhysics
 
     return MjxPhysics(hand, task, objects)
 
 
 def _make_native(*arguments: Any) -> Physics:
     """MuJoCo C on threads."""
-    from actors.physics.native import NativePhysics
+    from congrasp.actors.physics.native import NativePhysics
 
     return NativePhysics(*arguments)
 

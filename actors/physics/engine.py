@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from common.objects.spec import GraspObject
-from common.task.types import Array
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.types import Array
 
 
 class ResetState(NamedTuple):

@@ -13,16 +13,16 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from actors.physics.engine import PhysicsState, ResetState, where_environments
-from actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
-from actors.physics.scene import GAINS, SENSOR_WIDTH, TABLE_AWAY, addresses
-from actors.physics.slots import Pool
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands.spec import Hand
-from common.objects.mjcf import CONTACT
-from common.objects.spec import GraspObject
-from common.task.types import CONTACTS_PER_LINK, Array
+from congrasp.actors.physics.engine import PhysicsState, ResetState, where_environments
+from congrasp.actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
+from congrasp.actors.physics.scene import GAINS, SENSOR_WIDTH, TABLE_AWAY, addresses
+from congrasp.actors.physics.slots import Pool
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.mjcf import CONTACT
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
 
 class MjxState(NamedTuple):

@@ -12,13 +12,13 @@ import mujoco
 import numpy as np
 import psutil
 
-from actors.physics.engine import PhysicsState, ResetState
-from actors.physics.physics_state import has_diverged, physics_state
-from actors.physics.scene import GAINS, TABLE_AWAY, addresses, compile_scene
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
+from congrasp.actors.physics.engine import PhysicsState, ResetState
+from congrasp.actors.physics.physics_state import has_diverged, physics_state
+from congrasp.actors.physics.scene import GAINS, TABLE_AWAY, addresses, compile_scene
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 
 _ENVIRONMENT = 860_000  # bytes of an environment that has been stepped: model, data and their stack
 

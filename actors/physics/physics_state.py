@@ -5,10 +5,10 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from actors.physics.engine import PhysicsState, ResetState
-from actors.physics.scene import SENSOR_WIDTH, Addresses
-from common.ranges import MAX_DISTANCE, MAX_SPEED
-from common.task.types import CONTACTS_PER_LINK, Array
+from congrasp.actors.physics.engine import PhysicsState, ResetState
+from congrasp.actors.physics.scene import SENSOR_WIDTH, Addresses
+from congrasp.common.ranges import MAX_DISTANCE, MAX_SPEED
+from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
 
 def initial_qpos(where: Addresses, nq: int, reset_state: ResetState) -> Array:

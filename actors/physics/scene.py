@@ -5,12 +5,12 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from common.config import TaskConfig
-from common.hands.mjcf import HAND_CONTYPE, WRIST_JOINTS, add_hand
-from common.hands.spec import Hand
-from common.objects.mjcf import CONTACT, ContactSettings, add_object
-from common.objects.spec import GraspObject
-from common.task.types import CONTACTS_PER_LINK
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.mjcf import HAND_CONTYPE, WRIST_JOINTS, add_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.mjcf import CONTACT, ContactSettings, add_object
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.types import CONTACTS_PER_LINK
 
 OBJECT_CONTYPE = 2
 """Collision bit of the object; the table answers to it."""

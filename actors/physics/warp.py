@@ -13,15 +13,15 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from actors.physics.catalogue import Catalogue
-from actors.physics.engine import PhysicsState, ResetState, where_environments
-from actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
-from actors.physics.scene import SENSOR_WIDTH, addresses
-from actors.physics.warp_buffers import WarpBuffers, control_step, meshes_on, objects_on, register
-from common.config import TaskConfig
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.task.types import CONTACTS_PER_LINK, Array
+from congrasp.actors.physics.catalogue import Catalogue
+from congrasp.actors.physics.engine import PhysicsState, ResetState, where_environments
+from congrasp.actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
+from congrasp.actors.physics.scene import SENSOR_WIDTH, addresses
+from congrasp.actors.physics.warp_buffers import WarpBuffers, control_step, meshes_on, objects_on, register
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
 wp.config.log_level = wp.LOG_WARNING  # not a line for each of some 50 modules that are loaded
 

@@ -17,8 +17,8 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 from warp import JaxCallableGraphMode, jax_callable
 
-from actors.physics.scene import TABLE_AWAY, Addresses
-from actors.physics.warp_kernels import DATA_LEAVES, MODEL_LEAVES, OBJECT_FIELDS, Leaves, Objects, count, place
+from congrasp.actors.physics.scene import TABLE_AWAY, Addresses
+from congrasp.actors.physics.warp_kernels import DATA_LEAVES, MODEL_LEAVES, OBJECT_FIELDS, Leaves, Objects, count, place
 
 CONTACTS_PER_ENVIRONMENT = 40
 """Contacts that the shared list holds for each environment on average."""

@@ -5,14 +5,14 @@ import os
 import pathlib
 from collections.abc import Callable
 
-from common.errors import CongraspError
-from common.hands.allegro import ALLEGRO
-from common.hands.files import MAX_BYTES, hand_from_text, read_hand
-from common.hands.human import HUMAN
-from common.hands.mano import own_mano_hand
-from common.hands.sharpa import SHARPA
-from common.hands.spec import Hand
-from common.inputs import LONGEST_NAME
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.allegro import ALLEGRO
+from congrasp.common.hands.files import MAX_BYTES, hand_from_text, read_hand
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.mano import own_mano_hand
+from congrasp.common.hands.sharpa import SHARPA
+from congrasp.common.hands.spec import Hand
+from congrasp.common.inputs import LONGEST_NAME
 
 HANDS: dict[str, Callable[[], Hand]] = {
     "human": lambda: HUMAN,

@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands.spec import Capsule, Hand, Joint, Link, Solid, Vector, chain, vector, wrist_gains
+from congrasp.common.hands.spec import Capsule, Hand, Joint, Link, Solid, Vector, chain, vector, wrist_gains
 
 _GAINS = {"kp": 3.0, "kv": 0.1, "torque_limit": 0.7, "armature": 1e-3}
 """Of a proportional-derivative controller as it is common for this hand; the motors' greatest torque is 0.7 N.m."""

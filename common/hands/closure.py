@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from common.hands import kinematics
-from common.hands.kinematics import grasp_frame
-from common.hands.motors import joint_positions, motor_limits, motor_positions
-from common.hands.spec import Hand
-from common.task.types import Array
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.types import Array
 
 CLOSURES = np.round(np.arange(-1.0, 0.51, 0.1), 6)
 """Closures at which gaps and outlines are tabulated: down to where fingers close on thin things."""

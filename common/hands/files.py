@@ -14,10 +14,10 @@ from typing import Any
 import dacite
 import numpy as np
 
-from common.errors import CongraspError
-from common.hands.motors import motor_limits
-from common.hands.spec import Hand, Solid, chain_of
-from common.inputs import LONGEST_NAME, read_file
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.motors import motor_limits
+from congrasp.common.hands.spec import Hand, Solid, chain_of
+from congrasp.common.inputs import LONGEST_NAME, read_file
 
 FORMAT = 1
 MAX_BYTES = 1 << 20

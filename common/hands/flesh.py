@@ -12,7 +12,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from common.hands.skeleton import Skeleton
+from congrasp.common.hands.skeleton import Skeleton
 
 _CELL = 0.0039  # side of a cell of the grid that the surface is cut from, m
 _PALM_BLEND, _FINGER_BLEND, _THUMB_BLEND = 0.014, 0.008, 0.020  # m over which parts run into one another

@@ -5,7 +5,7 @@ lunate, fingers towards -y, thumb side +x, back of the hand +z. Fingers flex wit
 `ip` with negative ones. Limits are MyoHand's, widened where anatomy allows; phalanx masses are of a mean adult hand.
 """
 
-from common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain, wrist_gains
+from congrasp.common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain, wrist_gains
 
 FINGER_GAINS = {"kp": 4.0, "kv": 0.15, "torque_limit": 1.5}
 WRIST = wrist_gains(0.35)

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common import rotations
-from common.hands.spec import Hand, link_origin
-from common.task.types import Array
+from congrasp.common import rotations
+from congrasp.common.hands.spec import Hand, link_origin
+from congrasp.common.task.types import Array
 
 
 class _Chain(NamedTuple):

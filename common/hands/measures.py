@@ -4,8 +4,8 @@ import functools
 
 import numpy as np
 
-from common.hands.motors import transmission
-from common.hands.spec import Hand, Link, chain_of
+from congrasp.common.hands.motors import transmission
+from congrasp.common.hands.spec import Hand, Link, chain_of
 
 HUMAN_OPENING = 0.106
 """m between thumb and fingers of the human hand, which grasps objects of their own size."""

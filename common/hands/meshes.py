@@ -8,10 +8,10 @@ import pathlib
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.hands import get_hand, own_hands
-from common.hands.spec import Hand
-from common.npz import read_npz
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand, own_hands
+from congrasp.common.hands.spec import Hand
+from congrasp.common.npz import read_npz
 
 SUFFIX = ".visual.npz"
 MAX_FACES = 3000

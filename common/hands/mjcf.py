@@ -6,10 +6,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from common.hands.spec import CONTACT_TIME, Capsule, Hand, Link, Solid, link_origin
-from common.objects import shapes
-from common.objects.mjcf import GEOM_TYPES
-from common.objects.spec import Piece
+from congrasp.common.hands.spec import CONTACT_TIME, Capsule, Hand, Link, Solid, link_origin
+from congrasp.common.objects import shapes
+from congrasp.common.objects.mjcf import GEOM_TYPES
+from congrasp.common.objects.spec import Piece
 
 HAND_CONTYPE = 1
 """Collision bit of the hand: whatever collides with it has this bit in its conaffinity."""

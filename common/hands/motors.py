@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.hands.spec import Hand
+from congrasp.common.hands.spec import Hand
 
 Array = Any
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from common.hands import kinematics
-from common.hands.closure import CLOSURES, closure_pose, table_of_gaps
-from common.hands.spec import Hand
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.closure import CLOSURES, closure_pose, table_of_gaps
+from congrasp.common.hands.spec import Hand
 
 
 class Outline(NamedTuple):

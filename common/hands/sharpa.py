@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain, vector, wrist_gains
+from congrasp.common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain, vector, wrist_gains
 
 
 class _Drive(NamedTuple):

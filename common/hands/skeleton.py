@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.hands.spec import Hand, link_origin
+from congrasp.common.hands.spec import Hand, link_origin
 
 
 class Skeleton(NamedTuple):

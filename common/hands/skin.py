@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from common.hands.flesh import Surface, flesh
-from common.hands.meshes import Meshes, own_meshes
-from common.hands.skeleton import Skeleton, skeleton_of
-from common.hands.spec import Hand, Link, link_origin
+from congrasp.common.hands.flesh import Surface, flesh
+from congrasp.common.hands.meshes import Meshes, own_meshes
+from congrasp.common.hands.skeleton import Skeleton, skeleton_of
+from congrasp.common.hands.spec import Hand, Link, link_origin
 
 HUMAN_HANDS = ("human", "mano")
 """Names of the hands that have flesh."""

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.inputs import LONGEST_NAME, file_name
-from common.objects.spec import COLOUR_POINTS, SURFACE_POINTS, GraspObject, Piece
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import LONGEST_NAME, file_name
+from congrasp.common.objects.spec import COLOUR_POINTS, SURFACE_POINTS, GraspObject, Piece
 
 LARGEST = 10.0
 """Metres from the object frame's origin to anything of the object."""

@@ -21,12 +21,12 @@ import trimesh
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from common.caches import keep, read_kept
-from common.files import cache_folder
-from common.objects import shapes
-from common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
-from common.task.types import Array
-from common.wire.codec import Message
+from congrasp.common.caches import keep, read_kept
+from congrasp.common.files import cache_folder
+from congrasp.common.objects import shapes
+from congrasp.common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
+from congrasp.common.task.types import Array
+from congrasp.common.wire.codec import Message
 
 CELLS = 1 << 17
 """Grid points of an object: cells of 1.5 to 3 mm, in a quarter of a megabyte."""

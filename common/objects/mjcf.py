@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from common.objects.spec import GraspObject
+from congrasp.common.objects.spec import GraspObject
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 from scipy.spatial import cKDTree
 
-from common.objects.spec import Colours
+from congrasp.common.objects.spec import Colours
 
 _EDGE, _MOST_FACES = 0.006, 12_000
 """m, that no edge need be shorter than; most faces."""

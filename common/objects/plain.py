@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from common.objects import shapes
-from common.objects.spec import GraspObject, Piece
-from common.objects.surface import mass_properties, sample_union
+from congrasp.common.objects import shapes
+from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.common.objects.surface import mass_properties, sample_union
 
 
 def plain_object(name: str, pieces: tuple[Piece, ...], density: float) -> GraspObject:

@@ -3,12 +3,12 @@
 import pathlib
 from collections.abc import Sequence
 
-from common.config import ObjectsConfig, TaskConfig
-from common.errors import CongraspError
-from common.hands.spec import Hand
-from common.objects import procedural
-from common.objects.spec import GraspObject
-from common.objects.store import Catalogue
+from congrasp.common.config import ObjectsConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.objects.store import Catalogue
 
 HELD_OUT_SEED = 1_000_000
 """Seeds from here upward are never trained on; those below `FIGURES_SEED` are for development."""

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.objects import shapes
-from common.objects.families import BASIC, BUILDERS, HOUSEHOLD, Draft
-from common.objects.resting import rest_poses
-from common.objects.spec import GraspObject
-from common.objects.surface import halves, mass_properties, sample_union
-from common.parallel import parallel_map
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import shapes
+from congrasp.common.objects.families import BASIC, BUILDERS, HOUSEHOLD, Draft
+from congrasp.common.objects.resting import rest_poses
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.objects.surface import halves, mass_properties, sample_union
+from congrasp.common.parallel import parallel_map
 
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)
 BASIC_FAMILIES = tuple(BASIC)

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from common.objects import shapes
-from common.objects.mjcf import CONTACT, add_object
-from common.objects.spec import GraspObject, Piece
+from congrasp.common.objects import shapes
+from congrasp.common.objects.mjcf import CONTACT, add_object
+from congrasp.common.objects.spec import GraspObject, Piece
 
 MAX_POSES = 8
 _SAME_NORMAL = np.cos(np.radians(15))  # directions nearer than this count as one

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from common.objects.spec import Piece
+from congrasp.common.objects.spec import Piece
 
 _SEGMENTS = 24
 

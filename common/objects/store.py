@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.inputs import file_name, read_file
-from common.objects.checks import faults
-from common.objects.spec import Colours, GraspObject, Piece
-from common.wire.codec import Message, decode, encode
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.inputs import file_name, read_file
+from congrasp.common.objects.checks import faults
+from congrasp.common.objects.spec import Colours, GraspObject, Piece
+from congrasp.common.wire.codec import Message, decode, encode
 
 SUFFIX = ".safetensors"
 MAX_BYTES = 64 << 20

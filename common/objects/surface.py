@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from common.objects import shapes
-from common.objects.spec import SURFACE_POINTS, Piece
+from congrasp.common.objects import shapes
+from congrasp.common.objects.spec import SURFACE_POINTS, Piece
 
 _SEAM = 2e-4  # m; a point is outside if it still is after this step along its normal
 _REACHABLE = 4e-3  # m; a mesh's surface counts as open if the collision pieces end within this distance

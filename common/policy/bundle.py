@@ -18,19 +18,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.config import NetworkConfig, TaskConfig, with_older_critic, with_older_physics
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.hands import check_reference, get_hand
-from common.inputs import read_file
-from common.policy import network, normalizer
-from common.policy.network import Layout, Params
-from common.policy.normalizer import Affine, Statistics
-from common.ranges import network_faults, task_faults
-from common.task import observation as task_observation
-from common.task import privileged
-from common.task.types import Array
-from common.wire.codec import MAX_MESSAGE, Message, decode, encode
+from congrasp.common.config import NetworkConfig, TaskConfig, with_older_critic, with_older_physics
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.hands import check_reference, get_hand
+from congrasp.common.inputs import read_file
+from congrasp.common.policy import network, normalizer
+from congrasp.common.policy.network import Layout, Params
+from congrasp.common.policy.normalizer import Affine, Statistics
+from congrasp.common.ranges import network_faults, task_faults
+from congrasp.common.task import observation as task_observation
+from congrasp.common.task import privileged
+from congrasp.common.task.types import Array
+from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 FORMAT = 1
 _MALFORMED = (LookupError, AttributeError, TypeError, ValueError, OverflowError)

@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.config import NetworkConfig
-from common.errors import CongraspError
-from common.task.types import Array
+from congrasp.common.config import NetworkConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.task.types import Array
 
 Layout = tuple[tuple[str, int], ...]
 """Names and sizes of an observation's blocks, in order (`common.task.observation.layout`)."""

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.policy.network import TRUNK, Layout
-from common.task.types import Array
+from congrasp.common.policy.network import TRUNK, Layout
+from congrasp.common.task.types import Array
 
 LIMIT = 10.0
 """Normalised observations are clipped to plus and minus this."""

@@ -3,9 +3,9 @@
 import os
 import pathlib
 
-from common.errors import CongraspError
-from common.hands import HANDS, get_hand, hands_folder, own_hands
-from common.policy import bundle as bundles
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import HANDS, get_hand, hands_folder, own_hands
+from congrasp.common.policy import bundle as bundles
 
 _FOLDER = pathlib.Path(__file__).with_name("data")
 SUFFIX = ".safetensors"

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.task.types import Array
+from congrasp.common.task.types import Array
 
 
 class ConstraintBank(NamedTuple):

@@ -6,14 +6,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from common.config import Split
-from common.described import check_arrays
-from common.errors import CongraspError
-from common.inputs import file_name, read_file
-from common.objects import store
-from common.objects.spec import GraspObject
-from common.task.bank import ConstraintBank, stacked
-from common.wire.codec import MAX_MESSAGE, Message, decode
+from congrasp.common.config import Split
+from congrasp.common.described import check_arrays
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import file_name, read_file
+from congrasp.common.objects import store
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.bank import ConstraintBank, stacked
+from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode
 
 SUFFIX = ".constraints.safetensors"
 REGIONS = ("whole surface", "graspable region")

@@ -5,13 +5,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from common.config import ControlConfig, TaskConfig
-from common.hands.motors import joint_positions, motor_limits, motor_positions
-from common.hands.spec import Hand
-from common.task.constraints import known
-from common.task.constraints.base import Scene
-from common.task.geometry import wrist_to_joints
-from common.task.types import Action, Array, SceneState
+from congrasp.common.config import ControlConfig, TaskConfig
+from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints import known
+from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.geometry import wrist_to_joints
+from congrasp.common.task.types import Action, Array, SceneState
 
 jax.tree_util.register_dataclass(
     ControlConfig,

@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from common import rotations
-from common.config import TaskConfig
-from common.hands import kinematics
-from common.hands.spec import Hand
-from common.task.constraints import known
-from common.task.constraints.base import Scene
-from common.task.constraints.fingers import chosen_fingers
-from common.task.geometry import hand_center, nearest_index, squared_distances, wrist_pose
-from common.task.sensing import Readings
-from common.task.types import Array, Goal, SceneState, Surface
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints import known
+from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.constraints.fingers import chosen_fingers
+from congrasp.common.task.geometry import hand_center, nearest_index, squared_distances, wrist_pose
+from congrasp.common.task.sensing import Readings
+from congrasp.common.task.types import Array, Goal, SceneState, Surface
 
 
 class Features(NamedTuple):

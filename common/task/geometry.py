@@ -3,10 +3,10 @@
 import jax
 import jax.numpy as jnp
 
-from common import rotations
-from common.hands import kinematics
-from common.hands.spec import Hand
-from common.task.types import Array, SceneState
+from congrasp.common import rotations
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.types import Array, SceneState
 
 FAR = 0.3
 """Metres that stand for "no such surface point"."""

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from common.config import CurriculumConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
+from congrasp.common.config import CurriculumConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 STUDENT = "student"

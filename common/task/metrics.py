@@ -4,11 +4,11 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 
-from common.config import TaskConfig
-from common.task.constraints import blocks, error_specs, known
-from common.task.constraints.base import ErrorSpec, Scene
-from common.task.reward import terms
-from common.task.types import Array
+from congrasp.common.config import TaskConfig
+from congrasp.common.task.constraints import blocks, error_specs, known
+from congrasp.common.task.constraints.base import ErrorSpec, Scene
+from congrasp.common.task.reward import terms
+from congrasp.common.task.types import Array
 
 FORCES = ("force_sum", "force_link_max")
 DIVERGED = "bad"  # the metric's name on the wire and in recordings

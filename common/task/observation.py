@@ -5,14 +5,14 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from common import rotations
-from common.config import TaskConfig
-from common.hands.spec import Hand
-from common.task.constraints import blocks, known
-from common.task.constraints.base import ObservationField, Scene
-from common.task.geometry import flat, squash
-from common.task.sensing import Readings
-from common.task.types import Array
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints import blocks, known
+from congrasp.common.task.constraints.base import ObservationField, Scene
+from congrasp.common.task.geometry import flat, squash
+from congrasp.common.task.sensing import Readings
+from congrasp.common.task.types import Array
 
 
 def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:

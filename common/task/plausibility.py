@@ -13,17 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from common import rotations
-from common.hands import kinematics
-from common.hands.meshes import own_meshes
-from common.hands.mjcf import overlapping
-from common.hands.motors import motor_positions
-from common.hands.spec import Hand
-from common.objects.distance import DistanceField
-from common.objects.shapes import mesh_of
-from common.objects.spec import Piece
-from common.task.constraints.base import Scene
-from common.task.types import Array
+from congrasp.common import rotations
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.meshes import own_meshes
+from congrasp.common.hands.mjcf import overlapping
+from congrasp.common.hands.motors import motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.distance import DistanceField
+from congrasp.common.objects.shapes import mesh_of
+from congrasp.common.objects.spec import Piece
+from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.types import Array
 
 CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}
 """Deepest penetrations below which an episode is clean; `hand_mesh_mm` is measured of hands with meshes alone."""

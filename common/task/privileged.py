@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from common.config import TaskConfig
-from common.hands.measures import tip_forces
-from common.hands.spec import Hand
-from common.task import observation
-from common.task.constraints.base import ObservationField, Scene
-from common.task.sensing import Sensors
-from common.task.types import Array
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.measures import tip_forces
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task import observation
+from congrasp.common.task.constraints.base import ObservationField, Scene
+from congrasp.common.task.sensing import Sensors
+from congrasp.common.task.types import Array
 
 GRAVITY = 9.81
 """m/s^2."""

@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 
-from common import rotations
-from common.task.constraints import known
-from common.task.constraints.base import Scene
-from common.task.constraints.fingers import chosen_fingers, keypoint_weights
-from common.task.geometry import FAR, square
-from common.task.types import Array, SceneState
+from congrasp.common import rotations
+from congrasp.common.task.constraints import known
+from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.constraints.fingers import chosen_fingers, keypoint_weights
+from congrasp.common.task.geometry import FAR, square
+from congrasp.common.task.types import Array, SceneState
 
 if TYPE_CHECKING:
-    from common.config import RewardWeights, TaskConfig
+    from congrasp.common.config import RewardWeights, TaskConfig
 
 
 class Earning(NamedTuple):

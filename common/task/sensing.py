@@ -12,9 +12,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from common import rotations
-from common.config import SensingConfig, TaskConfig
-from common.task.types import Array, SceneState
+from congrasp.common import rotations
+from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.task.types import Array, SceneState
 
 
 class Sensors(NamedTuple):

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from typing import Protocol, Self
 
-from common.errors import CongraspError
-from common.wire.codec import Message
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message
 
 Handler = Callable[[str, Message], Message]
 """(key, request) -> reply."""

@@ -9,8 +9,8 @@ from typing import NamedTuple
 from cryptography import x509
 from cryptography.x509.oid import NameOID
 
-from common.errors import CongraspError
-from common.transport.security import CERTIFICATE_FILE, ROLES, Credentials, Identity, not_ours, parse_identity
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.security import CERTIFICATE_FILE, ROLES, Credentials, Identity, not_ours, parse_identity
 
 
 class Certificate(NamedTuple):

@@ -6,7 +6,7 @@ import platform
 import re
 from typing import Literal, NamedTuple
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 ROOT = "congrasp"
 Flow = Literal["control", "bulk", "log", "policy"]

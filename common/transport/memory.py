@@ -14,10 +14,10 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import NamedTuple, Self
 
-from common.errors import CongraspError, RefusedError, TransportError, error_of
-from common.transport.base import Admission, Answerer, Damage, Subscription, join
-from common.transport.keys import matches
-from common.wire.codec import Message
+from congrasp.common.errors import CongraspError, RefusedError, TransportError, error_of
+from congrasp.common.transport.base import Admission, Answerer, Damage, Subscription, join
+from congrasp.common.transport.keys import matches
+from congrasp.common.wire.codec import Message
 
 _log = logging.getLogger(__name__)
 _GRACE = 5.0

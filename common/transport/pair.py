@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from typing import Any, Self
 
-from common.transport.base import Answerer, Subscription, Transport
-from common.wire.codec import Message
+from congrasp.common.transport.base import Answerer, Subscription, Transport
+from congrasp.common.wire.codec import Message
 
 
 class PairTransport:

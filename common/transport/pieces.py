@@ -14,7 +14,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 
-from common.errors import TransportError
+from congrasp.common.errors import TransportError
 
 _SHORTEST, _FIRST, _LONGEST = 8 << 10, 32 << 10, 4 << 20  # bytes of a piece
 _FAST, _SLOW = 0.1, 0.4  # seconds of a piece below which the next is longer, and above which it is shorter

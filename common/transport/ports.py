@@ -11,8 +11,8 @@ import socket
 import tempfile
 import threading
 
-from common.errors import CongraspError
-from common.transport.keys import FLOWS
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.keys import FLOWS
 
 LEARNER_URL = "tcp/127.0.0.1:7447"
 """Where a learner listens unless told otherwise: on this machine only, and on as many ports from this one on as there

@@ -20,8 +20,8 @@ import ssl
 from collections.abc import Iterable, Iterator, Set
 from typing import Any, NamedTuple
 
-from common.errors import CongraspError
-from common.transport.keys import ROOT, Flow, flow
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.keys import ROOT, Flow, flow
 
 ROLES = ("learner", "actor", "server", "client", "observer")
 """Certificate roles."""

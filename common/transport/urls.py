@@ -10,12 +10,12 @@ import pathlib
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from common.errors import CongraspError
-from common.transport.base import Transport
-from common.transport.keys import FLOWS, Flow
-from common.transport.memory import connect_in_memory, listen_in_memory
-from common.transport.ports import LEARNER_URL
-from common.transport.security import Credentials, check_exposure, numbered
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import FLOWS, Flow
+from congrasp.common.transport.memory import connect_in_memory, listen_in_memory
+from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.common.transport.security import Credentials, check_exposure, numbered
 
 Listener = Literal["learner", "server"]
 Peer = Literal["actor", "server", "client", "observer"]
@@ -114,7 +114,7 @@ def find_credentials(certs: Certs, role: str, run: str | None = None) -> Credent
         return None
     if importlib.util.find_spec("cryptography") is None:
         return Credentials(pathlib.Path(certs), role)
-    from common.transport.certificates import find
+    from congrasp.common.transport.certificates import find
 
     credentials = find(pathlib.Path(certs), role)
     if run is not None and credentials.identity.run != run:
@@ -148,7 +148,7 @@ def _open_memory(endpoint: Endpoint) -> Transport:
 
 
 def _open_zenoh(endpoint: Endpoint) -> Transport:
-    from common.transport.zenoh_transport import ZenohTransport
+    from congrasp.common.transport.zenoh_transport import ZenohTransport
 
     credentials = find_credentials(endpoint.certs, endpoint.role, endpoint.run)
     if endpoint.listens:

@@ -17,10 +17,10 @@ from typing import Any
 
 import zenoh
 
-from common.errors import CongraspError, TransportError
-from common.transport.base import join
-from common.transport.keys import FLOWS, Flow
-from common.transport.security import Credentials, limits, refusal
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.transport.base import join
+from congrasp.common.transport.keys import FLOWS, Flow
+from congrasp.common.transport.security import Credentials, limits, refusal
 
 LONGEST: dict[Flow, int] = {"control": 2 << 20, "log": 32 << 20, "policy": 2 << 20}
 """Bytes of a message that is put together at all; every connection may have several in the making."""

@@ -23,15 +23,15 @@ from typing import Any, NamedTuple, Self
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from common.errors import CongraspError, RefusedError, TransportError, error_of
-from common.transport import pieces, zenoh_session
-from common.transport.base import Admission, Answerer, Damage, Subscription
-from common.transport.keys import FLOWS, Flow, account, flow
-from common.transport.pieces import Outbox, Pace
-from common.transport.ports import shifted
-from common.transport.security import Credentials, secured
-from common.transport.zenoh_session import Sessions, first_line
-from common.wire.codec import MAX_MESSAGE, Message, decode, encode
+from congrasp.common.errors import CongraspError, RefusedError, TransportError, error_of
+from congrasp.common.transport import pieces, zenoh_session
+from congrasp.common.transport.base import Admission, Answerer, Damage, Subscription
+from congrasp.common.transport.keys import FLOWS, Flow, account, flow
+from congrasp.common.transport.pieces import Outbox, Pace
+from congrasp.common.transport.ports import shifted
+from congrasp.common.transport.security import Credentials, secured
+from congrasp.common.transport.zenoh_session import Sessions, first_line
+from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 _QUEUE = 256  # samples that wait for a thread that only moves them on
 _FEW = 4 << 10  # bytes of a query that may be sent twice

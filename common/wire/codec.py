@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 try:  # the same checksum, seven times as fast where it is installed
     from isal.isal_zlib import crc32

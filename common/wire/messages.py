@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.transport.keys import check_name
-from common.wire.codec import Message
-from common.wire.schema import F32, RECORDABLE, ArraySpec, RolloutForm
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.keys import check_name
+from congrasp.common.wire.codec import Message
+from congrasp.common.wire.schema import F32, RECORDABLE, ArraySpec, RolloutForm
 
 LONGEST_TEXT = 4096
 """Characters of a text in the meta data; a hand's own text has its own limit (`common.hands.files`)."""

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-from common.config import RunConfig
-from common.errors import CongraspError
-from common.policy.bundle import PolicySpec
-from learner.algorithms.distill import Distillation
-from learner.algorithms.ppo import PPO
-from learner.algorithms.protocol import Algorithm
+from congrasp.common.config import RunConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy.bundle import PolicySpec
+from congrasp.learner.algorithms.distill import Distillation
+from congrasp.learner.algorithms.ppo import PPO
+from congrasp.learner.algorithms.protocol import Algorithm
 
 ALGORITHMS: dict[str, Callable[[PolicySpec, RunConfig], Algorithm]] = {
     "ppo": lambda spec, config: PPO(spec, config.ppo, config.updates),

@@ -16,19 +16,19 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from common.config import DistillConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from common.policy import network, normalizer
-from common.policy.bundle import InferenceParameters, PolicyBundle, PolicySpec, full_layout
-from common.policy.network import Layout, Params
-from common.policy.normalizer import Affine, Statistics
-from common.policy.pretrained import named_policy
-from common.task.types import Array
-from common.wire.schema import RECORDABLE, Schema
-from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
-from learner.batch import partition_specs
-from learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.common.config import DistillConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy import network, normalizer
+from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, PolicySpec, full_layout
+from congrasp.common.policy.network import Layout, Params
+from congrasp.common.policy.normalizer import Affine, Statistics
+from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.task.types import Array
+from congrasp.common.wire.schema import RECORDABLE, Schema
+from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from congrasp.learner.batch import partition_specs
+from congrasp.learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 _SCHEMA = {name: RECORDABLE[name] for name in ("observation", "teacher_observation")}
 _SPECS = partition_specs(_SCHEMA)

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from common.task.types import Array
+from congrasp.common.task.types import Array
 
 
 def td_errors(

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from common.policy import network
-from common.policy.network import Layout, Params
-from common.task.types import Array
+from congrasp.common.policy import network
+from congrasp.common.policy.network import Layout, Params
+from congrasp.common.task.types import Array
 
 
 class Sample(NamedTuple):

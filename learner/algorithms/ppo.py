@@ -20,18 +20,18 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh, PartitionSpec
 
-from common.config import PPOConfig
-from common.errors import CongraspError
-from common.policy import network, normalizer
-from common.policy.bundle import PolicySpec
-from common.policy.network import Layout, Params
-from common.policy.normalizer import Affine, Statistics
-from common.task.types import Array
-from common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
-from learner.algorithms import gae, losses
-from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
-from learner.batch import partition_specs
-from learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.common.config import PPOConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import network, normalizer
+from congrasp.common.policy.bundle import PolicySpec
+from congrasp.common.policy.network import Layout, Params
+from congrasp.common.policy.normalizer import Affine, Statistics
+from congrasp.common.task.types import Array
+from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
+from congrasp.learner.algorithms import gae, losses
+from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from congrasp.learner.batch import partition_specs
+from congrasp.learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 _SPECS = partition_specs(RECORDABLE)
 _CHECKED_INPUTS = tuple(name for name, spec in {**RECORDED, **PRIVILEGED}.items() if spec.dtypes != ("bool",))

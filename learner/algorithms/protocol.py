@@ -9,13 +9,13 @@ from typing import Any, NamedTuple, Protocol
 
 from jax.sharding import Mesh
 
-from common.errors import PhysicsError
-from common.policy import network, normalizer
-from common.policy.bundle import PolicySpec
-from common.policy.network import Params
-from common.policy.normalizer import Statistics
-from common.task.types import Array
-from common.wire.schema import Schema
+from congrasp.common.errors import PhysicsError
+from congrasp.common.policy import network, normalizer
+from congrasp.common.policy.bundle import PolicySpec
+from congrasp.common.policy.network import Params
+from congrasp.common.policy.normalizer import Statistics
+from congrasp.common.task.types import Array
+from congrasp.common.wire.schema import Schema
 
 
 class Policy(NamedTuple):

@@ -16,9 +16,9 @@ from collections.abc import Callable
 import zenoh
 from zenoh.handlers import Callback, FifoChannel
 
-from common.transport.keys import Keys
-from common.transport.ports import shifted
-from common.wire.codec import Message, encode
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.ports import shifted
+from congrasp.common.wire.codec import Message, encode
 
 _SILENT = 300
 _HUGE = 60 << 20

@@ -27,20 +27,20 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
-from actors.link import ActorLink
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from common.transport import urls
-from common.transport.keys import FLOWS
-from common.transport.ports import free_port, local_url, shifted
-from common.wire.codec import Message, encode
-from common.wire.schema import RolloutForm
-from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
-from services.serve.client import PolicyClient
-from services.serve.load import Example, example_episode, processor_seconds, serving, wait_until_ready
-from services.train.command import untrained
-from services.train.presets import get_preset
+from congrasp.actors.link import ActorLink
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import FLOWS
+from congrasp.common.transport.ports import free_port, local_url, shifted
+from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.staleness import StalenessManager
+from congrasp.services.serve.client import PolicyClient
+from congrasp.services.serve.load import Example, example_episode, processor_seconds, serving, wait_until_ready
+from congrasp.services.train.command import untrained
+from congrasp.services.train.presets import get_preset
 
 _FORM = RolloutForm(steps=20, worlds=34, observation=534, action=26, half=True)
 _RUN, _RUN_ID, _SCHEMA = "bench", "id", "schema"
@@ -114,7 +114,7 @@ def attacked(
     kind: str, endpoint: str, run: str, query: pathlib.Path | None = None, count: int = 1
 ) -> Iterator[Sequence[subprocess.Popen]]:
     """Attackers of a kind, in processes of their own, while the block runs."""
-    command = [sys.executable, "-m", "services.bench.attackers", kind, endpoint, run, str(query or "")]
+    command = [sys.executable, "-m", "congrasp.services.bench.attackers", kind, endpoint, run, str(query or "")]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) for _ in range(count)]
     try:
         for process in processes:

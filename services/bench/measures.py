@@ -9,19 +9,19 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from actors.bank import build_bank
-from actors.physics import make_physics, resolve_physics
-from actors.rollout import Probe, RolloutWorker
-from common.config import ObjectsConfig
-from common.engines import PhysicsName
-from common.hands import get_hand
-from common.objects.distance import distance_field
-from common.objects.pool import HELD_OUT_SEED, load_pool, scale_objects
-from common.policy import bundle as bundles
-from common.policy.bundle import sample_action
-from common.policy.pretrained import policy_file
-from common.task import plausibility
-from services.evaluate.protocol import protocol, two_seconds
+from congrasp.actors.bank import build_bank
+from congrasp.actors.physics import make_physics, resolve_physics
+from congrasp.actors.rollout import Probe, RolloutWorker
+from congrasp.common.config import ObjectsConfig
+from congrasp.common.engines import PhysicsName
+from congrasp.common.hands import get_hand
+from congrasp.common.objects.distance import distance_field
+from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool, scale_objects
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import sample_action
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.task import plausibility
+from congrasp.services.evaluate.protocol import protocol, two_seconds
 
 
 def bench_measures(physics: PhysicsName, environments: int, threads: int, repeats: int) -> None:

@@ -9,14 +9,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from actors.physics.scene import TABLE_AWAY, addresses, compile_scene
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.hands.motors import motor_positions
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject, Piece
-from services.assets.objects.fidelity import fidelity
-from services.assets.objects.pieces import merge, simplify
+from congrasp.actors.physics.scene import TABLE_AWAY, addresses, compile_scene
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.motors import motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.services.assets.objects.fidelity import fidelity
+from congrasp.services.assets.objects.pieces import merge, simplify
 
 _CLOSING = 100
 """Control steps in which the fingers close around the object, which is held where it is."""

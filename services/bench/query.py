@@ -3,11 +3,11 @@
 import pathlib
 import tempfile
 
-from common.policy import bundle as bundles
-from services.serve.client import PolicyClient
-from services.serve.load import example_episode, measure, processor_seconds, serving, wait_until_ready
-from services.train.command import untrained
-from services.train.presets import get_preset
+from congrasp.common.policy import bundle as bundles
+from congrasp.services.serve.client import PolicyClient
+from congrasp.services.serve.load import example_episode, measure, processor_seconds, serving, wait_until_ready
+from congrasp.services.train.command import untrained
+from congrasp.services.train.presets import get_preset
 
 
 def bench_query(repeat: int, concurrency: int, states: int) -> None:

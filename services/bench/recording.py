@@ -10,15 +10,15 @@ import time
 import psutil
 from rich.console import Console
 
-from common.errors import CongraspError
-from common.transport import urls
-from common.transport.keys import Keys
-from common.transport.ports import local_url
-from learner.process import run_learner
-from learner.run_directory import create_run
-from services.record.recorder import Recorder
-from services.train.presets import get_preset
-from services.train.processes import Child, end_all
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.ports import local_url
+from congrasp.learner.process import run_learner
+from congrasp.learner.run_directory import create_run
+from congrasp.services.record.recorder import Recorder
+from congrasp.services.train.presets import get_preset
+from congrasp.services.train.processes import Child, end_all
 
 _PATIENCE = 300.0
 

@@ -9,9 +9,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from common.errors import CongraspError
-from services.bench.run_under_test import RunUnderTest, until
-from services.ops.audit import audit
+from congrasp.common.errors import CongraspError
+from congrasp.services.bench.run_under_test import RunUnderTest, until
+from congrasp.services.ops.audit import audit
 
 _WINDOW = 10.0  # seconds over which throughput is measured
 _AFTER = 5.0  # seconds after a death

@@ -11,11 +11,11 @@ from typing import Any
 
 import psutil
 
-from common.errors import CongraspError, TransportError
-from common.transport import urls
-from common.transport.base import Transport
-from common.transport.keys import Keys
-from common.wire.codec import Message
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.transport import urls
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message
 
 _RUN = "quickstart"
 _SMALL = (
@@ -46,7 +46,7 @@ class RunUnderTest:
 
     def start(self) -> None:
         """Begins the run, or resumes it, and waits until its learner has taken rollouts from all actors."""
-        command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(self.run_dir)]
+        command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(self.run_dir)]
         begun = (self.run_dir / "config.json").exists()
         command += [
             "--metric-writers",

@@ -15,11 +15,11 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from common.config import RunConfig
-from common.errors import CongraspError, TransportError
-from common.parallel import cores
-from learner.run_directory import create_run
-from services.train.processes import engine_of, leave_gpus_to, train
+from congrasp.common.config import RunConfig
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.parallel import cores
+from congrasp.learner.run_directory import create_run
+from congrasp.services.train.processes import engine_of, leave_gpus_to, train
 
 _WARM_UPDATES = 5
 """Updates before the measurement: the first ones compile, and begin with fresh episodes everywhere."""

@@ -10,14 +10,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from common.errors import TransportError
-from common.transport import urls
-from common.transport.base import Transport
-from common.transport.keys import Keys
-from common.transport.ports import local_url
-from common.wire.codec import Message
-from learner.rate_limit import RateLimit
-from services.ops.certificates import create_authority, issue
+from congrasp.common.errors import TransportError
+from congrasp.common.transport import urls
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.ports import local_url
+from congrasp.common.wire.codec import Message
+from congrasp.learner.rate_limit import RateLimit
+from congrasp.services.ops.certificates import create_authority, issue
 
 _KEYS = Keys("bench")
 _ACTOR, _EVIL = "0.a", "1.b"

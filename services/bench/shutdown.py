@@ -75,7 +75,7 @@ def attempts(count: int, within: float, seed: int = 0) -> Iterator[Attempt]:
     times = random.Random(seed)
     for number in range(count):
         with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
-            command = [sys.executable, "-m", "services.cli.main", *SMALL, "--run-dir", str(pathlib.Path(folder, "run"))]
+            command = [sys.executable, "-m", "congrasp", *SMALL, "--run-dir", str(pathlib.Path(folder, "run"))]
             yield attempt(command, times.uniform(0.0, within), signal.SIGTERM if number % 2 else signal.SIGINT)
 
 

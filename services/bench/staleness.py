@@ -9,9 +9,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from common.policy import bundle as bundles
-from learner.algorithms.ppo import PPO
-from services.bench import toy
+from congrasp.common.policy import bundle as bundles
+from congrasp.learner.algorithms.ppo import PPO
+from congrasp.services.bench import toy
 
 SETTINGS = dataclasses.replace(
     toy.SETTINGS, epochs=16, learning_rate=5e-3, learning_rate_range=(1e-5, 1e-2), kl_target=0.02

@@ -12,11 +12,11 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from common.config import RunConfig
-from common.engines import PhysicsName
-from common.errors import CongraspError
-from common.stages import imported, since_start, stages
-from services.train.warmup import until_first_update
+from congrasp.common.config import RunConfig
+from congrasp.common.engines import PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.stages import imported, since_start, stages
+from congrasp.services.train.warmup import until_first_update
 
 _STOPPED_SECONDS = 30.0
 _EVENTS = {

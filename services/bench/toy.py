@@ -9,11 +9,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from common.config import NetworkConfig, PPOConfig, TaskConfig
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle, PolicySpec
-from common.task.types import Array
-from learner.algorithms.protocol import TrainState
+from congrasp.common.config import NetworkConfig, PPOConfig, TaskConfig
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle, PolicySpec
+from congrasp.common.task.types import Array
+from congrasp.learner.algorithms.protocol import TrainState
 
 STANDING_STILL = -5.0
 HALVING = -0.5

@@ -23,18 +23,18 @@ import zenoh
 from zenoh import CongestionControl
 from zenoh.handlers import FifoChannel
 
-from actors.link import ActorLink, RunFinished
-from common.errors import CongraspError
-from common.journal import AUDIT, Journal
-from common.transport import urls
-from common.transport.ports import free_port, local_url
-from common.wire.codec import Message, encode
-from common.wire.schema import RolloutForm
-from learner.admission import Admission, Ranges
-from learner.audit import AuditLog
-from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
-from learner.write_ahead import FOLDER, WriteAheadLog
+from congrasp.actors.link import ActorLink, RunFinished
+from congrasp.common.errors import CongraspError
+from congrasp.common.journal import AUDIT, Journal
+from congrasp.common.transport import urls
+from congrasp.common.transport.ports import free_port, local_url
+from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.admission import Admission, Ranges
+from congrasp.learner.audit import AuditLog
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.write_ahead import FOLDER, WriteAheadLog
 
 _FORM = RolloutForm(steps=20, worlds=340, observation=534, action=26, half=True)
 """Of the human hand's rollouts; these have 8.0 MB."""

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import tyro
 
-from actors.physics import PhysicsName
-from common.transport.ports import LEARNER_URL
-from services.cli.watch import Watch, Watched
+from congrasp.actors.physics import PhysicsName
+from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.services.cli.watch import Watch, Watched
 
 
 def actor(
@@ -38,14 +38,14 @@ def actor(
       congrasp actor --connect tcp/127.0.0.1:7447 --run human
       congrasp actor --connect tls/10.0.0.5:7447 --run human --certs actor.1
     """
-    from actors.process import run_actor
-    from common.journal import Journal
-    from common.parallel import cores
-    from common.transport import urls
-    from common.transport.keys import process_name
-    from services.ops.logs import log
-    from services.ops.metrics import ActorMetrics
-    from services.ops.shutdown import on_signal
+    from congrasp.actors.process import run_actor
+    from congrasp.common.journal import Journal
+    from congrasp.common.parallel import cores
+    from congrasp.common.transport import urls
+    from congrasp.common.transport.keys import process_name
+    from congrasp.services.ops.logs import log
+    from congrasp.services.ops.metrics import ActorMetrics
+    from congrasp.services.ops.shutdown import on_signal
 
     name = urls.name_on_wire(id or process_name("actor"), certs)
     metrics = ActorMetrics()

@@ -23,7 +23,7 @@ def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tupl
     from rich.console import Console
     from rich.table import Table
 
-    from services.ops.audit import FAULTS, audit
+    from congrasp.services.ops.audit import FAULTS, audit
 
     report = audit(run_dir, journals)
     console = Console()

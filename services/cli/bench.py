@@ -2,7 +2,7 @@
 
 import pathlib
 
-from actors.physics import PhysicsName
+from congrasp.actors.physics import PhysicsName
 
 
 def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines: tuple[str, ...] = ()) -> int:
@@ -20,8 +20,8 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
       congrasp bench physics
       congrasp bench physics --engines native warp --environments 1024
     """
-    from common.parallel import cores
-    from services.bench import physics as bench
+    from congrasp.common.parallel import cores
+    from congrasp.services.bench import physics as bench
 
     bench.bench_physics(environments, threads or cores(), repeats, list(engines) or bench.engines())  # type: ignore[arg-type]
     return 0
@@ -47,8 +47,8 @@ def pieces(
       congrasp bench pieces --objects my-objects
       congrasp bench pieces --objects my-objects --counts 8 32 --vertices 32
     """
-    from services.assets.objects.named import objects_of
-    from services.bench.pieces import bench_pieces
+    from congrasp.services.assets.objects.named import objects_of
+    from congrasp.services.bench.pieces import bench_pieces
 
     bench_pieces(objects_of(objects), hand, counts, vertices, repeats)
     return 0
@@ -68,7 +68,7 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
       congrasp bench query
       congrasp bench query --repeat 5000 --concurrency 4
     """
-    from services.bench.query import bench_query
+    from congrasp.services.bench.query import bench_query
 
     bench_query(repeat, concurrency, states)
     return 0
@@ -89,7 +89,7 @@ def shutdown(repeats: int = 100, within: float = 45.0, seed: int = 0) -> int:
       congrasp bench shutdown
       congrasp bench shutdown --repeats 10
     """
-    from services.bench.shutdown import bench_shutdown
+    from congrasp.services.bench.shutdown import bench_shutdown
 
     return 0 if bench_shutdown(repeats, within, seed) else 1
 
@@ -112,8 +112,8 @@ def security(repeats: int = 5, seconds: float = 5.0, turns: int = 3, attacks: tu
       congrasp bench security
       congrasp bench security --seconds 2 --repeats 3
     """
-    from services.bench.attacks import bench_attacks
-    from services.bench.security import bench_security
+    from congrasp.services.bench.attacks import bench_attacks
+    from congrasp.services.bench.security import bench_security
 
     if repeats:
         bench_security(repeats)
@@ -136,7 +136,7 @@ def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: 
       congrasp bench transport
       congrasp bench transport --senders 4
     """
-    from services.bench.transport import bench_transport
+    from congrasp.services.bench.transport import bench_transport
 
     bench_transport(senders, seconds, repeats, actors, versions)
     return 0
@@ -155,7 +155,7 @@ def staleness(lag: int = 4, seeds: int = 5, updates: int = 40, worlds: int = 32)
       congrasp bench staleness
       congrasp bench staleness --lag 8 --seeds 3
     """
-    from services.bench.staleness import bench_staleness
+    from congrasp.services.bench.staleness import bench_staleness
 
     bench_staleness(lag, seeds, updates, worlds)
     return 0
@@ -179,7 +179,7 @@ def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed
       congrasp bench faults
       congrasp bench faults --repeats 5
     """
-    from services.bench.faults import bench_faults
+    from congrasp.services.bench.faults import bench_faults
 
     return 0 if bench_faults(actors, repeats, kinds, seed) else 1
 
@@ -195,7 +195,7 @@ def recovery(actors: int = 3, repeats: int = 3) -> int:
       congrasp bench recovery
       congrasp bench recovery --actors 4
     """
-    from services.bench.recovery import bench_recovery
+    from congrasp.services.bench.recovery import bench_recovery
 
     bench_recovery(actors, repeats)
     return 0
@@ -213,7 +213,7 @@ def recording(actors: int = 2, seconds: float = 20.0, turns: int = 3) -> int:
       congrasp bench recording
       congrasp bench recording --actors 1 --turns 5
     """
-    from services.bench.recording import bench_recording
+    from congrasp.services.bench.recording import bench_recording
 
     bench_recording(actors, seconds, turns)
     return 0
@@ -250,8 +250,8 @@ def scaling(
     """
     import dataclasses
 
-    from services.bench.scaling import bench_scaling
-    from services.train.presets import get_preset
+    from congrasp.services.bench.scaling import bench_scaling
+    from congrasp.services.train.presets import get_preset
 
     config = get_preset(preset)
     config = dataclasses.replace(config, physics=physics, environments=environments or config.environments)
@@ -284,8 +284,8 @@ def startup(
     """
     import dataclasses
 
-    from services.bench.startup import bench_startup
-    from services.train.presets import get_preset
+    from congrasp.services.bench.startup import bench_startup
+    from congrasp.services.train.presets import get_preset
 
     config = get_preset(preset)
     pool = dataclasses.replace(config.objects, count=objects or config.objects.count)
@@ -309,8 +309,8 @@ def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int 
       congrasp bench measures
       congrasp bench measures --environments 256
     """
-    from common.parallel import cores
-    from services.bench.measures import bench_measures
+    from congrasp.common.parallel import cores
+    from congrasp.services.bench.measures import bench_measures
 
     bench_measures(engine, environments, threads or cores(), repeats)
     return 0

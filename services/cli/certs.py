@@ -30,8 +30,8 @@ def init(
       congrasp certs init certs --run human --host 10.0.0.5
       congrasp certs init certs --force
     """
-    from common.transport.security import LISTENERS, ROLES
-    from services.ops.certificates import create_authority, issue
+    from congrasp.common.transport.security import LISTENERS, ROLES
+    from congrasp.services.ops.certificates import create_authority, issue
 
     create_authority(folder, run=run, force=force)
     for role in ROLES:
@@ -67,8 +67,8 @@ def issue(
       congrasp certs issue certs --role actor
       congrasp certs issue certs --role client --host 10.0.0.6
     """
-    from common.transport.security import CERTIFICATE_FILE
-    from services.ops.certificates import issue, read
+    from congrasp.common.transport.security import CERTIFICATE_FILE
+    from congrasp.services.ops.certificates import issue, read
 
     made = issue(folder, role, run=run, number=number, hosts=host, days=days, force=force)
     print(f"{made}: good until {read(made / CERTIFICATE_FILE).expires:%Y-%m-%d}")
@@ -91,7 +91,7 @@ def revoke(folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, r
       congrasp certs revoke certs --role actor --number 1
       congrasp certs revoke certs --role client --number 2 --run human
     """
-    from services.ops.certificates import revoke
+    from congrasp.services.ops.certificates import revoke
 
     print(f"{revoke(folder, role, number, run=run)} is revoked.")
     return 0
@@ -110,8 +110,8 @@ def show(folder: Folder = pathlib.Path("certs")) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from common.transport.security import Credentials
-    from services.ops.certificates import certificates
+    from congrasp.common.transport.security import Credentials
+    from congrasp.services.ops.certificates import certificates
 
     revoked = Credentials(folder, "").revoked()
     table = Table("certificate", "expires (UTC)", "days left", "listens as")

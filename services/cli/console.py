@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 Track = Callable[[str, int | None], Callable[[int], None]]
 """(what is done, its total if known) -> what to call with the amount done."""

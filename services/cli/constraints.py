@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from common.errors import CongraspError
-from services.assets.captures import IMPORTERS
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.captures import IMPORTERS
 
 if TYPE_CHECKING:
-    from common.hands.spec import Hand
-    from common.objects.spec import GraspObject
-    from common.wire.codec import Message
-    from services.assets.captures.build import Report
-    from services.cli.console import Track
+    from congrasp.common.hands.spec import Hand
+    from congrasp.common.objects.spec import GraspObject
+    from congrasp.common.wire.codec import Message
+    from congrasp.services.assets.captures.build import Report
+    from congrasp.services.cli.console import Track
 
 REPORT = "import.json"
 """File beside imported sets that holds the outcome of each sequence."""
@@ -56,12 +56,12 @@ def generate(
       congrasp constraints generate mug:7 box:0
       congrasp constraints generate my-objects --references policy
     """
-    from common.config import TaskConfig
-    from common.hands import get_hand
-    from common.objects.procedural import generate_many
-    from services.assets.objects.named import find_object, objects_of
-    from services.cli.console import tracked
-    from services.grasp.constraint_sets import make_sets, save
+    from congrasp.common.config import TaskConfig
+    from congrasp.common.hands import get_hand
+    from congrasp.common.objects.procedural import generate_many
+    from congrasp.services.assets.objects.named import find_object, objects_of
+    from congrasp.services.cli.console import tracked
+    from congrasp.services.grasp.constraint_sets import make_sets, save
 
     if not objects and count < 1:
         raise CongraspError("There is no object to make constraints for.", "Name objects, or set --count.")
@@ -86,10 +86,10 @@ def _references(
     hand: "Hand", policy: pathlib.Path | None, objects: "list[GraspObject]", seed: int, track: "Track"
 ) -> Any:
     """Constraints with references from a policy's grasps; prints how many there are."""
-    from common.parallel import cores
-    from common.policy import bundle as bundles
-    from common.policy.pretrained import policy_file, reference_file
-    from services.evaluate.evaluator import Evaluator
+    from congrasp.common.parallel import cores
+    from congrasp.common.policy import bundle as bundles
+    from congrasp.common.policy.pretrained import policy_file, reference_file
+    from congrasp.services.evaluate.evaluator import Evaluator
 
     bundle = bundles.load(policy or reference_file(hand.name) or policy_file(None, hand.name))
     if bundle.spec.hand_name != hand.name:
@@ -146,11 +146,11 @@ def import_captures(
     """
     import importlib
 
-    from common.hands import get_hand
-    from common.hands.mano import own_mano_model
-    from services.assets.captures.build import Options, import_sets
-    from services.assets.captures.objects import Meshes
-    from services.cli.console import bars
+    from congrasp.common.hands import get_hand
+    from congrasp.common.hands.mano import own_mano_model
+    from congrasp.services.assets.captures.build import Options, import_sets
+    from congrasp.services.assets.captures.objects import Meshes
+    from congrasp.services.cli.console import bars
 
     if format not in IMPORTERS:
         raise CongraspError(f"There is no format '{format}'.", f"Choose one of: {', '.join(IMPORTERS)}.")
@@ -187,9 +187,9 @@ def _save(
     folder: pathlib.Path,
 ) -> None:
     """Writes objects to their folder, and their sets and the outcome of each sequence to `out`."""
-    from common.files import write_atomically
-    from common.objects.store import Catalogue
-    from services.grasp.constraint_sets import save
+    from congrasp.common.files import write_atomically
+    from congrasp.common.objects.store import Catalogue
+    from congrasp.services.grasp.constraint_sets import save
 
     catalogue = Catalogue(folder)
     for obj, made in zip(objects, sets, strict=True):
@@ -201,7 +201,7 @@ def _save(
 
 def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathlib.Path) -> None:
     """What was kept, what was dropped by which rule, and where it all is."""
-    from services.cli.console import show_table
+    from congrasp.services.cli.console import show_table
 
     kept, dropped = report.kept, report.dropped
     print(f"{len(kept)} of {len(kept) + len(dropped)} sequences kept.")
@@ -259,9 +259,9 @@ def show(
       congrasp constraints show sets/mug_7.constraints.safetensors
       congrasp constraints show sets/mug_7.constraints.safetensors --png mug.png --rest 2
     """
-    from common.task.constraint_sets import load
-    from services.cli.console import show_facts
-    from services.grasp.constraint_sets import describe
+    from congrasp.common.task.constraint_sets import load
+    from congrasp.services.cli.console import show_facts
+    from congrasp.services.grasp.constraint_sets import describe
 
     constraints = load(file)
     rests = len(constraints.arrays["rest"])
@@ -269,8 +269,8 @@ def show(
         raise CongraspError(f"--rest is {rest}.", f"The object has the resting poses 1 to {rests}.")
     show_facts(describe(constraints))
     if png is not None:
-        from services.viz.constraint_sheet import constraint_sheet
-        from services.viz.sheets import save_png
+        from congrasp.services.viz.constraint_sheet import constraint_sheet
+        from congrasp.services.viz.sheets import save_png
 
         best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
         save_png(png, constraint_sheet(constraints, rest - 1 if rest else best, seed))

@@ -23,7 +23,7 @@ def doctor(
       congrasp doctor
       congrasp doctor --connect tcp/10.0.0.5:7447 --run human
     """
-    from services.ops.doctor import examine
+    from congrasp.services.ops.doctor import examine
 
     findings = examine(connect, run, folder, certs)
     for finding in findings:

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from actors.physics import PhysicsName
-from common.config import Split
-from common.engines import engine_title
-from common.errors import CongraspError
+from congrasp.actors.physics import PhysicsName
+from congrasp.common.config import Split
+from congrasp.common.engines import engine_title
+from congrasp.common.errors import CongraspError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from services.evaluate.lineup import Entrant, Lineup
-    from services.evaluate.tables import Found
+    from congrasp.services.evaluate.lineup import Entrant, Lineup
+    from congrasp.services.evaluate.tables import Found
 
 Table = Literal[
     "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
@@ -91,12 +91,12 @@ def evaluate(
       congrasp evaluate --table single composed --episodes 200
       congrasp evaluate --policy runs/mine/policy.safetensors --json evaluation.json
     """
-    from actors.physics import resolve_physics
-    from services.assets.objects.named import objects_of
-    from services.cli.console import at_least, tracked
-    from services.evaluate.lineup import line_up, read_entrants
-    from services.evaluate.scores import write_json
-    from services.evaluate.tables import Setup, captured, evaluate_tables
+    from congrasp.actors.physics import resolve_physics
+    from congrasp.services.assets.objects.named import objects_of
+    from congrasp.services.cli.console import at_least, tracked
+    from congrasp.services.evaluate.lineup import line_up, read_entrants
+    from congrasp.services.evaluate.scores import write_json
+    from congrasp.services.evaluate.tables import Setup, captured, evaluate_tables
 
     at_least(1, episodes=episodes)
     at_least(0, pool=pool, batch=batch)
@@ -161,7 +161,7 @@ def _check_hand(made_for: str, hands: Sequence[str]) -> None:
 
 def _who(lineup: "Lineup") -> str:
     """What was evaluated: a policy, a method that has none, or several."""
-    from common.task.methods import get_method
+    from congrasp.common.task.methods import get_method
 
     if len(lineup.entrants) > 1:
         return f"{len(lineup.entrants)} policies"
@@ -174,7 +174,7 @@ def _who(lineup: "Lineup") -> str:
 
 def _source(lineup: "Lineup", objects: pathlib.Path | None, exam: Exam) -> str:
     """The objects, in the size of the hand where there is one."""
-    from services.evaluate.protocol import objects_label
+    from congrasp.services.evaluate.protocol import objects_label
 
     labels = list(dict.fromkeys(objects_label(one.policy, objects, exam) for one, _ in lineup.entrants))
     return labels[0] if len(labels) == 1 else f"{labels[0].partition(',')[0]} in each hand's size"
@@ -191,7 +191,7 @@ def _console() -> "Console":
 
 def _show(results: "Sequence[Found]", lineup: "Lineup", title: str, by: str | None) -> None:
     """Prints the tables, the effect of the rules for headings, the references' source, and why rows were left out."""
-    from services.evaluate.cells import object_table, tables_of
+    from congrasp.services.evaluate.cells import object_table, tables_of
 
     console, rows = _console(), [row for found in results for row in found.rows]
     for shown in tables_of(rows, title, lineup.missing) + ([object_table(rows)] if by == "object" else []):
@@ -207,8 +207,8 @@ def _show(results: "Sequence[Found]", lineup: "Lineup", title: str, by: str | No
 
 def _about(lineup: "Lineup", results: "Sequence[Found]") -> dict[str, Any]:
     """Policies, and how the rows were made, as the JSON file has them."""
-    from services.evaluate.lineup import facts
-    from services.evaluate.results import provenance
+    from congrasp.services.evaluate.lineup import facts
+    from congrasp.services.evaluate.results import provenance
 
     policies = [facts(one) for one, _ in lineup.entrants]
     rules = {
@@ -228,9 +228,9 @@ def _about(lineup: "Lineup", results: "Sequence[Found]") -> dict[str, Any]:
 
 def _draw(found: "Found", one: "Entrant", episodes: int, pictures: pathlib.Path) -> None:
     """Draws curves and examples of noisy references, and episodes of the other rows."""
-    from services.evaluate.failures import failure_sheets
-    from services.evaluate.noise_sheet import draw_noise
-    from services.viz.sheets import save_png
+    from congrasp.services.evaluate.failures import failure_sheets
+    from congrasp.services.evaluate.noise_sheet import draw_noise
+    from congrasp.services.viz.sheets import save_png
 
     if found.evaluator is None:
         return

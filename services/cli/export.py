@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 
 def policy(
@@ -31,10 +31,10 @@ def policy(
       congrasp export policy
       congrasp export policy --hand allegro --to stablehlo
     """
-    from common.files import check_free
-    from common.policy.bundle import load
-    from common.policy.pretrained import policy_file
-    from services.export.policy import SUFFIXES, TOLERANCE, export_policy
+    from congrasp.common.files import check_free
+    from congrasp.common.policy.bundle import load
+    from congrasp.common.policy.pretrained import policy_file
+    from congrasp.services.export.policy import SUFFIXES, TOLERANCE, export_policy
 
     source = policy_file(policy, hand)
     path = out or pathlib.Path(f"policy{SUFFIXES[to]}")
@@ -73,8 +73,8 @@ def motion(
       congrasp export motion grasps/mug/grasp.npz --to glb
       congrasp export motion runs/mine --success --to ros2 --out bag
     """
-    from services.export.frames import TOLERANCE_MM
-    from services.export.motion_formats import default_name, export_motions, pick_motion
+    from congrasp.services.export.frames import TOLERANCE_MM
+    from congrasp.services.export.motion_formats import default_name, export_motions, pick_motion
 
     if not paths:
         raise CongraspError("No motion was named.", "Name a .npz of 'congrasp grasp', a recording or a run's folder.")
@@ -110,11 +110,11 @@ def grasp(
       congrasp export grasp grasps
       congrasp export grasp grasps/mug/grasp.npz --replay
     """
-    from services.cli.console import tracked
-    from services.export.dexgraspbench import export_grasps
-    from services.export.frames import TOLERANCE_MM
-    from services.export.replay import replay as replayed
-    from services.export.replay import save_replay, summary
+    from congrasp.services.cli.console import tracked
+    from congrasp.services.export.dexgraspbench import export_grasps
+    from congrasp.services.export.frames import TOLERANCE_MM
+    from congrasp.services.export.replay import replay as replayed
+    from congrasp.services.export.replay import save_replay, summary
 
     if not paths:
         raise CongraspError("No motion was named.", "Name a folder or a motion (.npz) of 'congrasp grasp'.")
@@ -146,8 +146,8 @@ def layout(
       congrasp export layout runs/mine
       congrasp export layout recordings/learner.mcap --out layout.json
     """
-    from common.files import check_free
-    from services.export.layout import export_layout
+    from congrasp.common.files import check_free
+    from congrasp.services.export.layout import export_layout
 
     check_free(out, force=force)
     panels = export_layout(path, out)

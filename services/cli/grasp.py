@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.markup import escape
 from typing_extensions import Doc
 
-from common.errors import CongraspError
-from common.task.constraints import CONSTRAINTS
-from services.assets.objects.options import ImportOptions
+from congrasp.common.errors import CongraspError
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.services.assets.objects.options import ImportOptions
 
 if TYPE_CHECKING:
-    from services.grasp.jobs import Result
+    from congrasp.services.grasp.jobs import Result
 
 NOT_HELD, BAD_INPUT = 1, 2
 _MOST_ATTEMPTS = 1024
@@ -83,11 +83,11 @@ def grasp(
       congrasp grasp examples/mug.obj --video
       congrasp grasp mug:7 --rest upright --approach 1 --lift 0.15
     """
-    from common.policy import bundle as bundles
-    from common.policy.pretrained import policy_file
-    from services.cli.console import at_least, at_most, bars
-    from services.grasp.grasper import Grasper
-    from services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
+    from congrasp.common.policy import bundle as bundles
+    from congrasp.common.policy.pretrained import policy_file
+    from congrasp.services.cli.console import at_least, at_most, bars
+    from congrasp.services.grasp.grasper import Grasper
+    from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
@@ -136,7 +136,7 @@ def _show(result: "Result") -> None:
 
 def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
     """Prints where everything is; returns the exit code."""
-    from services.grasp.jobs import SHEET
+    from congrasp.services.grasp.jobs import SHEET
 
     held = sum(bool(result.facts.get("success")) for result in results)
     failed = sum(bool(result.error) for result in results)

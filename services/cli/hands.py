@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from actors.physics import PhysicsName
+from congrasp.actors.physics import PhysicsName
 
 if TYPE_CHECKING:
-    from services.assets.hands.model_files import Choices, Proposal
+    from congrasp.services.assets.hands.model_files import Choices, Proposal
 
 
 def list_hands() -> int:
@@ -18,10 +18,10 @@ def list_hands() -> int:
       congrasp hands list
     """
 
-    from common.errors import CongraspError
-    from common.hands import HANDS, get_hand, hands_folder, own_hands
-    from common.policy.pretrained import pretrained_file
-    from services.cli.console import show_table
+    from congrasp.common.errors import CongraspError
+    from congrasp.common.hands import HANDS, get_hand, hands_folder, own_hands
+    from congrasp.common.policy.pretrained import pretrained_file
+    from congrasp.services.cli.console import show_table
 
     rows, missing = [], []
     own, folder = own_hands(), hands_folder()
@@ -60,11 +60,11 @@ def sheet(
       congrasp hands sheet human
       congrasp hands sheet allegro sharpa --out robot-hands.png
     """
-    from common.hands import get_hand, own_hands
-    from common.hands.meshes import load_meshes
-    from common.hands.skin import skin_of_meshes
-    from services.viz.hand_sheets import hands_sheet
-    from services.viz.sheets import save_png
+    from congrasp.common.hands import get_hand, own_hands
+    from congrasp.common.hands.meshes import load_meshes
+    from congrasp.common.hands.skin import skin_of_meshes
+    from congrasp.services.viz.hand_sheets import hands_sheet
+    from congrasp.services.viz.sheets import save_png
 
     found = [get_hand(name) for name in hands]
     files = [own_hands().get(name, pathlib.Path(name)) for name in hands]
@@ -107,10 +107,10 @@ def import_hand(
       congrasp hands import hand.urdf
       congrasp hands import hand.xml --name mine --palm palm_link
     """
-    from common.errors import CongraspError
-    from common.hands import SUFFIX
-    from services.assets.hands.model_files import Choices
-    from services.assets.hands.model_files import import_hand as proposed
+    from congrasp.common.errors import CongraspError
+    from congrasp.common.hands import SUFFIX
+    from congrasp.services.assets.hands.model_files import Choices
+    from congrasp.services.assets.hands.model_files import import_hand as proposed
 
     proposal = proposed(file, Choices(name, palm, thumb, object_scale, collision == "own"))
     if out is not None and out.suffix != SUFFIX:
@@ -123,14 +123,14 @@ def import_hand(
 
 def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | None) -> None:
     """Writes a hand's file and picture, by default in the folder of the user's own hands, and prints all of it."""
-    from common.errors import CongraspError
-    from common.files import write_atomically
-    from common.hands import HANDS, SUFFIX, get_hand, hands_folder
-    from common.hands.files import hand_text
-    from services.assets.hands.model_files import describe
-    from services.assets.hands.visual import save_meshes
-    from services.viz.hand_sheets import joints_sheet
-    from services.viz.sheets import save_png
+    from congrasp.common.errors import CongraspError
+    from congrasp.common.files import write_atomically
+    from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder
+    from congrasp.common.hands.files import hand_text
+    from congrasp.services.assets.hands.model_files import describe
+    from congrasp.services.assets.hands.visual import save_meshes
+    from congrasp.services.viz.hand_sheets import joints_sheet
+    from congrasp.services.viz.sheets import save_png
 
     hand = proposal.hand
     if hand.name in HANDS:
@@ -167,12 +167,12 @@ def check(
       congrasp hands check allegro
       congrasp hands check my_hand --png check.png --json check.json
     """
-    from common.hands import get_hand
-    from common.parallel import cores
-    from services.assets.hands.check import check_hand, write_findings
-    from services.train.recipe import recipe
-    from services.viz.check_sheet import check_sheet
-    from services.viz.sheets import save_png
+    from congrasp.common.hands import get_hand
+    from congrasp.common.parallel import cores
+    from congrasp.services.assets.hands.check import check_hand, write_findings
+    from congrasp.services.train.recipe import recipe
+    from congrasp.services.viz.check_sheet import check_sheet
+    from congrasp.services.viz.sheets import save_png
 
     found = get_hand(hand)
     checked = check_hand(found, recipe(found).task, cores())
@@ -229,11 +229,11 @@ def train(
 
     import jax
 
-    from common.hands import get_hand
-    from services.assets.hands.model_files import Choices
-    from services.cli.console import at_least
-    from services.train.own_hand import Request, train_hand
-    from services.train.processes import accelerators
+    from congrasp.common.hands import get_hand
+    from congrasp.services.assets.hands.model_files import Choices
+    from congrasp.services.cli.console import at_least
+    from congrasp.services.train.own_hand import Request, train_hand
+    from congrasp.services.train.processes import accelerators
 
     at_least(0, episodes=episodes, pool=pool)
     at_least(1, patience=patience)
@@ -260,8 +260,8 @@ def train(
 
 def _taken(hand: str, choices: "Choices") -> str:
     """What commands call a hand by; that of a URDF or MJCF is imported, unless it was before."""
-    from common.hands import own_hands
-    from services.assets.hands.model_files import import_hand as proposed
+    from congrasp.common.hands import own_hands
+    from congrasp.services.assets.hands.model_files import import_hand as proposed
 
     file = pathlib.Path(hand)
     if file.suffix.lower() not in (".urdf", ".xml", ".mjcf"):

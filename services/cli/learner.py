@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from common.config import MetricWriter, RunConfig, run_config_from_json, to_json
-from common.transport.ports import LEARNER_URL, rank_url, reachable_url
-from services.cli.train import defaults as defaults
-from services.cli.watch import Watch, Watched
-from services.train.presets import with_hand
+from congrasp.common.config import MetricWriter, RunConfig, run_config_from_json, to_json
+from congrasp.common.transport.ports import LEARNER_URL, rank_url, reachable_url
+from congrasp.services.cli.train import defaults as defaults
+from congrasp.services.cli.watch import Watch, Watched
+from congrasp.services.train.presets import with_hand
 
 if TYPE_CHECKING:
-    from common.transport.base import Transport
-    from learner.ranks import Ranks
+    from congrasp.common.transport.base import Transport
+    from congrasp.learner.ranks import Ranks
 
 
 def learner(
@@ -71,12 +71,12 @@ def learner(
       congrasp learner --preset human --run-dir runs/human --listen tls/0.0.0.0:7447 --certs certs
       congrasp learner --run-dir runs/human --resume
     """
-    from common.errors import CongraspError
-    from common.policy import bundle as bundles
-    from common.transport import urls
-    from learner.ranks import Ranks, end_process
-    from learner.run_directory import CONFIG_FILE, continue_run, create_run, listening
-    from services.ops.shutdown import on_signal
+    from congrasp.common.errors import CongraspError
+    from congrasp.common.policy import bundle as bundles
+    from congrasp.common.transport import urls
+    from congrasp.learner.ranks import Ranks, end_process
+    from congrasp.learner.run_directory import CONFIG_FILE, continue_run, create_run, listening
+    from congrasp.services.ops.shutdown import on_signal
 
     resume = resume or (or_resume and (run_dir / CONFIG_FILE).exists())
     try:
@@ -119,9 +119,9 @@ def learner(
 
 def _longest_rollout(config: RunConfig) -> int:
     """Twice the bytes of a run's rollouts: what is longer is none."""
-    from common.policy.bundle import policy_spec
-    from learner.algorithms import make_algorithm
-    from learner.batch import rollout_form
+    from congrasp.common.policy.bundle import policy_spec
+    from congrasp.learner.algorithms import make_algorithm
+    from congrasp.learner.batch import rollout_form
 
     spec = policy_spec(config.task, config.network)
     form = rollout_form(config, spec, make_algorithm(spec, config).batch_schema)
@@ -141,9 +141,9 @@ def _learn(
     watch: Watch,
 ) -> None:
     """Runs the learner until it is finished or told to stop."""
-    from learner.run_directory import has_checkpoints
-    from services.ops.logs import log
-    from services.train.learn import learn
+    from congrasp.learner.run_directory import has_checkpoints
+    from congrasp.services.ops.logs import log
+    from congrasp.services.train.learn import learn
 
     def updated(values: dict[str, float]) -> None:
         log("info", f"Update {values['update']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)

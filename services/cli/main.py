@@ -13,10 +13,10 @@ import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
-from common.errors import CongraspError
-from common.files import cache_folder
-from services.ops.logs import log_error
-from services.ops.shutdown import follow_parent, on_signal
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import cache_folder
+from congrasp.services.ops.logs import log_error
+from congrasp.services.ops.shutdown import follow_parent, on_signal
 
 COMMANDS = {
     "train": "train a policy: a learner and its actors on this machine",
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         code = _fail(_said_of(error), USAGE_ERROR, debug)
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] in ("common", "actors", "learner", "services"):
+        if (error.name or "").partition(".")[0] == "congrasp":
             raise
         package = (error.name or "").partition(".")[0]
         extra = EXTRAS.get(package, "train")
@@ -139,8 +139,8 @@ def run(arguments: list[str]) -> int:
 
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
     """The command's module as a function from its arguments to the call that they ask for."""
-    module = importlib.import_module(f"services.cli.{name}")
-    from services.cli import parser
+    module = importlib.import_module(f"congrasp.services.cli.{name}")
+    from congrasp.services.cli import parser
 
     prog = f"congrasp {name}"
     if hasattr(module, "COMMANDS"):

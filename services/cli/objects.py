@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from common.errors import CongraspError
-from services.assets.objects.options import ImportOptions
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.objects.options import ImportOptions
 
 if TYPE_CHECKING:
-    from common.objects.spec import GraspObject
-    from common.task.sampling.headings import Headings
+    from congrasp.common.objects.spec import GraspObject
+    from congrasp.common.task.sampling.headings import Headings
 
 _COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "yellow": (255, 255, 0)}
 
@@ -28,9 +28,9 @@ def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tup
       congrasp objects generate --count 100
       congrasp objects generate --families mug knife --out tools
     """
-    from common.objects import procedural
-    from common.objects.store import Catalogue
-    from services.cli.console import at_least, tracked
+    from congrasp.common.objects import procedural
+    from congrasp.common.objects.store import Catalogue
+    from congrasp.services.cli.console import at_least, tracked
 
     at_least(1, count=count)
     catalogue = Catalogue(out)
@@ -63,10 +63,10 @@ def import_meshes(
       congrasp objects import examples/mug.obj
       congrasp objects import scans/ --unit mm --density 300 --out my-objects
     """
-    from common.objects.store import Catalogue
-    from services.assets.objects.meshes import import_sources
-    from services.assets.objects.sources import find_sources
-    from services.cli.console import bars, report_error
+    from congrasp.common.objects.store import Catalogue
+    from congrasp.services.assets.objects.meshes import import_sources
+    from congrasp.services.assets.objects.sources import find_sources
+    from congrasp.services.cli.console import bars, report_error
 
     if not paths:
         raise CongraspError("There is nothing to import.", "Name mesh files or folders.")
@@ -109,9 +109,9 @@ def list_objects(
       congrasp objects list my-objects --png my-objects.png
       congrasp objects list --families
     """
-    from common.objects.procedural import FAMILIES
-    from common.objects.store import Catalogue
-    from services.cli.console import report_error, show_table
+    from congrasp.common.objects.procedural import FAMILIES
+    from congrasp.common.objects.store import Catalogue
+    from congrasp.services.cli.console import report_error, show_table
 
     if families:
         print("\n".join(FAMILIES))
@@ -133,8 +133,8 @@ def list_objects(
     else:
         print(f"{folder} holds no object.")
     if png is not None and found:
-        from services.viz.object_sheet import overview
-        from services.viz.sheets import save_png
+        from congrasp.services.viz.object_sheet import overview
+        from congrasp.services.viz.sheets import save_png
 
         save_png(png, overview(found))
         print(f"The picture is {png}.")
@@ -155,10 +155,10 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     """
     import numpy as np
 
-    from common.objects.store import digest
-    from common.task.sampling.headings import sample_headings
-    from services.assets.objects.named import find_object
-    from services.cli.console import show_facts
+    from congrasp.common.objects.store import digest
+    from congrasp.common.task.sampling.headings import sample_headings
+    from congrasp.services.assets.objects.named import find_object
+    from congrasp.services.cli.console import show_facts
 
     obj = find_object(object, folder)
     share = obj.graspable[obj.labels].mean()
@@ -186,8 +186,8 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     print(obj.name)
     show_facts(facts)
     if png is not None:
-        from services.viz.object_sheet import object_sheet
-        from services.viz.sheets import save_png
+        from congrasp.services.viz.object_sheet import object_sheet
+        from congrasp.services.viz.sheets import save_png
 
         assert free is not None, "only the graspable region may be out of reach"
         save_png(png, object_sheet(obj, free))
@@ -211,9 +211,9 @@ def rests(
     """
     import numpy as np
 
-    from common.objects.resting import rest_tilts
-    from services.assets.objects.named import find_object
-    from services.cli.console import show_table
+    from congrasp.common.objects.resting import rest_tilts
+    from congrasp.services.assets.objects.named import find_object
+    from congrasp.services.cli.console import show_table
 
     obj = find_object(object, folder)
     tilts = np.degrees(rest_tilts(obj))
@@ -223,8 +223,8 @@ def rests(
     ]
     show_table(("--rest", "centre of mass (cm)", "z axis from up (°)"), rows)
     if png is not None:
-        from services.viz.object_sheet import rests_sheet
-        from services.viz.sheets import save_png
+        from congrasp.services.viz.object_sheet import rests_sheet
+        from congrasp.services.viz.sheets import save_png
 
         save_png(png, rests_sheet(obj))
         print(f"The picture is {png}.")
@@ -233,9 +233,9 @@ def rests(
 
 def _reach(obj: "GraspObject", headings: "Headings | None") -> list[str]:
     """For each resting pose, what share of the headings the table leaves the human hand."""
-    from common.hands.human import HUMAN
-    from common.hands.outline import outline
-    from common.task.sampling.headings import above, within_reach
+    from congrasp.common.hands.human import HUMAN
+    from congrasp.common.hands.outline import outline
+    from congrasp.common.task.sampling.headings import above, within_reach
 
     if headings is None:
         return ["none"] * len(obj.rest_poses)
@@ -276,9 +276,9 @@ def set_affordance(
       congrasp objects affordance examples/mug.obj --part-mesh examples/handle.obj --invert
       congrasp objects affordance mug_7 --half-space 0 0 1 0.02 --name upper-mug
     """
-    from common.objects.store import Catalogue
-    from services.assets.objects import affordance
-    from services.assets.objects.named import find_object
+    from congrasp.common.objects.store import Catalogue
+    from congrasp.services.assets.objects import affordance
+    from congrasp.services.assets.objects.named import find_object
 
     if [part_mesh, painted, half_space or None].count(None) != 2:
         raise CongraspError(

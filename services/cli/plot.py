@@ -24,9 +24,9 @@ def plot(
       congrasp plot runs/mine
       congrasp plot runs/mine runs/other --out plots --formats png
     """
-    from common.errors import CongraspError
-    from services.evaluate.plots import plot_evaluation
-    from services.viz.plots import plot_runs
+    from congrasp.common.errors import CongraspError
+    from congrasp.services.evaluate.plots import plot_evaluation
+    from congrasp.services.viz.plots import plot_runs
 
     evaluations = [path for path in paths if path.suffix == ".json"]
     if not paths:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from common.transport.ports import SERVER_URL
+from congrasp.common.transport.ports import SERVER_URL
 
 
 def query(
@@ -40,9 +40,9 @@ def query(
     """
     import json as json_module
 
-    from services.cli.console import at_least
-    from services.serve.client import PolicyClient
-    from services.serve.load import example_episode, measure, one_answer
+    from congrasp.services.cli.console import at_least
+    from congrasp.services.serve.client import PolicyClient
+    from congrasp.services.serve.load import example_episode, measure, one_answer
 
     at_least(1, repeat=repeat, concurrency=concurrency, states=states)
     if health:

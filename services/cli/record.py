@@ -2,8 +2,8 @@
 
 import pathlib
 
-from common.transport.ports import LEARNER_URL
-from services.ops.logs import LogFormat
+from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.services.ops.logs import LogFormat
 
 
 def record(
@@ -33,9 +33,9 @@ def record(
       congrasp record --connect tcp/127.0.0.1:7447 --run human
       congrasp record --run human --out recordings --live 8765
     """
-    from common.transport.keys import process_name
-    from services.ops.logs import logging_as
-    from services.record.process import record_run
+    from congrasp.common.transport.keys import process_name
+    from congrasp.services.ops.logs import logging_as
+    from congrasp.services.record.process import record_run
 
     structured = log_format == "json"
     with logging_as(log_format, role="recorder", id=process_name("recorder"), run=run):

@@ -17,9 +17,9 @@ def hand(hand: str = "human", out: pathlib.Path = pathlib.Path("hand.png")) -> i
       congrasp render hand --hand allegro
       congrasp render hand --hand my_hand --out my-hand.png
     """
-    from common.hands import get_hand
-    from services.viz.hand_sheets import hand_sheet
-    from services.viz.sheets import save_png
+    from congrasp.common.hands import get_hand
+    from congrasp.services.viz.hand_sheets import hand_sheet
+    from congrasp.services.viz.sheets import save_png
 
     save_png(out, hand_sheet(get_hand(hand)))
     print(out)
@@ -48,9 +48,9 @@ def episode(
       congrasp render episode runs/mine --success
       congrasp render episode runs/mine --index 0 --video grasp.mp4
     """
-    from services.record.reader import pick_episode
-    from services.viz.render import episode_sheet, save_episode_video
-    from services.viz.sheets import save_png
+    from congrasp.services.record.reader import pick_episode
+    from congrasp.services.viz.render import episode_sheet, save_episode_video
+    from congrasp.services.viz.sheets import save_png
 
     chosen = pick_episode(path, index, success=success)
     save_png(out, episode_sheet(chosen, frames=frames))

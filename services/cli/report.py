@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from actors.physics import PhysicsName
-from common.errors import CongraspError
+from congrasp.actors.physics import PhysicsName
+from congrasp.common.errors import CongraspError
 
 if TYPE_CHECKING:
-    from services.evaluate.report import HandCheck
+    from congrasp.services.evaluate.report import HandCheck
 
 _POOL = 64
 
@@ -47,11 +47,11 @@ def report(
       congrasp report runs/mine --episodes 16
       congrasp report --hand allegro --objects my-objects --out allegro.html
     """
-    from common.policy.bundle import content_hash
-    from common.policy.pretrained import policy_file
-    from services.cli.console import at_least, tracked
-    from services.evaluate.reporting import report_on
-    from services.evaluate.scores import write_json
+    from congrasp.common.policy.bundle import content_hash
+    from congrasp.common.policy.pretrained import policy_file
+    from congrasp.services.cli.console import at_least, tracked
+    from congrasp.services.evaluate.reporting import report_on
+    from congrasp.services.evaluate.scores import write_json
 
     at_least(1, episodes=episodes, pool=pool)
     if out.is_dir():
@@ -83,8 +83,8 @@ def report(
 
 def _checked(file: pathlib.Path) -> "HandCheck":
     """The self-check that a file and the picture beside it show."""
-    from services.assets.hands.check import read_findings
-    from services.evaluate.report import HandCheck
+    from congrasp.services.assets.hands.check import read_findings
+    from congrasp.services.evaluate.report import HandCheck
 
     picture = file.with_suffix(".png")
     if not picture.is_file():
@@ -94,7 +94,7 @@ def _checked(file: pathlib.Path) -> "HandCheck":
 
 def _policy_of_run(run_dir: pathlib.Path) -> pathlib.Path:
     """The policy file of a run's folder; a CongraspError if it has none."""
-    from learner.run_directory import POLICY_FILE
+    from congrasp.learner.run_directory import POLICY_FILE
 
     if not (run_dir / POLICY_FILE).is_file():
         raise CongraspError(f"The folder {run_dir} holds no {POLICY_FILE}.", "Name a run's folder, or a policy file.")

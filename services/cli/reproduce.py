@@ -5,12 +5,12 @@ import shlex
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from actors.physics import PhysicsName
-from common.errors import CongraspError
+from congrasp.actors.physics import PhysicsName
+from congrasp.common.errors import CongraspError
 
 if TYPE_CHECKING:
-    from services.evaluate.lineup import Entrant
-    from services.reproduce.plan import Policy
+    from congrasp.services.evaluate.lineup import Entrant
+    from congrasp.services.reproduce.plan import Policy
 
 _OUT = "reproduction"
 _QUICK, _FULL = (48, 24), (1000, 64)
@@ -62,13 +62,13 @@ def reproduce(
       congrasp reproduce --quick
       congrasp reproduce --captured grab oakink dexycb
     """
-    from common.policy.pretrained import pretrained_hands
-    from services.cli.console import at_least, tracked
-    from services.evaluate.protocol import NOMINAL_FRICTION
-    from services.reproduce.evaluation import Numbers
-    from services.reproduce.page import JSON, LATEX, PAGE, summary
-    from services.reproduce.plan import BASELINES, policies
-    from services.reproduce.run import Request, reproduce, to_train
+    from congrasp.common.policy.pretrained import pretrained_hands
+    from congrasp.services.cli.console import at_least, tracked
+    from congrasp.services.evaluate.protocol import NOMINAL_FRICTION
+    from congrasp.services.reproduce.evaluation import Numbers
+    from congrasp.services.reproduce.page import JSON, LATEX, PAGE, summary
+    from congrasp.services.reproduce.plan import BASELINES, policies
+    from congrasp.services.reproduce.run import Request, reproduce, to_train
 
     at_least(0, episodes=episodes, pool=pool)
     at_least(1, patience=patience)
@@ -104,8 +104,8 @@ def reproduce(
 
 def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
     """Raises a CongraspError for a hand or a method that is not there."""
-    from common.hands import get_hand
-    from services.reproduce.plan import BASELINES
+    from congrasp.common.hands import get_hand
+    from congrasp.services.reproduce.plan import BASELINES
 
     for name in hands:
         if get_hand(name).name != name:
@@ -116,8 +116,8 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
 
 def _given(texts: tuple[str, ...], needed: "list[Policy]") -> "dict[Policy, Entrant]":
     """Policies by what they are; a CongraspError for one that nothing needs."""
-    from services.evaluate.lineup import read_entrants
-    from services.reproduce.plan import Policy
+    from congrasp.services.evaluate.lineup import read_entrants
+    from congrasp.services.reproduce.plan import Policy
 
     found = {Policy(one.hand, one.method): one for one in read_entrants(texts)}
     for policy, one in found.items():
@@ -131,7 +131,7 @@ def _given(texts: tuple[str, ...], needed: "list[Policy]") -> "dict[Policy, Entr
 
 def _check_device(wanted: list[str]) -> None:
     """Raises a CongraspError if something has to be trained where there is no GPU."""
-    from services.train.processes import accelerators
+    from congrasp.services.train.processes import accelerators
 
     if wanted and accelerators()[0] == "cpu":
         raise CongraspError(

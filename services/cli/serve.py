@@ -2,8 +2,8 @@
 
 import pathlib
 
-from common.transport.ports import SERVER_URL
-from services.cli.watch import Watch, Watched
+from congrasp.common.transport.ports import SERVER_URL
+from congrasp.services.cli.watch import Watch, Watched
 
 
 def serve(
@@ -44,14 +44,14 @@ def serve(
 
     import jax
 
-    from common.errors import CongraspError
-    from common.policy.pretrained import policy_file
-    from common.transport import urls
-    from common.transport.keys import Keys
-    from services.ops.logs import log
-    from services.ops.metrics import ServerMetrics
-    from services.ops.shutdown import on_signal
-    from services.serve.server import PolicyServer, follow_file, follow_run
+    from congrasp.common.errors import CongraspError
+    from congrasp.common.policy.pretrained import policy_file
+    from congrasp.common.transport import urls
+    from congrasp.common.transport.keys import Keys
+    from congrasp.services.ops.logs import log
+    from congrasp.services.ops.metrics import ServerMetrics
+    from congrasp.services.ops.shutdown import on_signal
+    from congrasp.services.serve.server import PolicyServer, follow_file, follow_run
 
     if policy is not None and connect:
         raise CongraspError(

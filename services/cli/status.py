@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from common.transport.ports import LEARNER_URL
+from congrasp.common.transport.ports import LEARNER_URL
 
 _RUN = "quickstart"
 
@@ -41,10 +41,10 @@ def status(
     from rich.console import Console
     from rich.live import Live
 
-    from common.errors import CongraspError
-    from common.transport import urls
-    from learner.run_directory import learner_url, open_run
-    from services.ops.status import ask, follow, tables
+    from congrasp.common.errors import CongraspError
+    from congrasp.common.transport import urls
+    from congrasp.learner.run_directory import learner_url, open_run
+    from congrasp.services.ops.status import ask, follow, tables
 
     if run_dir is not None:
         if (connect, run) != (LEARNER_URL, _RUN):

@@ -7,13 +7,13 @@ from typing import Annotated, Any
 
 import tyro
 
-import actors.physics  # noqa: F401 - registers the engines that --physics offers
-from common.config import MetricWriter, RunConfig, Split
-from common.inputs import file_name
-from common.task.methods import with_method
-from learner.run_directory import CONFIG_FILE, open_run
-from services.train.presets import get_preset, with_hand
-from services.train.student import student_of
+import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
+from congrasp.common.config import MetricWriter, RunConfig, Split
+from congrasp.common.inputs import file_name
+from congrasp.common.task.methods import with_method
+from congrasp.learner.run_directory import CONFIG_FILE, open_run
+from congrasp.services.train.presets import get_preset, with_hand
+from congrasp.services.train.student import student_of
 
 
 def train(
@@ -77,7 +77,7 @@ def train(
       congrasp train --preset quickstart --run-dir runs/mine
       congrasp train --preset human --run-dir runs/human --seed 5
     """
-    from services.train.command import run_training
+    from congrasp.services.train.command import run_training
 
     config = with_hand(config if method is None else with_method(config, method), hand)
     if constraints is not None or split is not None:

@@ -42,9 +42,9 @@ def view(
       congrasp view runs/mine
       congrasp view --objects my-objects --port 8080
     """
-    from common.errors import CongraspError
-    from services.ops.shutdown import on_signal
-    from services.viz.studio.app import open_view
+    from congrasp.common.errors import CongraspError
+    from congrasp.services.ops.shutdown import on_signal
+    from congrasp.services.viz.studio.app import open_view
 
     if run_dir is not None:
         if connect or policy or recordings or run != _RUN:
@@ -74,9 +74,9 @@ def view(
 
 def _of_folder(run_dir: pathlib.Path, certs: pathlib.Path | None) -> tuple[str, str, pathlib.Path | None, pathlib.Path]:
     """--connect, --run, --policy and --recordings of a run: its learner if that responds, else its newest policy."""
-    from common.errors import TransportError
-    from common.transport import urls
-    from learner.run_directory import POLICY_FILE, learner_url, open_run
+    from congrasp.common.errors import TransportError
+    from congrasp.common.transport import urls
+    from congrasp.learner.run_directory import POLICY_FILE, learner_url, open_run
 
     run, connect = open_run(run_dir).name, learner_url(run_dir)
     try:

@@ -2,8 +2,8 @@
 
 import dataclasses
 
-import actors.physics  # noqa: F401 - registers the engines that --physics offers
-from common.engines import PhysicsName
+import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
+from congrasp.common.engines import PhysicsName
 
 
 def warmup(
@@ -35,11 +35,11 @@ def warmup(
     """
     from rich.console import Console
 
-    from common.stages import imported
-    from services.ops.shutdown import on_signal
-    from services.train.command import first_update
-    from services.train.presets import get_preset
-    from services.train.warmup import until_first_update
+    from congrasp.common.stages import imported
+    from congrasp.services.ops.shutdown import on_signal
+    from congrasp.services.train.command import first_update
+    from congrasp.services.train.presets import get_preset
+    from congrasp.services.train.warmup import until_first_update
 
     imported()
     console = Console(highlight=False)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from services.ops.logs import LogFormat, logging_as
+from congrasp.services.ops.logs import LogFormat, logging_as
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Watch:
         with contextlib.ExitStack() as stack:
             stack.enter_context(logging_as(self.log_format, role=role, id=id, run=run))
             if self.metrics_port and collector is not None:
-                from services.ops.metrics import exposed
+                from congrasp.services.ops.metrics import exposed
 
                 stack.enter_context(exposed(self.metrics_port, self.metrics_host, collector))
             yield

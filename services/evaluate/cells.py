@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from actors.protocols import SURVIVAL
-from common.task.plausibility import CLEAN_MM
-from services.evaluate.scores import ERRORS, UNITS, Row
+from congrasp.actors.protocols import SURVIVAL
+from congrasp.common.task.plausibility import CLEAN_MM
+from congrasp.services.evaluate.scores import ERRORS, UNITS, Row
 
 RATES = ("constraint", "episodes", "objects", "success", "held 2 s", "of all objects", "error", "paper")
 """Columns of the table that compares with the paper; `rate_cells` fills them. Of all objects: success and held, with

@@ -10,25 +10,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors import protocols
-from actors.env import EnvState, metric_names
-from actors.episode import episode_message
-from actors.harvest import Grasps
-from actors.initial import InitialConditions
-from actors.physics import make_physics
-from actors.rollout import RolloutWorker, Trace, finished_episodes
-from common.config import TaskConfig
-from common.engines import PhysicsName
-from common.hands import get_hand
-from common.objects.distance import DistanceField
-from common.objects.spec import GraspObject
-from common.policy.bundle import PolicyBundle, act_by_mean
-from common.task import plausibility
-from common.task.constraints import get_constraint
-from common.task.types import Array, Goal, Surface
-from common.wire.codec import Message
-from services.evaluate.protocol import two_seconds
-from services.evaluate.scores import Sample
+from congrasp.actors import protocols
+from congrasp.actors.env import EnvState, metric_names
+from congrasp.actors.episode import episode_message
+from congrasp.actors.harvest import Grasps
+from congrasp.actors.initial import InitialConditions
+from congrasp.actors.physics import make_physics
+from congrasp.actors.rollout import RolloutWorker, Trace, finished_episodes
+from congrasp.common.config import TaskConfig
+from congrasp.common.engines import PhysicsName
+from congrasp.common.hands import get_hand
+from congrasp.common.objects.distance import DistanceField
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.policy.bundle import PolicyBundle, act_by_mean
+from congrasp.common.task import plausibility
+from congrasp.common.task.constraints import get_constraint
+from congrasp.common.task.types import Array, Goal, Surface
+from congrasp.common.wire.codec import Message
+from congrasp.services.evaluate.protocol import two_seconds
+from congrasp.services.evaluate.scores import Sample
 
 
 class Batch(NamedTuple):

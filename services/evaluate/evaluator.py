@@ -9,28 +9,28 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import jax
 import numpy as np
 
-from actors.bank import build_bank
-from actors.initial import InitialConditions
-from common.config import TaskConfig
-from common.engines import ENGINES, PhysicsName
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects.distance import DistanceField, distance_field
-from common.objects.pool import scale_objects
-from common.objects.spec import GraspObject
-from common.policy.bundle import PolicyBundle
-from common.task.bank import ConstraintBank
-from common.wire.codec import Message
-from services.evaluate import loads, references, sensing
-from services.evaluate.episodes import Batch, Episodes
-from services.evaluate.heading_rules import HeadingRules, heading_rules
-from services.evaluate.loads import Load
-from services.evaluate.noise import LEVELS, Noise, with_noise
-from services.evaluate.paper import CENTER_GROUP
-from services.evaluate.plan import RowPlan, batches, from_references, plan_row
-from services.evaluate.protocol import NOMINAL_FRICTION, protocol, two_seconds
-from services.evaluate.references import References
-from services.evaluate.scores import Row, Sample, joined, summarise
+from congrasp.actors.bank import build_bank
+from congrasp.actors.initial import InitialConditions
+from congrasp.common.config import TaskConfig
+from congrasp.common.engines import ENGINES, PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects.distance import DistanceField, distance_field
+from congrasp.common.objects.pool import scale_objects
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.wire.codec import Message
+from congrasp.services.evaluate import loads, references, sensing
+from congrasp.services.evaluate.episodes import Batch, Episodes
+from congrasp.services.evaluate.heading_rules import HeadingRules, heading_rules
+from congrasp.services.evaluate.loads import Load
+from congrasp.services.evaluate.noise import LEVELS, Noise, with_noise
+from congrasp.services.evaluate.paper import CENTER_GROUP
+from congrasp.services.evaluate.plan import RowPlan, batches, from_references, plan_row
+from congrasp.services.evaluate.protocol import NOMINAL_FRICTION, protocol, two_seconds
+from congrasp.services.evaluate.references import References
+from congrasp.services.evaluate.scores import Row, Sample, joined, summarise
 
 STRESSED = 200
 """Episodes of a row that go on after the hold, lifted and pushed."""

@@ -3,11 +3,11 @@
 import zlib
 from typing import Literal
 
-from common.config import ObjectsConfig
-from common.errors import CongraspError
-from common.objects import procedural
-from common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool
-from common.objects.spec import GraspObject
+from congrasp.common.config import ObjectsConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import procedural
+from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool
+from congrasp.common.objects.spec import GraspObject
 
 Exam = Literal["figures", "development"]
 FAMILIES = tuple(sorted(procedural.FAMILIES, key=lambda family: zlib.crc32(family.encode())))

@@ -4,11 +4,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from common.policy.bundle import PolicyBundle
-from common.wire.codec import Message
-from services.evaluate.evaluator import Evaluator
-from services.viz.render import episode_strip
-from services.viz.sheets import contact_sheet
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.wire.codec import Message
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.viz.render import episode_strip
+from congrasp.services.viz.sheets import contact_sheet
 
 _FRAMES = 5
 _SIZE = (300, 225)

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.objects.spec import GraspObject
-from common.task.bank import ConstraintBank
-from common.task.sampling.headings import Headings, feasible
-from services.evaluate.plan import repeated_rests
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.sampling.headings import Headings, feasible
+from congrasp.services.evaluate.plan import repeated_rests
 
 _LIFT = np.array([0, 0, 10, 0, 0, 0, 0])
 """Of a resting pose, m: higher than any hand reaches down."""

@@ -6,11 +6,11 @@ import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from common.policy.pretrained import policy_file, pretrained_hands
-from common.task.methods import STUDENT, evaluated_as
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.pretrained import policy_file, pretrained_hands
+from congrasp.common.task.methods import STUDENT, evaluated_as
 
 Table = Literal[
     "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from actors.initial import InitialConditions
-from services.evaluate.episodes import identity
+from congrasp.actors.initial import InitialConditions
+from congrasp.services.evaluate.episodes import identity
 
 CONSTRAINT = "heading"
 """The row that is evaluated at every level."""

@@ -3,11 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from common.config import SensingConfig, TaskConfig
-from common.policy.bundle import PolicyBundle
-from common.task.constraints import optional
-from common.task.plausibility import CLEAN_MM
-from services.evaluate.scores import Row
+from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.task.constraints import optional
+from congrasp.common.task.plausibility import CLEAN_MM
+from congrasp.services.evaluate.scores import Row
 
 _LEAST = 0.8
 """Rates below this are named as limits."""

@@ -9,10 +9,10 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands.kinematics import grasp_frame
-from common.hands.motors import coupled
-from common.hands.spec import Hand
-from common.task.bank import ConstraintBank
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.bank import ConstraintBank
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from services.evaluate.evaluator import Evaluator
-from services.evaluate.noise import LEVELS
-from services.evaluate.scores import Row
-from services.viz.render import episode_strip
-from services.viz.sheets import contact_sheet, save_png
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.noise import LEVELS
+from congrasp.services.evaluate.scores import Row
+from congrasp.services.viz.render import episode_strip
+from congrasp.services.viz.sheets import contact_sheet, save_png
 
 _TITLES = {
     "joints": "Pose: normal error of every finger joint",

@@ -13,14 +13,14 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from actors import initial
-from actors.initial import InitialConditions, PlannedEpisodes
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.task.bank import ConstraintBank
-from common.task.constraints import get_constraint, optional, require_known
+from congrasp.actors import initial
+from congrasp.actors.initial import InitialConditions, PlannedEpisodes
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.constraints import get_constraint, optional, require_known
 
 ALIGNED = ":aligned"
 """Ends the name of a row whose pose and trajectory belong together; elsewhere each is drawn for itself."""

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.inputs import read_json
-from common.task.constraints import CONSTRAINTS
-from services.record.palette import INK
-from services.viz.plots import COLOURS, QUIET, new_figure, save, style
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import read_json
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.services.record.palette import INK
+from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, save, style
 
 _TITLES = {
     spec.column or spec.name: (f"{constraint.title.capitalize()} error", spec.unit or "share")

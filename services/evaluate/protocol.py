@@ -3,11 +3,11 @@
 import dataclasses
 import pathlib
 
-from common.config import SensingConfig, TaskConfig
-from common.hands import get_hand
-from common.objects.mjcf import CONTACT
-from common.objects.pool import object_scale
-from common.policy.bundle import PolicyBundle
+from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects.mjcf import CONTACT
+from congrasp.common.objects.pool import object_scale
+from congrasp.common.policy.bundle import PolicyBundle
 
 HOLD_SECONDS = 2.0
 """How long a grasp should last without the table, beyond the paper's quarter of a second."""

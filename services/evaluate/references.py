@@ -15,25 +15,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors import initial
-from actors.bank import POSES, make_references
-from actors.initial import PlannedEpisodes
-from common.caches import keep, read_kept
-from common.config import TaskConfig
-from common.engines import ENGINES, PhysicsName
-from common.files import cache_folder
-from common.hands import get_hand
-from common.objects import store
-from common.objects.spec import GraspObject
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from common.policy.pretrained import reference_file
-from common.task.bank import ConstraintBank
-from common.task.sampling.closed_poses import Poses
-from common.wire.codec import Message, encode
-from services.evaluate.episodes import Episodes
-from services.evaluate.plan import RowPlan, batches
-from services.evaluate.protocol import protocol
+from congrasp.actors import initial
+from congrasp.actors.bank import POSES, make_references
+from congrasp.actors.initial import PlannedEpisodes
+from congrasp.common.caches import keep, read_kept
+from congrasp.common.config import TaskConfig
+from congrasp.common.engines import ENGINES, PhysicsName
+from congrasp.common.files import cache_folder
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import store
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.pretrained import reference_file
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.common.wire.codec import Message, encode
+from congrasp.services.evaluate.episodes import Episodes
+from congrasp.services.evaluate.plan import RowPlan, batches
+from congrasp.services.evaluate.protocol import protocol
 
 HELD_OUT = POSES // 5
 """References of an object and region that tables are made with; the others are for training."""

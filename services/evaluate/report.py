@@ -8,15 +8,15 @@ import pathlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.policy.bundle import PolicyBundle, content_hash
-from common.wire.codec import encode
-from services.evaluate.cells import FORCES, error_title, force_cells, paper_cells, rate_cells, scaled
-from services.evaluate.model_card import model_card
-from services.evaluate.scores import ERRORS, Row
-from services.record.reader import read_metrics
-from services.viz.plots import draw, encoded, figures
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.policy.bundle import PolicyBundle, content_hash
+from congrasp.common.wire.codec import encode
+from congrasp.services.evaluate.cells import FORCES, error_title, force_cells, paper_cells, rate_cells, scaled
+from congrasp.services.evaluate.model_card import model_card
+from congrasp.services.evaluate.scores import ERRORS, Row
+from congrasp.services.record.reader import read_metrics
+from congrasp.services.viz.plots import draw, encoded, figures
 
 _REPORT = pathlib.Path(__file__).with_suffix(".html")
 _FEW = 100

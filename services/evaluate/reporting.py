@@ -4,20 +4,28 @@ import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from actors.physics import PhysicsName, resolve_physics
-from common.engines import engine_title
-from common.errors import CongraspError
-from common.parallel import cores
-from common.policy import bundle as bundles
-from services.assets.objects.named import objects_of
-from services.evaluate.evaluator import Evaluator
-from services.evaluate.exam import exam_pool
-from services.evaluate.failures import failure_sheets
-from services.evaluate.protocol import objects_label, two_seconds
-from services.evaluate.report import Commands, HandCheck, Picture, count_causes, curves_of, template, write_report
-from services.evaluate.scores import TABLES, Row, known_rows
-from services.evaluate.turntable import turntable
-from services.viz.sheets import png_of
+from congrasp.actors.physics import PhysicsName, resolve_physics
+from congrasp.common.engines import engine_title
+from congrasp.common.errors import CongraspError
+from congrasp.common.parallel import cores
+from congrasp.common.policy import bundle as bundles
+from congrasp.services.assets.objects.named import objects_of
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.exam import exam_pool
+from congrasp.services.evaluate.failures import failure_sheets
+from congrasp.services.evaluate.protocol import objects_label, two_seconds
+from congrasp.services.evaluate.report import (
+    Commands,
+    HandCheck,
+    Picture,
+    count_causes,
+    curves_of,
+    template,
+    write_report,
+)
+from congrasp.services.evaluate.scores import TABLES, Row, known_rows
+from congrasp.services.evaluate.turntable import turntable
+from congrasp.services.viz.sheets import png_of
 
 _PICTURED = 4
 

@@ -1,6 +1,6 @@
 """Figures of record: the files of `docs/results`, and the tables that pages show of them.
 
-`congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m services.evaluate.results` writes each
+`congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m congrasp.services.evaluate.results` writes each
 table between `<!-- results NAME KIND -->` and `<!-- end of results -->` in the README and in `docs`; KIND is one of
 `KINDS`.
 """
@@ -17,14 +17,14 @@ from typing import Any
 
 import jax
 
-from common.engines import engine_title
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.inputs import read_json
-from common.parallel import cores
-from services.evaluate.cells import paper_cells, plausibility_cells, rate_cells, row_title
-from services.evaluate.heading_rules import HeadingRules
-from services.evaluate.scores import Row
+from congrasp.common.engines import engine_title
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.inputs import read_json
+from congrasp.common.parallel import cores
+from congrasp.services.evaluate.cells import paper_cells, plausibility_cells, rate_cells, row_title
+from congrasp.services.evaluate.heading_rules import HeadingRules
+from congrasp.services.evaluate.scores import Row
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 FOLDER = pathlib.Path("docs", "results")

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from actors.protocols import ASSESSED, SURVIVAL
-from common.config import TaskConfig
-from common.files import write_atomically
-from common.task.constraints import CONSTRAINTS
-from common.task.plausibility import CLEAN_MM
-from services.evaluate.intervals import NORMAL_95, clustered, independent_episodes, standard_error
-from services.evaluate.paper import PaperRow, paper_row
-from services.evaluate.plan import ALIGNED
+from congrasp.actors.protocols import ASSESSED, SURVIVAL
+from congrasp.common.config import TaskConfig
+from congrasp.common.files import write_atomically
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.plausibility import CLEAN_MM
+from congrasp.services.evaluate.intervals import NORMAL_95, clustered, independent_episodes, standard_error
+from congrasp.services.evaluate.paper import PaperRow, paper_row
+from congrasp.services.evaluate.plan import ALIGNED
 
 TABLES = {
     "single": tuple(constraint.name for constraint in CONSTRAINTS),

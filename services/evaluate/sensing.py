@@ -9,8 +9,8 @@ import math
 
 import jax.numpy as jnp
 
-from actors.initial import InitialConditions
-from common.config import SensingConfig, TaskConfig
+from congrasp.actors.initial import InitialConditions
+from congrasp.common.config import SensingConfig, TaskConfig
 
 CONSTRAINT = "heading"
 """The row that is evaluated at every level."""

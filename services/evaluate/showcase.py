@@ -5,13 +5,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from common.config import ObjectsConfig
-from common.objects.pool import HELD_OUT_SEED, load_pool
-from common.parallel import cores
-from common.policy.bundle import PolicyBundle
-from services.evaluate.evaluator import Evaluator
-from services.viz.render import episode_strip
-from services.viz.sheets import contact_sheet, save_png
+from congrasp.common.config import ObjectsConfig
+from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
+from congrasp.common.parallel import cores
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.viz.render import episode_strip
+from congrasp.services.viz.sheets import contact_sheet, save_png
 
 _OBJECTS, _ATTEMPTS, _FRAMES = 12, 8, 4
 _SIZE = (360, 270)

@@ -7,28 +7,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import Split
-from common.engines import PhysicsName
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects.pool import object_scale
-from common.objects.spec import GraspObject
-from common.parallel import cores
-from common.policy.bundle import PolicyBundle
-from common.task.bank import ConstraintBank
-from common.task.constraint_sets import bank_of, load_for
-from common.task.methods import takes
-from services.evaluate import loads, sensing
-from services.evaluate.evaluator import Evaluator
-from services.evaluate.exam import Exam, exam_pool
-from services.evaluate.heading_rules import HeadingRules
-from services.evaluate.noise import LEVELS
-from services.evaluate.paper import CAPTURED_SETS
-from services.evaluate.plan import from_references
-from services.evaluate.protocol import NOMINAL_FRICTION, two_seconds
-from services.evaluate.references import reference_policy
-from services.evaluate.scores import TABLES, Row, known_rows
-from services.evaluate.unseen import evaluate_objects, folder_pools, procedural_pools
+from congrasp.common.config import Split
+from congrasp.common.engines import PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects.pool import object_scale
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.parallel import cores
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.constraint_sets import bank_of, load_for
+from congrasp.common.task.methods import takes
+from congrasp.services.evaluate import loads, sensing
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.exam import Exam, exam_pool
+from congrasp.services.evaluate.heading_rules import HeadingRules
+from congrasp.services.evaluate.noise import LEVELS
+from congrasp.services.evaluate.paper import CAPTURED_SETS
+from congrasp.services.evaluate.plan import from_references
+from congrasp.services.evaluate.protocol import NOMINAL_FRICTION, two_seconds
+from congrasp.services.evaluate.references import reference_policy
+from congrasp.services.evaluate.scores import TABLES, Row, known_rows
+from congrasp.services.evaluate.unseen import evaluate_objects, folder_pools, procedural_pools
 
 MANY = 50_000
 """Most procedural objects of the table `objects`, where their number is not given."""

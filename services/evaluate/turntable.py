@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands import known_hand
-from common.hands.skin import skin_of
-from common.wire.codec import Message
-from services.record.palette import OBJECT
-from services.viz.scene import Shape
-from services.viz.shapes import skin_colours, table_shape
-from services.viz.triangles import triangles_of
+from congrasp.common.hands import known_hand
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.palette import OBJECT
+from congrasp.services.viz.scene import Shape
+from congrasp.services.viz.shapes import skin_colours, table_shape
+from congrasp.services.viz.triangles import triangles_of
 
 FRAME_SECONDS = 0.04
 

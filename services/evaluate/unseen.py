@@ -18,29 +18,29 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from actors.bank import build_bank, headings_of
-from common.config import TaskConfig
-from common.engines import ENGINES, PhysicsName
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.hands import get_hand
-from common.hands.spec import Hand
-from common.inputs import read_file
-from common.objects import procedural
-from common.objects.distance import DistanceField, distance_field
-from common.objects.pool import object_scale, scale_objects
-from common.objects.spec import GraspObject
-from common.parallel import parallel_map
-from common.policy.bundle import PolicyBundle, content_hash
-from common.task.bank import ConstraintBank
-from common.wire.codec import MAX_MESSAGE, Message, decode, encode
-from services.assets.objects.named import ObjectAt, load_each, objects_at
-from services.evaluate.episodes import Episodes
-from services.evaluate.evaluator import MEASURED, STRESSED, batch_of, simulate
-from services.evaluate.exam import FAMILIES, Exam, first_seed
-from services.evaluate.plan import batches, plan_row
-from services.evaluate.protocol import protocol, two_seconds
-from services.evaluate.scores import Row, Sample, joined, object_groups, summarise
+from congrasp.actors.bank import build_bank, headings_of
+from congrasp.common.config import TaskConfig
+from congrasp.common.engines import ENGINES, PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.inputs import read_file
+from congrasp.common.objects import procedural
+from congrasp.common.objects.distance import DistanceField, distance_field
+from congrasp.common.objects.pool import object_scale, scale_objects
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.parallel import parallel_map
+from congrasp.common.policy.bundle import PolicyBundle, content_hash
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
+from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
+from congrasp.services.evaluate.episodes import Episodes
+from congrasp.services.evaluate.evaluator import MEASURED, STRESSED, batch_of, simulate
+from congrasp.services.evaluate.exam import FAMILIES, Exam, first_seed
+from congrasp.services.evaluate.plan import batches, plan_row
+from congrasp.services.evaluate.protocol import protocol, two_seconds
+from congrasp.services.evaluate.scores import Row, Sample, joined, object_groups, summarise
 
 _ROW = "heading"
 _MOST = {True: 4096, False: 128}

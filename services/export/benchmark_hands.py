@@ -13,9 +13,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands.spec import Hand, Joint, Solid, Vector, vector
-from services.export.motion_file import GraspMotion
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand, Joint, Solid, Vector, vector
+from congrasp.services.export.motion_file import GraspMotion
 
 Row = tuple[float, float, float, float, float, float]
 """Anchor (m) and axis (unit) of a joint, in the palm's frame at zero."""

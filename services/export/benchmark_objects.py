@@ -8,18 +8,18 @@ import numpy as np
 import trimesh
 from scipy.spatial import QhullError
 
-import common.objects
-import services.assets.objects
-from common.caches import keep, read_kept, source_digest
-from common.errors import CongraspError
-from common.files import cache_folder, write_atomically
-from common.objects import shapes
-from common.objects.plain import plain_object
-from common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
-from common.wire.codec import Message
-from services.assets.objects.decompose import decompose
-from services.assets.objects.pieces import simplify
-from services.export.motion_file import GraspMotion
+import congrasp.common.objects
+import congrasp.services.assets.objects
+from congrasp.common.caches import keep, read_kept, source_digest
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import cache_folder, write_atomically
+from congrasp.common.objects import shapes
+from congrasp.common.objects.plain import plain_object
+from congrasp.common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.objects.decompose import decompose
+from congrasp.services.assets.objects.pieces import simplify
+from congrasp.services.export.motion_file import GraspMotion
 
 _DENSITY = 500.0  # kg/m^3
 _SECONDS = 60.0  # for the convex decomposition of a body
@@ -77,7 +77,7 @@ def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
     that where CoACD had too little time is not: another run may have more.
     """
     vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
-    code = source_digest(services.assets.objects, common.objects).encode()
+    code = source_digest(congrasp.services.assets.objects, congrasp.common.objects).encode()
     key = hashlib.sha256(b"".join([code, vertices.tobytes(), faces.tobytes(), bytes([most])])).hexdigest()[:32]
     file = cache_folder("pieces") / f"{key}.safetensors"
     if (kept := read_kept(file)) is not None:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from services.export.frames import FROM_Y_UP, TO_Y_UP, Track, bodies, facts, identifiers, pose_matrices
-from services.export.motion_file import GraspMotion
+from congrasp.services.export.frames import FROM_Y_UP, TO_Y_UP, Track, bodies, facts, identifiers, pose_matrices
+from congrasp.services.export.motion_file import GraspMotion
 
 _CM = 100.0
 _ORDER = "ZYX"

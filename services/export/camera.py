@@ -8,13 +8,13 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from common.hands.skin import Skin
-from common.parallel import cores
-from services.export.frames import skin_of_motion
-from services.export.motion_file import GraspMotion
-from services.viz.raster import render_scene
-from services.viz.scene import Camera, Shape
-from services.viz.shapes import fit, object_shape, skin_shape, table_shape
+from congrasp.common.hands.skin import Skin
+from congrasp.common.parallel import cores
+from congrasp.services.export.frames import skin_of_motion
+from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.scene import Camera, Shape
+from congrasp.services.viz.shapes import fit, object_shape, skin_shape, table_shape
 
 SIZE = (320, 240)
 """Width and height in pixels."""

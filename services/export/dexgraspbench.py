@@ -16,23 +16,23 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from actors.physics.scene import compile_scene
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.hands import HANDS, get_hand, own_hands
-from common.hands.mjcf import add_hand
-from common.hands.motors import motor_positions
-from common.hands.spec import Hand
-from common.inputs import file_name
-from common.npz import read_npz
-from common.objects.spec import GraspObject
-from services.export.benchmark_hands import Match, benchmarked, match_hand
-from services.export.benchmark_objects import convex_object, write_object
-from services.export.frames import TOLERANCE_MM
-from services.export.motion_file import GraspMotion
-from services.export.motion_formats import pick_motion
-from services.record.goals import grasp_span
+from congrasp.actors.physics.scene import compile_scene
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.hands import HANDS, get_hand, own_hands
+from congrasp.common.hands.mjcf import add_hand
+from congrasp.common.hands.motors import motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.inputs import file_name
+from congrasp.common.npz import read_npz
+from congrasp.common.objects.spec import GraspObject
+from congrasp.services.export.benchmark_hands import Match, benchmarked, match_hand
+from congrasp.services.export.benchmark_objects import convex_object, write_object
+from congrasp.services.export.frames import TOLERANCE_MM
+from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion_formats import pick_motion
+from congrasp.services.record.goals import grasp_span
 
 CLEARANCE = 0.006
 """Metres between hand and object in the pregrasp."""

@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands import get_hand, own_hands
-from common.hands.skeleton import Skeleton
-from common.hands.skin import Skin, skin_of, skin_on
-from common.hands.spec import Hand
-from common.objects.painting import painted
-from services.export.motion_file import GraspMotion, hand_arrays
-from services.record import palette
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand, own_hands
+from congrasp.common.hands.skeleton import Skeleton
+from congrasp.common.hands.skin import Skin, skin_of, skin_on
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.painting import painted
+from congrasp.services.export.motion_file import GraspMotion, hand_arrays
+from congrasp.services.record import palette
 
 OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""

@@ -14,8 +14,8 @@ import pygltflib as gltf
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.hands.skin import Skin
-from services.export.frames import (
+from congrasp.common.hands.skin import Skin
+from congrasp.services.export.frames import (
     COLOURS,
     FROM_Y_UP,
     OBJECT,
@@ -29,7 +29,7 @@ from services.export.frames import (
     pose_matrices,
     skin_of_motion,
 )
-from services.export.motion_file import GraspMotion
+from congrasp.services.export.motion_file import GraspMotion
 
 _KINDS = {1: gltf.SCALAR, 3: gltf.VEC3, 4: gltf.VEC4, 16: gltf.MAT4}
 

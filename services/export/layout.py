@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 import foxglove.layouts as fl
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.inputs import parse_json
-from services.record.channels import flatten
-from services.record.reader import log_files, metrics_of, read_records
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.inputs import parse_json
+from congrasp.services.record.channels import flatten
+from congrasp.services.record.reader import log_files, metrics_of, read_records
 
 CURVES = {
     "Success and return": ("episode/success", "episode/return"),

@@ -16,13 +16,13 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from services.export.camera import SIZE, calibration, camera_for, pictures
-from services.export.frames import OBJECT, Track, facts, pose_matrices
-from services.export.motion_file import GraspMotion
-from services.export.urdf import forward_kinematics, hand_urdf
-from services.viz.scene import Camera
-from services.viz.sheets import save_video
+from congrasp.common.errors import CongraspError
+from congrasp.services.export.camera import SIZE, calibration, camera_for, pictures
+from congrasp.services.export.frames import OBJECT, Track, facts, pose_matrices
+from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.urdf import forward_kinematics, hand_urdf
+from congrasp.services.viz.scene import Camera
+from congrasp.services.viz.sheets import save_video
 
 VERSION = "v3.0"
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

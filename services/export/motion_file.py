@@ -14,17 +14,17 @@ from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 
-from common.described import check_arrays
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.hands import known_hand
-from common.hands.spec import Hand, capsule_ends
-from common.inputs import file_name
-from common.npz import read_npz
-from common.objects.spec import Colours
-from common.task.constraints import CONSTRAINTS
-from common.wire.codec import Message
-from services.record.goals import active_constraints
+from congrasp.common.described import check_arrays
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.hands import known_hand
+from congrasp.common.hands.spec import Hand, capsule_ends
+from congrasp.common.inputs import file_name
+from congrasp.common.npz import read_npz
+from congrasp.common.objects.spec import Colours
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.goals import active_constraints
 
 FORMAT = 2
 MAX_BYTES = 256 << 20

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.files import check_free
-from services.export.frames import TOLERANCE_MM, error_mm
-from services.export.motion_file import GraspMotion, load_motion, motion_of_episode
-from services.record.reader import pick_episode
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import check_free
+from congrasp.services.export.frames import TOLERANCE_MM, error_mm
+from congrasp.services.export.motion_file import GraspMotion, load_motion, motion_of_episode
+from congrasp.services.record.reader import pick_episode
 
 FORMATS = {
     "glb": ".glb",
@@ -83,7 +83,7 @@ def export_motions(
     check_free(path, force=force)
     for motion in motions:
         _check(motion)
-    module = importlib.import_module(f"services.export.{kind}")
+    module = importlib.import_module(f"congrasp.services.export.{kind}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         workplace = pathlib.Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))

@@ -9,9 +9,9 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from common.policy.bundle import PolicyBundle
-from common.policy.network import TRUNK, gated
-from common.policy.normalizer import LIMIT
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.network import TRUNK, gated
+from congrasp.common.policy.normalizer import LIMIT
 
 OPSET = 17
 """Old enough for every runtime in use; the graph needs nothing newer."""

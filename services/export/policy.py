@@ -12,20 +12,20 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, TABLE_AWAY, object_contact, scene_spec
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame
-from common.hands.mjcf import WRIST_JOINTS
-from common.hands.motors import transmission
-from common.hands.spec import Hand, link_origin
-from common.policy.bundle import PolicyBundle, content_hash, mean_action
-from common.policy.network import gated
-from common.task import observation
-from common.task.geometry import FORCE_SCALE
-from common.wire.codec import encode
-from services.serve.limits import JointLimits
+from congrasp.actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, TABLE_AWAY, object_contact, scene_spec
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.mjcf import WRIST_JOINTS
+from congrasp.common.hands.motors import transmission
+from congrasp.common.hands.spec import Hand, link_origin
+from congrasp.common.policy.bundle import PolicyBundle, content_hash, mean_action
+from congrasp.common.policy.network import gated
+from congrasp.common.task import observation
+from congrasp.common.task.geometry import FORCE_SCALE
+from congrasp.common.wire.codec import encode
+from congrasp.services.serve.limits import JointLimits
 
 TOLERANCE = 1e-5
 """Largest absolute difference between an exported policy and the Flax policy that is let through, in action units."""
@@ -209,7 +209,7 @@ def export_policy(bundle: PolicyBundle, kind: str, path: pathlib.Path) -> float:
 
 def _onnx(bundle: PolicyBundle) -> bytes:
     """The policy as an ONNX file's content."""
-    from services.export.onnx_graph import policy_model
+    from congrasp.services.export.onnx_graph import policy_model
 
     return policy_model(bundle, describe(bundle)).SerializeToString()
 

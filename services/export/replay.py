@@ -18,16 +18,16 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from actors.physics.engine import PhysicsState, ResetState
-from actors.physics.native import EnvInstance, NativePhysics
-from actors.protocols import FARTHEST, MOST_TURNED, PUSH_FORCE
-from common.config import TaskConfig
-from common.files import write_atomically
-from common.hands.motors import motor_positions
-from common.hands.spec import Hand
-from common.parallel import cores
-from services.export.benchmark_hands import benchmarked
-from services.export.dexgraspbench import STATES, Grasp, State
+from congrasp.actors.physics.engine import PhysicsState, ResetState
+from congrasp.actors.physics.native import EnvInstance, NativePhysics
+from congrasp.actors.protocols import FARTHEST, MOST_TURNED, PUSH_FORCE
+from congrasp.common.config import TaskConfig
+from congrasp.common.files import write_atomically
+from congrasp.common.hands.motors import motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.parallel import cores
+from congrasp.services.export.benchmark_hands import benchmarked
+from congrasp.services.export.dexgraspbench import STATES, Grasp, State
 
 MASS, FRICTION, TORSION = 0.1, 0.6, 0.02
 """kg, and sliding and torsional (m) friction of every object."""

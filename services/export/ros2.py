@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.objects.painting import nearest
-from services.export.frames import COLOURS, OBJECT, Body, Track, bodies, facts, pose_matrices
-from services.export.motion_file import GraspMotion
-from services.export.urdf import forward_kinematics, hand_urdf
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.painting import nearest
+from congrasp.services.export.frames import COLOURS, OBJECT, Body, Track, bodies, facts, pose_matrices
+from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.urdf import forward_kinematics, hand_urdf
 
 _WORLD = "world"
 _START = 10**9  # ns; TF takes a stamp of zero for "whenever"

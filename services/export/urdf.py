@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from services.export.frames import capsules, pose_matrices
-from services.export.motion_file import GraspMotion
+from congrasp.services.export.frames import capsules, pose_matrices
+from congrasp.services.export.motion_file import GraspMotion
 
 _MASS, _INERTIA = "0.01", "1e-6"
 """Of every link: only the kinematics is meant, but some readers refuse a link without."""

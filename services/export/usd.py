@@ -15,8 +15,8 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 
-from common.hands.skin import Skin
-from services.export.frames import (
+from congrasp.common.hands.skin import Skin
+from congrasp.services.export.frames import (
     COLOURS,
     OBJECT,
     SKIN,
@@ -31,7 +31,7 @@ from services.export.frames import (
     pose_matrices,
     skin_of_motion,
 )
-from services.export.motion_file import GraspMotion
+from congrasp.services.export.motion_file import GraspMotion
 
 _NAME = "congrasp:name"
 _DOUBLE = UsdGeom.XformOp.PrecisionDouble

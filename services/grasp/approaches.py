@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from actors.bank import clear_of_table
-from common.errors import CongraspError
-from common.hands.outline import outline
-from common.hands.spec import Hand
-from common.objects.shapes import matrix
-from common.objects.spec import GraspObject
-from common.request import GraspRequest
-from common.task.constraints import CONSTRAINTS
-from common.task.sampling.headings import above, sample_headings, within_reach
+from congrasp.actors.bank import clear_of_table
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.outline import outline
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.shapes import matrix
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.request import GraspRequest
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.sampling.headings import above, sample_headings, within_reach
 
 
 def headings(

@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from actors.bank import build_bank
-from common.config import TaskConfig
-from common.files import write_atomically
-from common.hands.spec import Hand
-from common.inputs import file_name
-from common.objects import store
-from common.objects.pool import object_scale, scale_objects
-from common.objects.spec import GraspObject
-from common.task.bank import ConstraintBank, rows_of
-from common.task.constraint_sets import FORMAT, MEANING, REGIONS, SUFFIX
-from common.wire.codec import Message, encode
+from congrasp.actors.bank import build_bank
+from congrasp.common.config import TaskConfig
+from congrasp.common.files import write_atomically
+from congrasp.common.hands.spec import Hand
+from congrasp.common.inputs import file_name
+from congrasp.common.objects import store
+from congrasp.common.objects.pool import object_scale, scale_objects
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.bank import ConstraintBank, rows_of
+from congrasp.common.task.constraint_sets import FORMAT, MEANING, REGIONS, SUFFIX
+from congrasp.common.wire.codec import Message, encode
 
 _TRAINING = 0.8
 

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.wire.codec import Message
-from services.export.motion_file import save_motion
-from services.grasp.grasper import Grasp
-from services.record.channels import JsonChannels
-from services.record.scene import episode_entries
-from services.record.writer import LogWriter
-from services.viz.render import (
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.wire.codec import Message
+from congrasp.services.export.motion_file import save_motion
+from congrasp.services.grasp.grasper import Grasp
+from congrasp.services.record.channels import JsonChannels
+from congrasp.services.record.scene import episode_entries
+from congrasp.services.record.writer import LogWriter
+from congrasp.services.viz.render import (
     best_camera,
     episode_sheet,
     grasp_picture,
@@ -24,7 +24,7 @@ from services.viz.render import (
     render_episode_frames,
     save_episode_video,
 )
-from services.viz.sheets import save_png
+from congrasp.services.viz.sheets import save_png
 
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
 PORTRAIT = "portrait.png"

@@ -11,29 +11,29 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from actors.attempts import Attempts, Outcome
-from actors.initial import RequestedEpisodes
-from actors.protocols import ASSESSED, SURVIVAL
-from common.config import TaskConfig
-from common.errors import CongraspError, ContradictionError
-from common.hands import get_hand
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.parallel import cores
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from common.policy.pretrained import policy_file
-from common.request import GraspRequest
-from common.task.constraints import CONSTRAINTS, goal_of, optional, require_known
-from common.task.constraints.priority import contradictions, explain
-from common.task.types import Goal, Surface
-from common.wire.codec import Message
-from services.assets.objects.named import one_object
-from services.assets.objects.options import ImportOptions
-from services.export.motion_file import GraspMotion, motion_of_episode
-from services.grasp.approaches import headings, prescribed, valid_rests
-from services.grasp.parse import read_request
-from services.grasp.reach import Reach, plan_reach, with_reach
+from congrasp.actors.attempts import Attempts, Outcome
+from congrasp.actors.initial import RequestedEpisodes
+from congrasp.actors.protocols import ASSESSED, SURVIVAL
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError, ContradictionError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.parallel import cores
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.request import GraspRequest
+from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional, require_known
+from congrasp.common.task.constraints.priority import contradictions, explain
+from congrasp.common.task.types import Goal, Surface
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.objects.named import one_object
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.export.motion_file import GraspMotion, motion_of_episode
+from congrasp.services.grasp.approaches import headings, prescribed, valid_rests
+from congrasp.services.grasp.parse import read_request
+from congrasp.services.grasp.reach import Reach, plan_reach, with_reach
 
 ATTEMPTS = 16
 """Grasps that are simulated side by side."""

@@ -11,21 +11,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.inputs import file_name
-from common.objects.procedural import MASS_RANGE
-from common.objects.resting import rest_tilts
-from common.objects.spec import GraspObject
-from common.objects.store import Catalogue
-from services.assets.objects.named import ObjectAt, objects_at
-from services.assets.objects.options import ImportOptions, check_options
-from services.assets.objects.sizes import size_in_words
-from services.grasp.files import OBJECT, THUMBNAIL, VIDEO, finished, key_of, save_grasp
-from services.grasp.grasper import Grasper, Progress
-from services.grasp.parse import numbered, read_request
-from services.viz.import_sheet import import_sheet, mesh_of_file
-from services.viz.sheets import contact_sheet, save_png
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.inputs import file_name
+from congrasp.common.objects.procedural import MASS_RANGE
+from congrasp.common.objects.resting import rest_tilts
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.objects.store import Catalogue
+from congrasp.services.assets.objects.named import ObjectAt, objects_at
+from congrasp.services.assets.objects.options import ImportOptions, check_options
+from congrasp.services.assets.objects.sizes import size_in_words
+from congrasp.services.grasp.files import OBJECT, THUMBNAIL, VIDEO, finished, key_of, save_grasp
+from congrasp.services.grasp.grasper import Grasper, Progress
+from congrasp.services.grasp.parse import numbered, read_request
+from congrasp.services.viz.import_sheet import import_sheet, mesh_of_file
+from congrasp.services.viz.sheets import contact_sheet, save_png
 
 SHEET, SUMMARY = "summary.png", "summary.json"
 _COLUMNS = 6

@@ -14,23 +14,23 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from common.errors import CongraspError
-from common.hands.motors import coupled
-from common.hands.spec import Hand
-from common.inputs import read_json
-from common.objects.spec import GraspObject
-from common.request import GraspRequest
-from common.task import constraint_sets
-from common.task.constraints import CONSTRAINTS, get_constraint
-from common.task.constraints.base import Option
-from common.task.constraints.force import least_force
-from common.wire.codec import Message
-from services.assets.objects.headers import check_header
-from services.assets.objects.sizes import size_in_words
-from services.export.frames import continuous_quaternions
-from services.export.motion_file import GraspMotion, load_motion
-from services.grasp.wrist_paths import HUGE, read_csv
-from services.record.goals import grasp_span
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.spec import Hand
+from congrasp.common.inputs import read_json
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.request import GraspRequest
+from congrasp.common.task import constraint_sets
+from congrasp.common.task.constraints import CONSTRAINTS, get_constraint
+from congrasp.common.task.constraints.base import Option
+from congrasp.common.task.constraints.force import least_force
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.objects.headers import check_header
+from congrasp.services.assets.objects.sizes import size_in_words
+from congrasp.services.export.frames import continuous_quaternions
+from congrasp.services.export.motion_file import GraspMotion, load_motion
+from congrasp.services.grasp.wrist_paths import HUGE, read_csv
+from congrasp.services.record.goals import grasp_span
 
 ABOVE = "above"
 """The heading straight down, whatever the object's pose."""

@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from common import rotations
-from common.errors import CongraspError
-from common.hands.spec import Hand, link_origin
-from common.objects.distance import DistanceField, distance_field
-from common.objects.spec import GraspObject
-from common.wire.codec import Message
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.viz.shapes import upright
+from congrasp.common import rotations
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand, link_origin
+from congrasp.common.objects.distance import DistanceField, distance_field
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.viz.shapes import upright
 
 SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
 """m/s, m/s^2 and rad/s that the wrist does not exceed."""

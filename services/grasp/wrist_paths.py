@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.inputs import read_file
-from common.npz import read_npz
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import read_file
+from congrasp.common.npz import read_npz
 
 _LARGEST, _DEEPEST = 32 << 20, 200
 """Bytes of a BVH or CSV file, and joints of a BVH chain."""

@@ -14,9 +14,9 @@ import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from common.errors import CongraspError
-from common.journal import AUDIT, JournalLines, has_fields, read_journal
-from learner.audit import Used, read_uses, replay
+from congrasp.common.errors import CongraspError
+from congrasp.common.journal import AUDIT, JournalLines, has_fields, read_journal
+from congrasp.learner.audit import Used, read_uses, replay
 
 Identity = tuple[str, str, int]
 """Actor, incarnation and sequence number."""

@@ -19,10 +19,10 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from common.errors import CongraspError
-from common.transport.certificates import Certificate, load, read
-from common.transport.keys import check_name
-from common.transport.security import (
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.certificates import Certificate, load, read
+from congrasp.common.transport.keys import check_name
+from congrasp.common.transport.security import (
     CA_FILE,
     CERTIFICATE_FILE,
     KEY_FILE,

@@ -15,12 +15,12 @@ from typing import NamedTuple
 
 from packaging.requirements import Requirement
 
-from common.errors import CongraspError
-from common.transport import urls
-from common.transport.keys import FLOWS
-from common.transport.ports import LEARNER_URL
-from services.ops.certificates import certificates
-from services.ops.status import ask
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import FLOWS
+from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.services.ops.certificates import certificates
+from congrasp.services.ops.status import ask
 
 _PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "flax", "eclipse-zenoh")
 _PAIRS = (("mujoco", "mujoco-mjx"), ("jax", "jaxlib"))

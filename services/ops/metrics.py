@@ -9,7 +9,7 @@ from typing import Any
 from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from common.errors import CongraspError, TransportError
+from congrasp.common.errors import CongraspError, TransportError
 
 _TICKETS = ("granted", "redeemed", "returned", "expired")
 _GAUGES = {

@@ -8,10 +8,10 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from common.errors import TransportError
-from common.transport.base import Transport
-from common.transport.keys import Keys
-from common.wire.codec import Message
+from congrasp.common.errors import TransportError
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message
 
 _TIMEOUT = 5.0
 _SUMS = {

@@ -8,8 +8,8 @@ import collections
 import time
 from collections.abc import Callable
 
-from common.errors import CongraspError
-from learner.rate_limit import certificate
+from congrasp.common.errors import CongraspError
+from congrasp.learner.rate_limit import certificate
 
 Name = tuple[str, str]
 """Role and name of who publishes."""

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 from google.protobuf.message import Message as Protobuf
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from common.errors import CongraspError
-from common.wire.codec import finite
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import finite
 
 OPAQUE = "x-safetensors"
 """Encoding of messages that are the bytes of `common.wire.codec`."""

@@ -9,12 +9,12 @@ from typing import Any
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from common.errors import CongraspError
-from common.transport.keys import check_name
-from common.wire.codec import Message, encode, finite
-from common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
-from services.record.budget import LogBudget, Name
-from services.record.channels import (
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.keys import check_name
+from congrasp.common.wire.codec import Message, encode, finite
+from congrasp.common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
+from congrasp.services.record.budget import LogBudget, Name
+from congrasp.services.record.channels import (
     ROLLOUT_SCHEMA,
     Entry,
     JsonChannels,
@@ -23,7 +23,7 @@ from services.record.channels import (
     opaque_channel,
     protobuf_channel,
 )
-from services.record.scene import check_episode, duration, episode_entries
+from congrasp.services.record.scene import check_episode, duration, episode_entries
 
 _AHEAD = 60_000_000_000
 """ns by which an actor's episodes may be behind one another; those that would come later are left out."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from common.task.constraints import CONSTRAINTS
+from congrasp.common.task.constraints import CONSTRAINTS
 
 _LATEST = 1e4  # s
 _OLDER = ("affordance", "pose_finger", "pose_wrist", "trajectory")

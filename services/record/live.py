@@ -8,8 +8,8 @@ import threading
 import time
 from typing import Any
 
-from common.errors import CongraspError
-from services.record.channels import Channel, Entry
+from congrasp.common.errors import CongraspError
+from congrasp.services.record.channels import Channel, Entry
 
 _HOST = "127.0.0.1"
 _BACKLOG, _BYTES = 20000, 256 << 20  # entries that may wait for their time; beyond it the newest are left out

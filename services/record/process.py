@@ -8,12 +8,12 @@ import time
 
 from rich.console import Console
 
-from common.errors import CongraspError
-from common.transport import urls
-from common.transport.keys import Keys, process_name
-from services.ops.logs import log
-from services.record.live import LiveServer
-from services.record.recorder import Recorder
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import Keys, process_name
+from congrasp.services.ops.logs import log
+from congrasp.services.record.live import LiveServer
+from congrasp.services.record.recorder import Recorder
 
 _REFRESH, _CLOSE = 0.5, 2.5  # seconds
 

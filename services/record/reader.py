@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.writer import MCAP0_MAGIC
 
-from common.errors import CongraspError
-from common.inputs import open_file, parse_json
-from common.wire.codec import Message, decode
-from services.record.channels import ROLLOUT_SCHEMA, flatten
-from services.record.salvage import Dropped, read_messages
-from services.record.scene import EPISODE_SCHEMA, check_episode
-from services.record.writer import PART
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import open_file, parse_json
+from congrasp.common.wire.codec import Message, decode
+from congrasp.services.record.channels import ROLLOUT_SCHEMA, flatten
+from congrasp.services.record.salvage import Dropped, read_messages
+from congrasp.services.record.scene import EPISODE_SCHEMA, check_episode
+from congrasp.services.record.writer import PART
 
 _log = logging.getLogger(__name__)
 

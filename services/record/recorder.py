@@ -7,14 +7,14 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from common.errors import CongraspError
-from common.inputs import file_name
-from common.transport.base import Transport
-from common.transport.keys import Keys
-from common.wire.codec import Message
-from services.record.channels import Entry
-from services.record.entries import Converter
-from services.record.writer import LogWriter
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import file_name
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.channels import Entry
+from congrasp.services.record.entries import Converter
+from congrasp.services.record.writer import LogWriter
 
 FLUSH_SECONDS = 0.5
 """A killed recorder loses at most this much."""

@@ -18,20 +18,20 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands import known_hand
-from common.hands.mjcf import WRIST_JOINTS
-from common.hands.spec import Hand, Link, capsule_ends
-from common.objects.checks import LARGEST
-from common.objects.painting import nearest
-from common.objects.spec import Colours
-from common.wire.codec import Message, encode
-from common.wire.messages import EPISODE, validate
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
-from services.record.goals import active_blocks
-from services.record.palette import AVOID, FLESH, GRASPABLE, HEADING, OBJECT, TABLE, WAYPOINT
-from services.record.surface import surface_parts, surface_points
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import known_hand
+from congrasp.common.hands.mjcf import WRIST_JOINTS
+from congrasp.common.hands.spec import Hand, Link, capsule_ends
+from congrasp.common.objects.checks import LARGEST
+from congrasp.common.objects.painting import nearest
+from congrasp.common.objects.spec import Colours
+from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.messages import EPISODE, validate
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
+from congrasp.services.record.goals import active_blocks
+from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE, HEADING, OBJECT, TABLE, WAYPOINT
+from congrasp.services.record.surface import surface_parts, surface_points
 
 EPISODE_SCHEMA = "congrasp.Episode"
 _MOST = {"T": 2000, "V": 200_000, "Fc": 400_000, "N": 4096, "n": 64, "P": 100_000}

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from common.errors import CongraspError
-from common.hands.skeleton import skeleton_of
-from common.hands.skin import Skin, skin_of, skin_on
-from common.hands.spec import Hand
-from services.record.palette import FLESH, JOINT, SKIN, Colour
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.skeleton import skeleton_of
+from congrasp.common.hands.skin import Skin, skin_of, skin_on
+from congrasp.common.hands.spec import Hand
+from congrasp.services.record.palette import FLESH, JOINT, SKIN, Colour
 
 _OVERLAP = 0.4  # weight of a link on a point of a triangle from which the triangle belongs to it, too
 _MOST_FACES = 12_000  # of a hand; links' own meshes may have more

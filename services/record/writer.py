@@ -8,8 +8,8 @@ from typing import IO
 
 from mcap.writer import CompressionType, IndexType, Writer
 
-from common.errors import CongraspError
-from services.record.channels import CONVENTIONS, Channel, Entry
+from congrasp.common.errors import CongraspError
+from congrasp.services.record.channels import CONVENTIONS, Channel, Entry
 
 PART = ".part"
 """Suffix of a file that is being written, or whose writer was killed."""

@@ -3,10 +3,10 @@
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
-from services.evaluate.paper import PaperLine, paper_lines
-from services.evaluate.scores import Row
-from services.reproduce.evaluation import Result
-from services.reproduce.plan import Policy
+from congrasp.services.evaluate.paper import PaperLine, paper_lines
+from congrasp.services.evaluate.scores import Row
+from congrasp.services.reproduce.evaluation import Result
+from congrasp.services.reproduce.plan import Policy
 
 SUCCESS = "success"
 CAPTURED_DATA = {"captured": "GRAB and OakInk", "cross": "DexYCB"}

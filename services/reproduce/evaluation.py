@@ -7,19 +7,19 @@ import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from common.engines import PhysicsName
-from common.errors import CongraspError
-from common.inputs import read_json
-from common.policy.bundle import content_hash
-from common.wire.codec import encode
-from services.assets.objects.named import objects_of
-from services.evaluate.failures import failure_sheets
-from services.evaluate.lineup import Entrant, facts
-from services.evaluate.report import count_causes
-from services.evaluate.scores import Row, write_json
-from services.evaluate.tables import Captured, Found, Setup, Track, captured, evaluate_tables
-from services.reproduce.plan import Part
-from services.viz.sheets import save_png
+from congrasp.common.engines import PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import read_json
+from congrasp.common.policy.bundle import content_hash
+from congrasp.common.wire.codec import encode
+from congrasp.services.assets.objects.named import objects_of
+from congrasp.services.evaluate.failures import failure_sheets
+from congrasp.services.evaluate.lineup import Entrant, facts
+from congrasp.services.evaluate.report import count_causes
+from congrasp.services.evaluate.scores import Row, write_json
+from congrasp.services.evaluate.tables import Captured, Found, Setup, Track, captured, evaluate_tables
+from congrasp.services.reproduce.plan import Part
+from congrasp.services.viz.sheets import save_png
 
 _LARGEST = 1 << 28
 OBJECTS, CONSTRAINTS = "objects", "constraints"

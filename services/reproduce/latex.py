@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from services.reproduce.layout import NONE, Table
+from congrasp.services.reproduce.layout import NONE, Table
 
 _ESCAPED = {
     "\\": r"\textbackslash{}",

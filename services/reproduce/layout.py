@@ -3,9 +3,9 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from services.evaluate.paper import TABLES
-from services.evaluate.scores import UNITS
-from services.reproduce.comparison import SUCCESS, Cell
+from congrasp.services.evaluate.paper import TABLES
+from congrasp.services.evaluate.scores import UNITS
+from congrasp.services.reproduce.comparison import SUCCESS, Cell
 
 COLUMNS = (
     ("constraint", ""),

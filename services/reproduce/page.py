@@ -7,16 +7,16 @@ import pathlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from common.files import write_atomically
-from common.inputs import read_file
-from services.evaluate.cells import PLAUSIBILITY, RATES, plausibility_cells, rate_cells
-from services.evaluate.report import Picture, embedded, template
-from services.evaluate.scores import Row
-from services.reproduce.comparison import CONDITIONS, SUCCESS, Cell, unmatched
-from services.reproduce.evaluation import Result
-from services.reproduce.latex import latex
-from services.reproduce.layout import not_comparable, tables
-from services.reproduce.plan import Policy
+from congrasp.common.files import write_atomically
+from congrasp.common.inputs import read_file
+from congrasp.services.evaluate.cells import PLAUSIBILITY, RATES, plausibility_cells, rate_cells
+from congrasp.services.evaluate.report import Picture, embedded, template
+from congrasp.services.evaluate.scores import Row
+from congrasp.services.reproduce.comparison import CONDITIONS, SUCCESS, Cell, unmatched
+from congrasp.services.reproduce.evaluation import Result
+from congrasp.services.reproduce.latex import latex
+from congrasp.services.reproduce.layout import not_comparable, tables
+from congrasp.services.reproduce.plan import Policy
 
 PAGE, JSON, LATEX = "reproduction.html", "reproduction.json", "tables.tex"
 _LARGEST_PICTURE = 32 << 20

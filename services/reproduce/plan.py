@@ -4,7 +4,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from common.task.methods import METHODS, STUDENT
+from congrasp.common.task.methods import METHODS, STUDENT
 
 BASELINES = tuple(name for name in METHODS if name not in ("ours", STUDENT))
 """Methods beside the full system, all of one hand."""

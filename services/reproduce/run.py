@@ -9,19 +9,19 @@ from typing import NamedTuple
 
 import jax
 
-from actors.physics import resolve_physics
-from common.engines import engine_title
-from common.errors import CongraspError
-from common.policy.pretrained import pretrained_file
-from common.task.methods import get_method
-from services.evaluate.lineup import Entrant, read_entrant
-from services.evaluate.report import curves_of
-from services.evaluate.tables import Track
-from services.reproduce import training
-from services.reproduce.comparison import compare
-from services.reproduce.evaluation import Numbers, Result, evaluate_part
-from services.reproduce.page import Account, page, write
-from services.reproduce.plan import BASELINES, Policy, parts, policies
+from congrasp.actors.physics import resolve_physics
+from congrasp.common.engines import engine_title
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy.pretrained import pretrained_file
+from congrasp.common.task.methods import get_method
+from congrasp.services.evaluate.lineup import Entrant, read_entrant
+from congrasp.services.evaluate.report import curves_of
+from congrasp.services.evaluate.tables import Track
+from congrasp.services.reproduce import training
+from congrasp.services.reproduce.comparison import compare
+from congrasp.services.reproduce.evaluation import Numbers, Result, evaluate_part
+from congrasp.services.reproduce.page import Account, page, write
+from congrasp.services.reproduce.plan import BASELINES, Policy, parts, policies
 
 RUNS = "policies"
 """Folder of trainings below the output folder."""

@@ -4,10 +4,10 @@ import functools
 import pathlib
 from collections.abc import Callable, Sequence
 
-from common.errors import CongraspError
-from services.reproduce.plan import Policy
-from services.train import unattended
-from services.train.presets import FULL
+from congrasp.common.errors import CongraspError
+from congrasp.services.reproduce.plan import Policy
+from congrasp.services.train import unattended
+from congrasp.services.train.presets import FULL
 
 
 def trained(folder: pathlib.Path, policy: Policy) -> pathlib.Path | None:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Generic, NamedTuple, TypeVar
 
-from common.errors import CongraspError, LateError, OverloadedError
+from congrasp.common.errors import CongraspError, LateError, OverloadedError
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -3,10 +3,10 @@
 import os
 import secrets
 
-from common.transport import urls
-from common.transport.keys import Keys
-from common.wire.codec import Message
-from services.serve.episode import EpisodePolicy
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message
+from congrasp.services.serve.episode import EpisodePolicy
 
 
 class PolicyClient(EpisodePolicy):

@@ -7,10 +7,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from common.errors import LayoutError, RefusedError
-from common.request import GraspRequest
-from common.wire.codec import Message
-from services.serve.policy import Answer, Policy, State
+from congrasp.common.errors import LayoutError, RefusedError
+from congrasp.common.request import GraspRequest
+from congrasp.common.wire.codec import Message
+from congrasp.services.serve.policy import Answer, Policy, State
 
 _REQUIRED = ("surface", "q", "wrist", "object_pose")
 _MEASURED = ("q", "u", "object_position", "object_quaternion")

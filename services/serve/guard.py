@@ -11,10 +11,10 @@ from typing import Literal, NamedTuple, Self
 
 import numpy as np
 
-from common.errors import CongraspError, RefusedError, TransportError
-from common.request import GraspRequest
-from services.serve.limits import JointLimits, Limiter, as_numbers
-from services.serve.policy import Answer, Policy, State
+from congrasp.common.errors import CongraspError, RefusedError, TransportError
+from congrasp.common.request import GraspRequest
+from congrasp.services.serve.limits import JointLimits, Limiter, as_numbers
+from congrasp.services.serve.policy import Answer, Policy, State
 
 Fallback = Literal["freeze", "open"]
 Mode = Literal["follow", "hold", "freeze", "open"]

@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.config import TaskConfig
-from common.errors import CongraspError, ContradictionError
-from common.hands.spec import Hand
-from common.policy.bundle import InferenceParameters, mean_action
-from common.task import control, observation
-from common.task.constraints.priority import explain, resolve
-from common.task.features import scene_of
-from common.task.sensing import seen_by
-from common.task.types import SceneState, Surface
-from common.wire.codec import Message
-from services.serve.requests import PACKED, STATES_LIMIT, Layout, Query
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError, ContradictionError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.policy.bundle import InferenceParameters, mean_action
+from congrasp.common.task import control, observation
+from congrasp.common.task.constraints.priority import explain, resolve
+from congrasp.common.task.features import scene_of
+from congrasp.common.task.sensing import seen_by
+from congrasp.common.task.types import SceneState, Surface
+from congrasp.common.wire.codec import Message
+from congrasp.services.serve.requests import PACKED, STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)
 """Batches are padded to one of these, so that nothing compiles after the warm-up."""

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 if TYPE_CHECKING:
-    from common.hands.spec import Hand
+    from congrasp.common.hands.spec import Hand
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class JointLimits:
           turn: rad, likewise.
           margin: rad that finger targets keep from the ends of their joints; narrow joints stay in their middle.
         """
-        from common.hands.motors import motor_limits
+        from congrasp.common.hands.motors import motor_limits
 
         wrist, motors = hand.wrist, hand.motors
         lower, upper = motor_limits(hand)

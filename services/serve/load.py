@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
-from common.errors import CongraspError, OverloadedError, TransportError
-from common.request import GraspRequest
-from common.transport.ports import local_url
-from services.ops.shutdown import PARENT_VARIABLE, register_child
-from services.serve.client import PolicyClient
-from services.serve.policy import Policy
+from congrasp.common.errors import CongraspError, OverloadedError, TransportError
+from congrasp.common.request import GraspRequest
+from congrasp.common.transport.ports import local_url
+from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
+from congrasp.services.serve.client import PolicyClient
+from congrasp.services.serve.policy import Policy
 
 
 @contextlib.contextmanager
@@ -32,7 +32,7 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]
       log: takes what the server prints.
     """
     endpoint = local_url()
-    command = [sys.executable, "-m", "services.cli.main", "serve", "--policy", str(policy), "--listen", endpoint]
+    command = [sys.executable, "-m", "congrasp", "serve", "--policy", str(policy), "--listen", endpoint]
     with log.open("wb") as output:
         server = subprocess.Popen(
             command,
@@ -90,12 +90,12 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     """The start of an episode with a procedural object and one of its headings."""
     import jax
 
-    from actors import initial
-    from actors.bank import build_bank
-    from common.config import TaskConfig
-    from common.hands import get_hand
-    from common.objects import procedural
-    from common.objects.pool import scale_objects
+    from congrasp.actors import initial
+    from congrasp.actors.bank import build_bank
+    from congrasp.common.config import TaskConfig
+    from congrasp.common.hands import get_hand
+    from congrasp.common.objects import procedural
+    from congrasp.common.objects.pool import scale_objects
 
     task = TaskConfig(hand=hand, constraints=("heading",))
     found = get_hand(hand)

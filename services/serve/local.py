@@ -3,15 +3,15 @@
 import os
 import time
 
-from common.errors import CongraspError, error_of
-from common.hands import get_hand
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from common.policy.pretrained import named_policy
-from common.wire.codec import Message
-from services.serve.episode import EpisodePolicy
-from services.serve.inference import BATCH_SIZES, PolicyFunction
-from services.serve.policy import Policy
+from congrasp.common.errors import CongraspError, error_of
+from congrasp.common.hands import get_hand
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.wire.codec import Message
+from congrasp.services.serve.episode import EpisodePolicy
+from congrasp.services.serve.inference import BATCH_SIZES, PolicyFunction
+from congrasp.services.serve.policy import Policy
 
 
 class LocalPolicy(EpisodePolicy):

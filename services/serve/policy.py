@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
-from common.request import GraspRequest
+from congrasp.common.request import GraspRequest
 
 State = Mapping[str, np.ndarray]
 """Hand and object now, by field; see `Policy.act`."""

@@ -23,14 +23,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.config import TaskConfig
-from common.errors import CongraspError, LayoutError
-from common.hands.spec import Hand
-from common.inputs import LONGEST_NAME
-from common.task.constraints import known, require_known
-from common.task.sensing import Readings
-from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
-from common.wire.codec import Message
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError, LayoutError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.inputs import LONGEST_NAME
+from congrasp.common.task.constraints import known, require_known
+from congrasp.common.task.sensing import Readings
+from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
+from congrasp.common.wire.codec import Message
 
 STATES_LIMIT = 64
 """Most states in one query."""

@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.errors import CongraspError, LateError, OverloadedError, TransportError
-from common.hands import get_hand
-from common.policy import bundle as bundles
-from common.policy.bundle import InferenceParameters, PolicyBundle, content_hash
-from common.transport.base import Transport
-from common.transport.keys import Keys, account, below
-from common.wire.codec import Message, encode
-from services.ops.logs import log
-from services.serve.batching import Batcher, Parts
-from services.serve.inference import BATCH_SIZES, Inference, PolicyFunction
-from services.serve.requests import Query
+from congrasp.common.errors import CongraspError, LateError, OverloadedError, TransportError
+from congrasp.common.hands import get_hand
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, content_hash
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys, account, below
+from congrasp.common.wire.codec import Message, encode
+from congrasp.services.ops.logs import log
+from congrasp.services.serve.batching import Batcher, Parts
+from congrasp.services.serve.inference import BATCH_SIZES, Inference, PolicyFunction
+from congrasp.services.serve.requests import Query
 
 Source = Callable[[int], PolicyBundle | None]
 """(version that is held, -1 for none) -> a newer bundle, or None."""

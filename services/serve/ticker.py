@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 _KEPT = 6000  # ticks whose jitter is kept: a minute at 100 Hz
 

@@ -13,32 +13,40 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from rich.console import Console
 
-from common.config import MetricWriter, ObjectsConfig, RunConfig
-from common.engines import ENGINES, PhysicsName
-from common.errors import CongraspError
-from common.objects.pool import HELD_OUT_SEED, load_pool
-from common.parallel import cores
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle, policy_spec
-from common.policy.pretrained import pretrained_file
-from common.stages import imported, since_start, stages
-from common.transport import urls
-from common.transport.ports import LEARNER_URL
-from common.transport.security import CERTIFICATE_FILE, check_exposure
-from learner.algorithms import make_algorithm
-from learner.checkpoint import Checkpoints
-from learner.run_directory import CHECKPOINTS, CONFIG_FILE, LOGS, POLICY_FILE, continue_run, create_run, has_checkpoints
-from services.evaluate.evaluator import Evaluator
-from services.evaluate.scores import Row
-from services.evaluate.showcase import showcase
-from services.ops.shutdown import on_signal
-from services.serve.client import PolicyClient
-from services.serve.load import example_episode, one_answer, serving, wait_until_ready
-from services.train.learn import learn
-from services.train.presets import FULL, easier
-from services.train.processes import engine_of, leave_gpus_to, train
-from services.viz.render import episode_sheet
-from services.viz.sheets import save_png
+from congrasp.common.config import MetricWriter, ObjectsConfig, RunConfig
+from congrasp.common.engines import ENGINES, PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
+from congrasp.common.parallel import cores
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle, policy_spec
+from congrasp.common.policy.pretrained import pretrained_file
+from congrasp.common.stages import imported, since_start, stages
+from congrasp.common.transport import urls
+from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.common.transport.security import CERTIFICATE_FILE, check_exposure
+from congrasp.learner.algorithms import make_algorithm
+from congrasp.learner.checkpoint import Checkpoints
+from congrasp.learner.run_directory import (
+    CHECKPOINTS,
+    CONFIG_FILE,
+    LOGS,
+    POLICY_FILE,
+    continue_run,
+    create_run,
+    has_checkpoints,
+)
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.scores import Row
+from congrasp.services.evaluate.showcase import showcase
+from congrasp.services.ops.shutdown import on_signal
+from congrasp.services.serve.client import PolicyClient
+from congrasp.services.serve.load import example_episode, one_answer, serving, wait_until_ready
+from congrasp.services.train.learn import learn
+from congrasp.services.train.presets import FULL, easier
+from congrasp.services.train.processes import engine_of, leave_gpus_to, train
+from congrasp.services.viz.render import episode_sheet
+from congrasp.services.viz.sheets import save_png
 
 EPISODE, PRETRAINED = "episode.png", "pretrained.png"
 _EVALUATION_OBJECTS = 12

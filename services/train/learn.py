@@ -7,19 +7,19 @@ import pathlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
-from actors.process import run_actor
-from common.config import MetricWriter, RunConfig
-from common.engines import PhysicsName
-from common.parallel import cores, prepare_workers
-from common.transport import urls
-from common.transport.base import Transport
-from common.transport.pair import PairTransport
-from learner.process import run_learner
-from learner.ranks import ROUND_SECONDS, Ranks
-from services.ops.metrics import LearnerMetrics, exposed
-from services.ops.shutdown import GRACE
-from services.ops.status import ask
-from services.train.metric_writers import recorded
+from congrasp.actors.process import run_actor
+from congrasp.common.config import MetricWriter, RunConfig
+from congrasp.common.engines import PhysicsName
+from congrasp.common.parallel import cores, prepare_workers
+from congrasp.common.transport import urls
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.pair import PairTransport
+from congrasp.learner.process import run_learner
+from congrasp.learner.ranks import ROUND_SECONDS, Ranks
+from congrasp.services.ops.metrics import LearnerMetrics, exposed
+from congrasp.services.ops.shutdown import GRACE
+from congrasp.services.ops.status import ask
+from congrasp.services.train.metric_writers import recorded
 
 _START_SECONDS = 0.5
 """By which the learner, which must listen first, is ahead of the actor."""

@@ -9,11 +9,11 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
-from common.config import MetricWriter, RunConfig
-from common.transport.base import Transport
-from learner.run_directory import LOGS
-from services.record.channels import Entry, flatten
-from services.record.recorder import Recorder
+from congrasp.common.config import MetricWriter, RunConfig
+from congrasp.common.transport.base import Transport
+from congrasp.learner.run_directory import LOGS
+from congrasp.services.record.channels import Entry, flatten
+from congrasp.services.record.recorder import Recorder
 
 _TOPIC = "/metrics/learner/"
 

@@ -9,19 +9,19 @@ import pathlib
 import time
 from collections.abc import Callable, Sequence
 
-from common.engines import PhysicsName
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.hands.files import hand_text
-from common.hands.spec import Hand
-from common.inputs import read_json
-from common.policy import bundle as bundles
-from common.policy.pretrained import own_policy_file, pretrained_hands
-from learner.run_directory import CONFIG_FILE, POLICY_FILE
-from services.assets.hands.check import Finding, read_findings
-from services.train.presets import FULL, get_preset
-from services.train.processes import Child
-from services.train.unattended import run_child, seconds, train_in_background, trained
+from congrasp.common.engines import PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.hands.files import hand_text
+from congrasp.common.hands.spec import Hand
+from congrasp.common.inputs import read_json
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import own_policy_file, pretrained_hands
+from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE
+from congrasp.services.assets.hands.check import Finding, read_findings
+from congrasp.services.train.presets import FULL, get_preset
+from congrasp.services.train.processes import Child
+from congrasp.services.train.unattended import run_child, seconds, train_in_background, trained
 
 HAND, CHECK, REPORT = "hand.json", "check.json", "report.html"
 _ROWS = "report.json"

@@ -2,10 +2,10 @@
 
 import dataclasses
 
-from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from services.train.recipe import recipe
+from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.services.train.recipe import recipe
 
 FULL = "full"
 """The preset of the full task for the hand that the command line names, the human hand by default."""

@@ -13,17 +13,17 @@ from typing import Any
 
 import jax
 
-from actors.physics import resolve_physics
-from common.config import MetricWriter, RunConfig
-from common.engines import PhysicsName
-from common.errors import CongraspError, TransportError
-from common.journal import AUDIT
-from common.parallel import cores
-from common.transport import urls
-from common.transport.base import Transport
-from common.transport.keys import Keys
-from common.transport.ports import local_url, rank_url, reachable_url
-from services.ops.shutdown import PARENT_VARIABLE, register_child
+from congrasp.actors.physics import resolve_physics
+from congrasp.common.config import MetricWriter, RunConfig
+from congrasp.common.engines import PhysicsName
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.journal import AUDIT
+from congrasp.common.parallel import cores
+from congrasp.common.transport import urls
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.ports import local_url, rank_url, reachable_url
+from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
 
 MAX_RESTARTS = 5
 CHILD_GRACE = 2.0
@@ -51,7 +51,7 @@ class Child:
         environment = {**os.environ, **self.environment, PARENT_VARIABLE: str(os.getpid())}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "services.cli.main", *self.arguments],
+                [sys.executable, "-m", "congrasp", *self.arguments],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,

@@ -20,7 +20,7 @@ docs/training.md compares this with what had been found by hand. All else is the
 
 import dataclasses
 
-from common.config import (
+from congrasp.common.config import (
     CurriculumConfig,
     ObjectsConfig,
     PPOConfig,
@@ -28,8 +28,8 @@ from common.config import (
     RunConfig,
     TaskConfig,
 )
-from common.hands.measures import tip_forces
-from common.hands.spec import Hand
+from congrasp.common.hands.measures import tip_forces
+from congrasp.common.hands.spec import Hand
 
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
 """Families that are hardest to hold by a part; twice as many of them are trained on."""

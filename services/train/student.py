@@ -3,10 +3,10 @@
 import dataclasses
 import pathlib
 
-from common.config import RunConfig, SensingConfig
-from common.policy import bundle as bundles
-from common.policy.pretrained import named_policy
-from common.task.methods import STUDENT, with_method
+from congrasp.common.config import RunConfig, SensingConfig
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.task.methods import STUDENT, with_method
 
 TRACKERS = SensingConfig(
     period=(0.0, 0.1),

@@ -6,11 +6,11 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.inputs import read_json
-from learner.run_directory import CONFIG_FILE, POLICY_FILE, has_checkpoints
-from services.train.processes import Child, end_all
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.inputs import read_json
+from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE, has_checkpoints
+from congrasp.services.train.processes import Child, end_all
 
 _TRAINED = "trained.json"
 _POLL = 0.5

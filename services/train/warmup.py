@@ -6,11 +6,11 @@ import tempfile
 import threading
 from collections.abc import Callable
 
-from common.config import RunConfig
-from common.engines import PhysicsName
-from learner.run_directory import create_run
-from services.train.learn import learn
-from services.train.processes import engine_of
+from congrasp.common.config import RunConfig
+from congrasp.common.engines import PhysicsName
+from congrasp.learner.run_directory import create_run
+from congrasp.services.train.learn import learn
+from congrasp.services.train.processes import engine_of
 
 _GRACE = 60.0
 """Seconds for an actor that is in the middle of a rollout: a process that ended meanwhile would abort."""

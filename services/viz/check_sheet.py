@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands.spec import Hand
-from services.record.palette import OBJECT, WAYPOINT
-from services.viz.hand_sheets import joints_sheet
-from services.viz.raster import render_scene
-from services.viz.scene import Shape
-from services.viz.shapes import fit, posed_hand, shape_points, upright
-from services.viz.sheets import contact_sheet, stacked
+from congrasp.common.hands.spec import Hand
+from congrasp.services.record.palette import OBJECT, WAYPOINT
+from congrasp.services.viz.hand_sheets import joints_sheet
+from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.scene import Shape
+from congrasp.services.viz.shapes import fit, posed_hand, shape_points, upright
+from congrasp.services.viz.sheets import contact_sheet, stacked
 
 if TYPE_CHECKING:
-    from services.assets.hands.grips import Grip
+    from congrasp.services.assets.hands.grips import Grip
 
 _VIEWS = {"": np.array([0.75, 0.65, 0.35]), ", other side": np.array([0.75, -0.65, 0.35])}
 

@@ -3,15 +3,15 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
-from common.task.sampling.headings import INWARD
-from common.wire.codec import Message
-from services.record.palette import HEADING, OBJECT, WAYPOINT
-from services.viz.raster import render_scene
-from services.viz.render import OBJECT_AVOID
-from services.viz.scene import Shape
-from services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, table_shape
-from services.viz.sheets import contact_sheet
+from congrasp.common.hands import get_hand
+from congrasp.common.task.sampling.headings import INWARD
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
+from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.render import OBJECT_AVOID
+from congrasp.services.viz.scene import Shape
+from congrasp.services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, table_shape
+from congrasp.services.viz.sheets import contact_sheet
 
 _ARROWS, _PATHS = 14, 4
 _ARROW_LENGTH, _GAP = 0.07, 0.002  # m

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.hands.kinematics import grasp_frame
-from common.hands.motors import joint_positions, motor_limits, motor_positions, transmission
-from common.hands.skin import Skin
-from common.hands.spec import Hand, link_origin
-from services.record.palette import HEADING, OBJECT, WAYPOINT
-from services.viz.raster import render_scene
-from services.viz.scene import Shape
-from services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, upright
-from services.viz.sheets import contact_sheet
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions, transmission
+from congrasp.common.hands.skin import Skin
+from congrasp.common.hands.spec import Hand, link_origin
+from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
+from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.scene import Shape
+from congrasp.services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, upright
+from congrasp.services.viz.sheets import contact_sheet
 
 _VIEW = np.array([0.75, 0.65, 0.35])
 

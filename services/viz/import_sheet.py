@@ -6,17 +6,17 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.hands.spec import Hand
-from common.objects.shapes import tessellate
-from common.objects.spec import Colours, GraspObject
-from services.assets.objects.repair import with_few_faces
-from services.assets.objects.sizes import length, size_in_words
-from services.assets.objects.sources import Source, read_mesh
-from services.record.palette import OBJECT, PIECES
-from services.viz.raster import render_scene
-from services.viz.scene import Shape
-from services.viz.shapes import fit, posed_hand, shape_points, upright
-from services.viz.sheets import contact_sheet
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.shapes import tessellate
+from congrasp.common.objects.spec import Colours, GraspObject
+from congrasp.services.assets.objects.repair import with_few_faces
+from congrasp.services.assets.objects.sizes import length, size_in_words
+from congrasp.services.assets.objects.sources import Source, read_mesh
+from congrasp.services.record.palette import OBJECT, PIECES
+from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.scene import Shape
+from congrasp.services.viz.shapes import fit, posed_hand, shape_points, upright
+from congrasp.services.viz.sheets import contact_sheet
 
 _SIZE = (460, 360)
 _VIEW = (0.9, -0.6, 0.45)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from services.viz.kernels import add_light, cover
-from services.viz.triangles import Triangles
+from congrasp.services.viz.kernels import add_light, cover
+from congrasp.services.viz.triangles import Triangles
 
 MANY, FEW = (24, 48), (10, 20)
 """Lamps of the key light and of the sky: for large pictures, and for small ones and videos."""

@@ -7,17 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands.human import HUMAN
-from common.hands.outline import outline
-from common.objects.resting import rest_tilts
-from common.objects.shapes import tessellate
-from common.objects.spec import GraspObject
-from common.task.sampling.headings import Headings, within_reach
-from services.record.palette import AVOID, GRASPABLE, HEADING, PIECES
-from services.viz.raster import render_scene
-from services.viz.scene import Shape
-from services.viz.shapes import arrow, fit, object_shape, shape_points, table_shape
-from services.viz.sheets import contact_sheet
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.outline import outline
+from congrasp.common.objects.resting import rest_tilts
+from congrasp.common.objects.shapes import tessellate
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.sampling.headings import Headings, within_reach
+from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, PIECES
+from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.scene import Shape
+from congrasp.services.viz.shapes import arrow, fit, object_shape, shape_points, table_shape
+from congrasp.services.viz.sheets import contact_sheet
 
 _ARROWS, _LENGTH = 24, 0.08  # how many headings, and from how far before them they are drawn, m
 _SIZE, _SMALL, _COLUMNS = (460, 400), (240, 200), 7

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from services.record.palette import INK
-from services.record.reader import read_metrics
-from services.viz.titles import titled
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.services.record.palette import INK
+from congrasp.services.record.reader import read_metrics
+from congrasp.services.viz.titles import titled
 
 Series = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """Steps and values of each metric of a run, by `<role>/<name>/<metric>`."""

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.viz.kernels import NOTHING, averaged, cover, shade
-from services.viz.light import FEW, MANY, light_on
-from services.viz.scene import Camera, Shape
-from services.viz.triangles import Triangles, joined, triangles_of
+from congrasp.services.viz.kernels import NOTHING, averaged, cover, shade
+from congrasp.services.viz.light import FEW, MANY, light_on
+from congrasp.services.viz.scene import Camera, Shape
+from congrasp.services.viz.triangles import Triangles, joined, triangles_of
 
 SAMPLES = 2
 """Samples along each side of a pixel."""

@@ -8,17 +8,26 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
-from common.hands import known_hand
-from common.hands.skin import skin_of
-from common.hands.spec import Hand
-from common.parallel import cores
-from common.wire.codec import Message
-from services.record.goals import active_blocks, grasp_span, phases_of
-from services.record.palette import HEADING, OBJECT, WAYPOINT
-from services.viz.raster import render_scene, visible
-from services.viz.scene import Camera, Shape
-from services.viz.shapes import arrow, beads, capsule_shapes, fit, object_shape, posed_hand, skin_shape, table_shape
-from services.viz.sheets import contact_sheet, save_video
+from congrasp.common.hands import known_hand
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.hands.spec import Hand
+from congrasp.common.parallel import cores
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.goals import active_blocks, grasp_span, phases_of
+from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
+from congrasp.services.viz.raster import render_scene, visible
+from congrasp.services.viz.scene import Camera, Shape
+from congrasp.services.viz.shapes import (
+    arrow,
+    beads,
+    capsule_shapes,
+    fit,
+    object_shape,
+    posed_hand,
+    skin_shape,
+    table_shape,
+)
+from congrasp.services.viz.sheets import contact_sheet, save_video
 
 TOUCHING = (0.13, 0.74, 0.63)
 OBJECT_AVOID = (0.72, 0.23, 0.22)

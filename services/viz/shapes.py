@@ -8,11 +8,11 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.hands.skin import Skin, skin_of
-from common.hands.spec import Hand, capsule_ends
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.record.palette import FLESH, JOINT, OBJECT, SKIN, TABLE, Colour
-from services.viz.scene import Camera, Shape, between
+from congrasp.common.hands.skin import Skin, skin_of
+from congrasp.common.hands.spec import Hand, capsule_ends
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.record.palette import FLESH, JOINT, OBJECT, SKIN, TABLE, Colour
+from congrasp.services.viz.scene import Camera, Shape, between
 
 _TABLE_RADIUS, _TABLE_HALF_HEIGHT = 0.28, 0.008  # m
 FIELD_OF_VIEW = 26.0

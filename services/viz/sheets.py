@@ -8,9 +8,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from common.errors import CongraspError
-from common.files import write_atomically
-from services.record.palette import INK
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.services.record.palette import INK
 
 _QUIET, _PAPER = (96, 103, 116), (251, 251, 252)
 _MARGIN, _LABEL, _TITLE = 10, 24, 44  # pixels

@@ -1,7 +1,7 @@
 """Titles and units of a run's metrics, for people."""
 
-from common.task.constraints import CONSTRAINTS
-from common.task.metrics import DIVERGED
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.metrics import DIVERGED
 
 _KINDS = {"rad": "angle", "m": "distance", "": "share of links"}
 _TITLES = {

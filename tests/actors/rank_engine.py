@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import warp
 
-from actors.physics.engine import ResetState
-from actors.physics.warp import WarpPhysics
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.objects import procedural
-from learner.ranks import Ranks
+from congrasp.actors.physics.engine import ResetState
+from congrasp.actors.physics.warp import WarpPhysics
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.learner.ranks import Ranks
 
 
 def main() -> None:

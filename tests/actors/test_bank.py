@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors.bank import POSES, build_bank, make_references
-from actors.harvest import Grasps, renew
-from actors.physics.engine import where_environments
-from common import rotations
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.kinematics import capsules, grasp_frame, link_transforms
-from common.objects import procedural
-from common.task.sampling.closed_poses import Poses
+from congrasp.actors.bank import POSES, build_bank, make_references
+from congrasp.actors.harvest import Grasps, renew
+from congrasp.actors.physics.engine import where_environments
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
+from congrasp.common.objects import procedural
+from congrasp.common.task.sampling.closed_poses import Poses
 
 HAND = get_hand("human")
 TASK = TaskConfig()

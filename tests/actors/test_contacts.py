@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from actors.physics.scene import compile_scene
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.objects import procedural
+from congrasp.actors.physics.scene import compile_scene
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
 
 HAND = get_hand("human")
 TASK = TaskConfig()

@@ -1,7 +1,7 @@
 """What an episode's message says of its object."""
 
-from actors.episode import _geometry
-from common.objects import procedural
+from congrasp.actors.episode import _geometry
+from congrasp.common.objects import procedural
 
 
 def test_sizes_are_real_numbers_for_objects_of_meshes_too():

@@ -4,9 +4,9 @@ import types
 
 import numpy as np
 
-from actors.followed import Follower
-from actors.rollout import Trace
-from common.task.types import Surface
+from congrasp.actors.followed import Follower
+from congrasp.actors.rollout import Trace
+from congrasp.common.task.types import Surface
 
 
 class Goal(str):

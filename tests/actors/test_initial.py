@@ -10,19 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors.initial import initial_hand, sample
-from common.config import TaskConfig
-from common.hands.kinematics import hand_center, keypoints, link_transforms
-from common.task.bank import ConstraintBank
-from common.task.constraints import optional
-from common.task.constraints.heading import heading_wrist_pose
-from common.task.constraints.priority import resolve
-from common.task.constraints.trajectory import closing
-from common.task.features import scene_of
-from common.task.geometry import in_world
-from common.task.metrics import errors
-from common.task.reward import reward_terms
-from common.task.types import Goal, Surface
+from congrasp.actors.initial import initial_hand, sample
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.kinematics import hand_center, keypoints, link_transforms
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.constraints import optional
+from congrasp.common.task.constraints.heading import heading_wrist_pose
+from congrasp.common.task.constraints.priority import resolve
+from congrasp.common.task.constraints.trajectory import closing
+from congrasp.common.task.features import scene_of
+from congrasp.common.task.geometry import in_world
+from congrasp.common.task.metrics import errors
+from congrasp.common.task.reward import reward_terms
+from congrasp.common.task.types import Goal, Surface
 from tests.scenes import HAND, F, K, quaternions, scene, units
 
 TASK = TaskConfig(p_affordance=0.5, p_pose=0.5, p_trajectory=0.5)

@@ -6,11 +6,11 @@ import time
 import numpy as np
 import pytest
 
-from actors.link import ActorLink, RunFinished, RunRestarted, Ticket
-from common.errors import CongraspError, TransportError
-from common.transport.keys import Keys, below
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message
+from congrasp.actors.link import ActorLink, RunFinished, RunRestarted, Ticket
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.transport.keys import Keys, below
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message
 
 pytestmark = pytest.mark.timeout(30)
 KEYS = Keys("test")

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors.bank import build_bank
-from actors.physics import ENGINES, Engine, make_physics, resolve_physics
-from actors.physics.native import NativePhysics
-from actors.rollout import RolloutWorker
-from common.config import NetworkConfig, RunConfig, TaskConfig, run_config_from_json, to_json
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects import procedural
-from services.evaluate.evaluator import Evaluator
-from services.train.command import untrained
+from congrasp.actors.bank import build_bank
+from congrasp.actors.physics import ENGINES, Engine, make_physics, resolve_physics
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.rollout import RolloutWorker
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig, run_config_from_json, to_json
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.train.command import untrained
 
 HAND, TASK = get_hand("human"), TaskConfig()
 OBJECTS = procedural.generate_many(2, 0, ("box", "cylinder"))
@@ -73,7 +73,7 @@ def test_a_run_and_errors_name_it():
 
 def test_command_lines_offer_it():
     program = (
-        "from actors.physics import ENGINES, Engine; from services.cli.main import run; "
+        "from congrasp.actors.physics import ENGINES, Engine; from congrasp.services.cli.main import run; "
         "ENGINES['counting'] = Engine(None, batch=1); run(['train', '--help'])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)

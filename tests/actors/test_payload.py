@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from actors.physics.scene import TABLE_AWAY, scene_spec
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.hands.mjcf import WRIST_JOINTS
-from common.task.control import track_load, wrist_load, wrist_target
+from congrasp.actors.physics.scene import TABLE_AWAY, scene_spec
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.mjcf import WRIST_JOINTS
+from congrasp.common.task.control import track_load, wrist_load, wrist_target
 from tests.scenes import scene
 
 

@@ -9,19 +9,19 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.bank import build_bank
-from actors.initial import InitialConditions
-from actors.physics import resolve_physics
-from actors.physics.engine import ResetState
-from actors.physics.mjx import MjxPhysics
-from actors.physics.native import NativePhysics
-from actors.physics.slots import LEAVES, Pool
-from common import rotations
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects import procedural
-from common.objects.spec import GraspObject
+from congrasp.actors.bank import build_bank
+from congrasp.actors.initial import InitialConditions
+from congrasp.actors.physics import resolve_physics
+from congrasp.actors.physics.engine import ResetState
+from congrasp.actors.physics.mjx import MjxPhysics
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.physics.slots import LEAVES, Pool
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.spec import GraspObject
 from tests import draws
 
 HAND = get_hand("human")
@@ -316,7 +316,7 @@ def test_jax_agrees_with_native(env, optimised):
 
 def test_environments_that_do_not_fit_into_the_memory_are_one_clear_line(env, monkeypatch):
     free = psutil.virtual_memory()._replace(available=1_500_000)
-    monkeypatch.setattr("actors.physics.native.psutil.virtual_memory", lambda: free)
+    monkeypatch.setattr("congrasp.actors.physics.native.psutil.virtual_memory", lambda: free)
     native = NativePhysics(HAND, TASK, OBJECTS, 1)
     with pytest.raises(CongraspError, match=r"environments of MuJoCo C need .* GB are free.*fewer --environments"):
         native.start(env.reset_state)

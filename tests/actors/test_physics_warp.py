@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from actors.physics import warp_buffers
-from actors.physics.catalogue import Catalogue
-from actors.physics.engine import ResetState
-from actors.physics.native import NativePhysics
-from actors.physics.scene import compile_scene
-from actors.physics.warp import WarpPhysics
-from common.errors import CongraspError
-from common.objects import procedural
-from common.objects.spec import GraspObject, Piece
-from common.transport.ports import free_port
+from congrasp.actors.physics import warp_buffers
+from congrasp.actors.physics.catalogue import Catalogue
+from congrasp.actors.physics.engine import ResetState
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.physics.scene import compile_scene
+from congrasp.actors.physics.warp import WarpPhysics
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import procedural
+from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.common.transport.ports import free_port
 from tests.actors.test_physics import HAND, TASK, above, grasp, one_each, servoed
 from tests.solids import mujoco_mass_properties
 

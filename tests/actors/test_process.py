@@ -9,29 +9,29 @@ import jax
 import numpy as np
 import pytest
 
-from actors import process
-from actors.env import episode_fields
-from actors.rollout import Rollout, Trace
-from actors.training_set import TrainingSet
-from common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig, to_json
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects import procedural
-from common.policy.bundle import PolicyBundle, policy_spec
-from common.request import GraspRequest
-from common.task import metrics
-from common.task.constraints import goal_of
-from common.task.reward import terms
-from common.task.types import Surface
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import encode
-from common.wire.messages import EPISODE, validate
-from common.wire.schema import PRIVILEGED, RECORDED
-from learner.algorithms import make_algorithm
-from learner.batch import rollout_form
-from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
+from congrasp.actors import process
+from congrasp.actors.env import episode_fields
+from congrasp.actors.rollout import Rollout, Trace
+from congrasp.actors.training_set import TrainingSet
+from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig, to_json
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.policy.bundle import PolicyBundle, policy_spec
+from congrasp.common.request import GraspRequest
+from congrasp.common.task import metrics
+from congrasp.common.task.constraints import goal_of
+from congrasp.common.task.reward import terms
+from congrasp.common.task.types import Surface
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import encode
+from congrasp.common.wire.messages import EPISODE, validate
+from congrasp.common.wire.schema import PRIVILEGED, RECORDED
+from congrasp.learner.algorithms import make_algorithm
+from congrasp.learner.batch import rollout_form
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.staleness import StalenessManager
 
 T, B = 5, 3
 CONFIG = RunConfig(

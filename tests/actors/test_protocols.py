@@ -11,23 +11,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from actors import protocols
-from actors.attempts import Attempts
-from actors.bank import build_bank
-from actors.env import GraspEnv, Settings
-from actors.initial import RequestedEpisodes
-from actors.physics.mjx import MjxPhysics
-from actors.physics.native import NativePhysics
-from actors.protocols import Frame, Protocol
-from actors.rollout import RolloutWorker
-from common import rotations
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.hands import get_hand
-from common.objects import procedural
-from common.objects.distance import distance_field
-from common.task import plausibility
-from common.task.types import Surface
-from services.train.command import untrained
+from congrasp.actors import protocols
+from congrasp.actors.attempts import Attempts
+from congrasp.actors.bank import build_bank
+from congrasp.actors.env import GraspEnv, Settings
+from congrasp.actors.initial import RequestedEpisodes
+from congrasp.actors.physics.mjx import MjxPhysics
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.protocols import Frame, Protocol
+from congrasp.actors.rollout import RolloutWorker
+from congrasp.common import rotations
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.distance import distance_field
+from congrasp.common.task import plausibility
+from congrasp.common.task.types import Surface
+from congrasp.services.train.command import untrained
 from tests import draws, scripted
 
 HAND = get_hand("human")
@@ -145,7 +145,7 @@ def test_native_pushes_with_a_force_and_forgets_it_at_a_reset():
 
 def test_mjx_gets_the_same_force(monkeypatch):
     """What MJX makes of `xfrc_applied` is MuJoCo's; compiling it takes over a minute."""
-    monkeypatch.setattr("actors.physics.mjx.mjx.step", lambda model, data: data)
+    monkeypatch.setattr("congrasp.actors.physics.mjx.mjx.step", lambda model, data: data)
     physics, force = MjxPhysics(HAND, TASK, OBJECTS), np.array([[0.6, -0.4, 1.0], [0.0, 0.8, -0.5]], np.float32)
     state = physics.start(start().reset_state)
     target = np.zeros((BATCH, 6 + len(HAND.joints)), np.float32)
@@ -156,7 +156,7 @@ def test_mjx_gets_the_same_force(monkeypatch):
 
 
 def test_warp_pushes_with_the_same_force():
-    warp = pytest.importorskip("actors.physics.warp")
+    warp = pytest.importorskip("congrasp.actors.physics.warp")
     check_fall(warp.WarpPhysics(HAND, TASK, OBJECTS, mesh_slots=0))
 
 

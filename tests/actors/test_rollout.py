@@ -7,18 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors.bank import build_bank
-from actors.env import GraspEnv, episode_fields, metric_names
-from actors.physics.engine import PhysicsState, where_environments
-from actors.physics.native import NativePhysics
-from actors.rollout import RolloutWorker, finished_episodes
-from common import rotations
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
-from common.objects import procedural
-from common.task.observation import layout
-from common.task.types import CONTACTS_PER_LINK, Action
+from congrasp.actors.bank import build_bank
+from congrasp.actors.env import GraspEnv, episode_fields, metric_names
+from congrasp.actors.physics.engine import PhysicsState, where_environments
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.rollout import RolloutWorker, finished_episodes
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
+from congrasp.common.objects import procedural
+from congrasp.common.task.observation import layout
+from congrasp.common.task.types import CONTACTS_PER_LINK, Action
 from tests import draws
 
 HAND = get_hand("human")

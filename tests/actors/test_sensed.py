@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors.bank import build_bank
-from actors.physics.native import NativePhysics
-from actors.rollout import RolloutWorker
-from common.config import SensingConfig, TaskConfig
-from common.hands import get_hand
-from common.objects import procedural
-from common.policy.bundle import full_layout
-from common.task import observation, privileged
+from congrasp.actors.bank import build_bank
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.rollout import RolloutWorker
+from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.policy.bundle import full_layout
+from congrasp.common.task import observation, privileged
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(0, "cylinder")]

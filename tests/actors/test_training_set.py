@@ -7,18 +7,18 @@ import jax
 import numpy as np
 import pytest
 
-from actors import harvest
-from actors.bank import headings_of
-from actors.harvest import Grasps
-from actors.training_set import training_set
-from common.config import ObjectsConfig, RunConfig, Split, TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects import procedural
-from common.objects.store import Catalogue
-from common.task.bank import rows_of, stacked
-from common.task.constraint_sets import load_for
-from services.grasp.constraint_sets import make_sets, save
+from congrasp.actors import harvest
+from congrasp.actors.bank import headings_of
+from congrasp.actors.harvest import Grasps
+from congrasp.actors.training_set import training_set
+from congrasp.common.config import ObjectsConfig, RunConfig, Split, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.store import Catalogue
+from congrasp.common.task.bank import rows_of, stacked
+from congrasp.common.task.constraint_sets import load_for
+from congrasp.services.grasp.constraint_sets import make_sets, save
 from tests import draws
 
 HAND = get_hand("human")

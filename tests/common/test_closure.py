@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.hands import get_hand
-from common.hands.closure import (
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.closure import (
     CLOSURES,
     WIDEST,
     closure_pose,
@@ -17,7 +17,7 @@ from common.hands.closure import (
     widest_gap,
     widest_pose,
 )
-from common.hands.kinematics import grasp_frame, keypoints, link_transforms
+from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
 
 HANDS = ("human", "allegro", "sharpa")
 

@@ -11,8 +11,8 @@ import pytest
 import safetensors.numpy
 from hypothesis import given, settings
 
-from common.errors import CongraspError
-from common.wire.codec import MAX_HEADER, Message, SharedMessage, decode, encode
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import MAX_HEADER, Message, SharedMessage, decode, encode
 
 DTYPES = ["f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "?"]
 arrays = st.dictionaries(

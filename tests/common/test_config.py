@@ -5,9 +5,9 @@ import json
 
 import pytest
 
-from common.config import CurriculumConfig, RewardWeights, RunConfig, run_config_from_json, to_json
-from common.errors import CongraspError
-from services.train.presets import PRESETS, get_preset
+from congrasp.common.config import CurriculumConfig, RewardWeights, RunConfig, run_config_from_json, to_json
+from congrasp.common.errors import CongraspError
+from congrasp.services.train.presets import PRESETS, get_preset
 
 
 @pytest.mark.parametrize("name", PRESETS)

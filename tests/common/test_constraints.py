@@ -12,19 +12,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from actors.bank import build_bank
-from actors.initial import InitialConditions, sample
-from common.config import RewardWeights, TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects import procedural
-from common.request import GraspRequest
-from common.task import metrics
-from common.task.constraints import CONSTRAINTS, OURS, PAPER, blocks, get_constraint, goal_of, known, require_known
-from common.task.constraints.priority import active_blocks
-from common.task.features import scene_of
-from common.task.observation import fields, layout, observe
-from common.task.reward import GRASP, reward_terms, terms
+from congrasp.actors.bank import build_bank
+from congrasp.actors.initial import InitialConditions, sample
+from congrasp.common.config import RewardWeights, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.request import GraspRequest
+from congrasp.common.task import metrics
+from congrasp.common.task.constraints import (
+    CONSTRAINTS,
+    OURS,
+    PAPER,
+    blocks,
+    get_constraint,
+    goal_of,
+    known,
+    require_known,
+)
+from congrasp.common.task.constraints.priority import active_blocks
+from congrasp.common.task.features import scene_of
+from congrasp.common.task.observation import fields, layout, observe
+from congrasp.common.task.reward import GRASP, reward_terms, terms
 from tests.scenes import HAND, active, moved, scene
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame
-from common.request import GraspRequest
-from common.task.constraints import goal_of
-from common.task.constraints.priority import contradictions
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.request import GraspRequest
+from congrasp.common.task.constraints import goal_of
+from congrasp.common.task.constraints.priority import contradictions
 
 HAND = get_hand("human")
 # A bar along x: its end at negative x may be grasped.

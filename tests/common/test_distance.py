@@ -9,9 +9,9 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.objects import procedural, shapes
-from common.objects.distance import MARGIN, DistanceField, distance_field, primitive_distance
-from common.objects.spec import GraspObject, Piece
+from congrasp.common.objects import procedural, shapes
+from congrasp.common.objects.distance import MARGIN, DistanceField, distance_field, primitive_distance
+from congrasp.common.objects.spec import GraspObject, Piece
 
 DIAGONAL = (0.9238795325112867, 0.0, 0.0, 0.3826834323650898)  # 45 degrees about z
 

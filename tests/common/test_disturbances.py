@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
-from common.task.sampling.disturbances import CLOSURE, JITTER, JOINTS, WRIST, disturbed_fingers, disturbed_wrist
+from congrasp.common.hands import get_hand
+from congrasp.common.task.sampling.disturbances import (
+    CLOSURE,
+    JITTER,
+    JOINTS,
+    WRIST,
+    disturbed_fingers,
+    disturbed_wrist,
+)
 
 HAND = get_hand("human")
 MANY = 4000

@@ -8,21 +8,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common import rotations
-from common.config import RewardWeights, TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand, kinematics
-from common.policy.bundle import load
-from common.policy.pretrained import policy_file
-from common.task import metrics
-from common.task.bank import Draw
-from common.task.constraints import PAPER, get_constraint
-from common.task.constraints.fingers import FingersGoal, finger_sets, keypoint_weights
-from common.task.features import features, scene_of
-from common.task.geometry import hand_center
-from common.task.observation import fields, layout, observe
-from common.task.reward import reward_terms, terms
-from common.task.types import Goal, Surface
+from congrasp.common import rotations
+from congrasp.common.config import RewardWeights, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand, kinematics
+from congrasp.common.policy.bundle import load
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.task import metrics
+from congrasp.common.task.bank import Draw
+from congrasp.common.task.constraints import PAPER, get_constraint
+from congrasp.common.task.constraints.fingers import FingersGoal, finger_sets, keypoint_weights
+from congrasp.common.task.features import features, scene_of
+from congrasp.common.task.geometry import hand_center
+from congrasp.common.task.observation import fields, layout, observe
+from congrasp.common.task.reward import reward_terms, terms
+from congrasp.common.task.types import Goal, Surface
 from tests.scenes import HAND, L, active, scene
 
 FINGERS = get_constraint("fingers")

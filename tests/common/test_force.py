@@ -8,18 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.config import RewardWeights, TaskConfig
-from common.errors import CongraspError
-from common.objects import procedural
-from common.task import metrics
-from common.task.bank import Draw
-from common.task.constraints import PAPER, get_constraint
-from common.task.constraints.force import ForceGoal, least_force
-from common.task.features import scene_of
-from common.task.observation import fields
-from common.task.reward import reward_terms, terms
-from common.task.types import Surface
-from services.grasp.parse import read_request
+from congrasp.common.config import RewardWeights, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import procedural
+from congrasp.common.task import metrics
+from congrasp.common.task.bank import Draw
+from congrasp.common.task.constraints import PAPER, get_constraint
+from congrasp.common.task.constraints.force import ForceGoal, least_force
+from congrasp.common.task.features import scene_of
+from congrasp.common.task.observation import fields
+from congrasp.common.task.reward import reward_terms, terms
+from congrasp.common.task.types import Surface
+from congrasp.services.grasp.parse import read_request
 from tests.scenes import HAND, L, active, scene
 
 FORCE = get_constraint("force")

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from actors.physics.engine import ResetState
-from actors.physics.native import NativePhysics
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import HANDS, get_hand
-from common.hands.kinematics import grasp_frame, link_poses
-from common.hands.mano import VARIABLE
-from common.hands.mjcf import add_hand, overlapping
-from common.hands.spec import link_origin
-from common.objects import procedural
-from common.objects.pool import scale_objects
-from services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.actors.physics.engine import ResetState
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import HANDS, get_hand
+from congrasp.common.hands.kinematics import grasp_frame, link_poses
+from congrasp.common.hands.mano import VARIABLE
+from congrasp.common.hands.mjcf import add_hand, overlapping
+from congrasp.common.hands.spec import link_origin
+from congrasp.common.objects import procedural
+from congrasp.common.objects.pool import scale_objects
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from tests.mano_file import mano_pickle
 
 ROBOTS = ("allegro", "sharpa")

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from common.hands import get_hand
-from common.hands.closure import CLOSURES
-from common.hands.kinematics import capsules, grasp_frame, link_transforms
-from common.hands.outline import CENTER, Outline, depth_below, outline
-from common.objects.procedural import FAMILIES, generate
-from common.task.sampling.headings import (
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.closure import CLOSURES
+from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
+from congrasp.common.hands.outline import CENTER, Outline, depth_below, outline
+from congrasp.common.objects.procedural import FAMILIES, generate
+from congrasp.common.task.sampling.headings import (
     INWARD,
     MAX_WIDTH,
     Headings,

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_poses, link_transforms
-from common.hands.mjcf import add_hand
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame, hand_center, keypoints, link_poses, link_transforms
+from congrasp.common.hands.mjcf import add_hand
 
 HAND = get_hand("human")
 
@@ -42,7 +42,7 @@ def test_product_of_exponentials_agrees_with_mujoco(seed):
 
 
 def test_wrist_joints_are_slides_then_intrinsic_xyz_hinges():
-    from common import rotations
+    from congrasp.common import rotations
 
     model = _model()
     data = mujoco.MjData(model)

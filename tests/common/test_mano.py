@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame, keypoints, link_transforms
-from common.hands.mano import MANO_FINGERS, VARIABLE, mano_axes, mano_hand, read_mano
-from common.hands.spec import link_origin
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
+from congrasp.common.hands.mano import MANO_FINGERS, VARIABLE, mano_axes, mano_hand, read_mano
+from congrasp.common.hands.spec import link_origin
 from tests.mano_file import content, mano_pickle, skeleton
 
 

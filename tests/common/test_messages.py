@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from common.errors import CongraspError
-from common.wire.codec import Message, decode, encode
-from common.wire.messages import (
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message, decode, encode
+from congrasp.common.wire.messages import (
     EPISODE,
     EVENT,
     MessageSpec,
@@ -17,7 +17,7 @@ from common.wire.messages import (
     validate_bundle,
     validate_rollout,
 )
-from common.wire.schema import RECORDED, RolloutForm
+from congrasp.common.wire.schema import RECORDED, RolloutForm
 
 T, B, D, A, E = 3, 2, 5, 4, 1
 FORM = RolloutForm(T, B, D, A, half=True)

@@ -6,15 +6,15 @@ import jax
 import numpy as np
 import pytest
 
-from common.config import CurriculumConfig, RewardWeights, RunConfig, TaskConfig, run_config_from_json, to_json
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from common.policy.pretrained import pretrained_file
-from common.task.control import decode
-from common.task.features import scene_of
-from common.task.methods import METHODS, evaluated_as, get_method, takes, with_method
-from common.task.observation import layout
-from common.task.reward import reward_terms
+from congrasp.common.config import CurriculumConfig, RewardWeights, RunConfig, TaskConfig, run_config_from_json, to_json
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import pretrained_file
+from congrasp.common.task.control import decode
+from congrasp.common.task.features import scene_of
+from congrasp.common.task.methods import METHODS, evaluated_as, get_method, takes, with_method
+from congrasp.common.task.observation import layout
+from congrasp.common.task.reward import reward_terms
 from tests.scenes import HAND, F, scene
 
 FIRST, LAST = RewardWeights(drop=2.0), RewardWeights(drop=9.0, heading_position=30.0)

@@ -11,16 +11,16 @@ import pytest
 from mujoco import mjx
 from mujoco.mjx.third_party import mujoco_warp
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.files import hand_from_text, hand_text
-from common.hands.mjcf import WRIST_JOINTS, add_hand
-from common.hands.motors import coupled, joint_positions, motor_limits, motor_positions
-from common.hands.spec import Coupling, Motor
-from common.policy.bundle import policy_spec
-from common.task.sampling.closed_poses import _fingers
-from services.assets.hands.model_files import import_hand
-from services.train.presets import get_preset, with_hand
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_from_text, hand_text
+from congrasp.common.hands.mjcf import WRIST_JOINTS, add_hand
+from congrasp.common.hands.motors import coupled, joint_positions, motor_limits, motor_positions
+from congrasp.common.hands.spec import Coupling, Motor
+from congrasp.common.policy.bundle import policy_spec
+from congrasp.common.task.sampling.closed_poses import _fingers
+from congrasp.services.assets.hands.model_files import import_hand
+from congrasp.services.train.presets import get_preset, with_hand
 
 TENDON = Motor("middle_tendon", {"middle_2": 1.0, "middle_3": 0.5}, 3.0, 0.1, 0.7)
 COUPLINGS = (Coupling("index_3", "index_2", 0.9), Coupling("ring_1", "index_1", 0.8, 0.1))

@@ -6,7 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from common.npz import read_npz
+from congrasp.common.npz import read_npz
 from tests.limits import limited
 
 

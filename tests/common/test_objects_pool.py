@@ -4,11 +4,11 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from common.config import ObjectsConfig
-from common.errors import CongraspError
-from common.objects import procedural
-from common.objects.pool import HELD_OUT_SEED, first_seed, load_pool
-from common.objects.store import Catalogue
+from congrasp.common.config import ObjectsConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import procedural
+from congrasp.common.objects.pool import HELD_OUT_SEED, first_seed, load_pool
+from congrasp.common.objects.store import Catalogue
 
 
 def test_actors_have_objects_of_their_own():

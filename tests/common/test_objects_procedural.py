@@ -9,11 +9,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
-from common.errors import CongraspError
-from common.objects import shapes
-from common.objects.families import BUILDERS
-from common.objects.mjcf import add_object
-from common.objects.procedural import (
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import shapes
+from congrasp.common.objects.families import BUILDERS
+from congrasp.common.objects.mjcf import add_object
+from congrasp.common.objects.procedural import (
     BASIC_FAMILIES,
     FAMILIES,
     HOUSEHOLD_FAMILIES,
@@ -24,9 +24,9 @@ from common.objects.procedural import (
     generate,
     generate_many,
 )
-from common.objects.resting import TableScene
-from common.objects.spec import MAX_MESH_VERTICES, PRIMITIVE_SLOTS, SURFACE_POINTS
-from common.objects.store import digest
+from congrasp.common.objects.resting import TableScene
+from congrasp.common.objects.spec import MAX_MESH_VERTICES, PRIMITIVE_SLOTS, SURFACE_POINTS
+from congrasp.common.objects.store import digest
 from tests.solids import mujoco_mass_properties
 
 MOST_MESHES = 13  # what environments have room for is sized by the object with the most

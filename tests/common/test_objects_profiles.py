@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.objects import shapes
-from common.objects.families.profiles import extrude, lathe, shell, slab, smooth, sweep, vessel
-from common.objects.spec import MAX_MESH_VERTICES
+from congrasp.common.objects import shapes
+from congrasp.common.objects.families.profiles import extrude, lathe, shell, slab, smooth, sweep, vessel
+from congrasp.common.objects.spec import MAX_MESH_VERTICES
 
 
 def _volume(pieces) -> float:

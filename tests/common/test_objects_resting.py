@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from common.objects import shapes
-from common.objects.mjcf import CONTACT, add_object
-from common.objects.procedural import generate
-from common.objects.resting import TableScene, quasi_static_poses, rest_poses, settle
-from common.objects.spec import GraspObject, Piece
-from common.objects.surface import mass_properties, sample_union
+from congrasp.common.objects import shapes
+from congrasp.common.objects.mjcf import CONTACT, add_object
+from congrasp.common.objects.procedural import generate
+from congrasp.common.objects.resting import TableScene, quasi_static_poses, rest_poses, settle
+from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.common.objects.surface import mass_properties, sample_union
 
 
 def make(*pieces, density=800.0):

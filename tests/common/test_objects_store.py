@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from common.errors import CongraspError
-from common.objects.procedural import generate
-from common.objects.store import Catalogue, digest, load, save
-from common.wire.codec import Message, encode
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.procedural import generate
+from congrasp.common.objects.store import Catalogue, digest, load, save
+from congrasp.common.wire.codec import Message, encode
 
 
 @pytest.mark.parametrize("family", ["mug", "bowl"])

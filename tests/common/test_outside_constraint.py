@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common import rotations
-from common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Weight
+from congrasp.common import rotations
+from congrasp.common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Weight
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -73,12 +73,12 @@ def test_nothing_else_must_be_changed():
 
 def episodes(task):
     """Metrics of short episodes with it; it is sampled, observed, rewarded and measured in them."""
-    from actors.bank import build_bank
-    from actors.physics.native import NativePhysics
-    from actors.rollout import RolloutWorker, finished_episodes
-    from common.hands import get_hand
-    from common.objects import procedural
-    from common.task.observation import layout
+    from congrasp.actors.bank import build_bank
+    from congrasp.actors.physics.native import NativePhysics
+    from congrasp.actors.rollout import RolloutWorker, finished_episodes
+    from congrasp.common.hands import get_hand
+    from congrasp.common.objects import procedural
+    from congrasp.common.task.observation import layout
 
     hand, batch = get_hand("human"), 32
     objects = [procedural.generate(0, "box")]
@@ -118,7 +118,7 @@ def episodes(task):
 
 def tables(task, values):
     """Its row of an evaluation, from those episodes that had it alone, as if they had all held the object."""
-    from services.evaluate import scores
+    from congrasp.services.evaluate import scores
 
     assert scores.TABLES["single"][-1] == "level" and scores.ERRORS["level"] == {"level_m": "level_m"}
     others = ("trajectory", "pose_finger", "affordance")
@@ -136,8 +136,8 @@ def tables(task, values):
 
 def server(task):
     """Its field of a query."""
-    from common.hands import get_hand
-    from services.serve.requests import Layout
+    from congrasp.common.hands import get_hand
+    from congrasp.services.serve.requests import Layout
 
     layout = Layout(get_hand("human"), task)
     assert layout.shapes["level_wrist"] == (1,) and layout.shapes["asked"] == (5,)
@@ -149,11 +149,11 @@ def command_line():
     import contextlib
     import io
 
-    from common.config import RunConfig
-    from common.hands import get_hand
-    from common.objects import procedural
-    from services.cli import main
-    from services.grasp.parse import read_request
+    from congrasp.common.config import RunConfig
+    from congrasp.common.hands import get_hand
+    from congrasp.common.objects import procedural
+    from congrasp.services.cli import main
+    from congrasp.services.grasp.parse import read_request
 
     for command, options in {"grasp": ["--level"], "train": ["--task.p-level", "--task.reward.level-height"]}.items():
         said = io.StringIO()
@@ -172,9 +172,9 @@ def command_line():
 
 def onnx(task):
     """Its block in what is written beside an exported policy."""
-    from common.config import NetworkConfig, RunConfig
-    from services.export.policy import describe
-    from services.train.command import untrained
+    from congrasp.common.config import NetworkConfig, RunConfig
+    from congrasp.services.export.policy import describe
+    from congrasp.services.train.command import untrained
 
     said = describe(untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=2))))
     assert said["masks"][-1] == "level" and ["level", 2] in said["layout"]
@@ -186,11 +186,11 @@ def onnx(task):
 
 
 if __name__ == "__main__":
-    from common.task import constraints
+    from congrasp.common.task import constraints
 
     constraints.CONSTRAINTS = (*constraints.CONSTRAINTS, Level())
 
-    from common.config import TaskConfig
+    from congrasp.common.config import TaskConfig
 
     TASK = dataclasses.replace(
         TaskConfig(constraints=(*constraints.PAPER, "level")), approach_steps=2, hold_steps=1, hold_steps_max=1

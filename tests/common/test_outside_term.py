@@ -33,9 +33,9 @@ def test_nothing_else_must_be_changed():
 
 def reward():
     """It is paid with its weight, beside the others."""
-    from common.config import RewardWeights, TaskConfig
-    from common.task.features import scene_of
-    from common.task.reward import reward_terms, terms
+    from congrasp.common.config import RewardWeights, TaskConfig
+    from congrasp.common.task.features import scene_of
+    from congrasp.common.task.reward import reward_terms, terms
     from tests.scenes import HAND, scene
 
     task, (state, surface, goal) = TaskConfig(), scene(0, batch=3)
@@ -49,7 +49,7 @@ def reward():
 
 def configuration():
     """A run keeps its weight."""
-    from common.config import RewardWeights, RunConfig, TaskConfig, run_config_from_json, to_json
+    from congrasp.common.config import RewardWeights, RunConfig, TaskConfig, run_config_from_json, to_json
 
     assert RewardWeights().height == 2.0
     config = RunConfig(task=TaskConfig(reward=RewardWeights(height=0.5)))
@@ -58,7 +58,7 @@ def configuration():
 
 def command_line():
     """Its option and the help."""
-    from services.cli import main
+    from congrasp.services.cli import main
 
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
@@ -67,7 +67,7 @@ def command_line():
 
 
 if __name__ == "__main__":
-    from common.task import reward as module
+    from congrasp.common.task import reward as module
 
     module.GRASP = (*module.GRASP, module.Term("height", 2.0, "Per metre of rise.", height))
     for check in (reward, configuration, command_line):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from common.objects import painting
-from common.objects.painting import finer, nearest, painted
-from common.objects.spec import Colours
+from congrasp.common.objects import painting
+from congrasp.common.objects.painting import finer, nearest, painted
+from congrasp.common.objects.spec import Colours
 
 
 @pytest.mark.parametrize("sections", [8, 512, 2048])

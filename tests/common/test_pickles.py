@@ -12,8 +12,8 @@ import scipy.sparse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import CongraspError
-from common.pickles import parse_pickle, read_pickle
+from congrasp.common.errors import CongraspError
+from congrasp.common.pickles import parse_pickle, read_pickle
 from tests.limits import limited
 from tests.mano_file import Reduced, content, dumps, mano_pickle, selection
 

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import TransportError
-from common.transport import pieces
-from common.transport.keys import account
-from common.transport.pieces import Outbox, Pace, fetch, is_request
+from congrasp.common.errors import TransportError
+from congrasp.common.transport import pieces
+from congrasp.common.transport.keys import account
+from congrasp.common.transport.pieces import Outbox, Pace, fetch, is_request
 
 
 def _first(outbox, payload, wish=b"", account="a"):

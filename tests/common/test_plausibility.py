@@ -11,14 +11,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
-from common.hands.kinematics import link_transforms
-from common.hands.mjcf import add_hand, overlapping
-from common.objects import procedural
-from common.objects.distance import distance_field
-from common.objects.spec import Piece
-from common.task import plausibility
-from common.task.plausibility import Sample, hand_hand, hand_object, hand_table, is_clean, measures, segment_distance
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import link_transforms
+from congrasp.common.hands.mjcf import add_hand, overlapping
+from congrasp.common.objects import procedural
+from congrasp.common.objects.distance import distance_field
+from congrasp.common.objects.spec import Piece
+from congrasp.common.task import plausibility
+from congrasp.common.task.plausibility import (
+    Sample,
+    hand_hand,
+    hand_object,
+    hand_table,
+    is_clean,
+    measures,
+    segment_distance,
+)
 
 HANDS = ("human", "allegro", "sharpa")
 UPRIGHT = np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)

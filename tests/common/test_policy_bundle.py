@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from common.policy import network, normalizer
-from common.policy.bundle import PolicyBundle, PolicySpec
-from common.policy.normalizer import Statistics
-from common.wire.codec import Message, decode, encode
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy import network, normalizer
+from congrasp.common.policy.bundle import PolicyBundle, PolicySpec
+from congrasp.common.policy.normalizer import Statistics
+from congrasp.common.wire.codec import Message, decode, encode
 
 LAYOUT = (
     ("state", 3),

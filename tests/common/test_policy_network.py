@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from common.config import NetworkConfig
-from common.errors import CongraspError
-from common.policy import network
+from congrasp.common.config import NetworkConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import network
 
 LAYOUT = (
     ("state", 7),

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from common.policy import normalizer
-from common.policy.normalizer import Statistics
+from congrasp.common.policy import normalizer
+from congrasp.common.policy.normalizer import Statistics
 
 LAYOUT = (
     ("state", 2),

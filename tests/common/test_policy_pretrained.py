@@ -6,13 +6,13 @@ import tomllib
 
 import pytest
 
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.files import hand_text
-from common.policy import bundle as bundles
-from common.policy import pretrained as module
-from common.policy.pretrained import (
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_text
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy import pretrained as module
+from congrasp.common.policy.pretrained import (
     hands_with_policy,
     named_policy,
     own_policy_file,
@@ -20,8 +20,8 @@ from common.policy.pretrained import (
     pretrained_file,
     pretrained_hands,
 )
-from services.evaluate.lineup import read_entrants
-from services.train.command import untrained
+from congrasp.services.evaluate.lineup import read_entrants
+from congrasp.services.train.command import untrained
 
 ROOT = pathlib.Path(module.__file__).resolve().parents[2]
 
@@ -66,7 +66,7 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
 
 def test_what_is_shipped_is_installed_and_can_be_loaded():
     data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    patterns = [pathlib.Path("common/policy", pattern) for pattern in data["common.policy"]]
+    patterns = [pathlib.Path("congrasp/common/policy", pattern) for pattern in data["congrasp.common.policy"]]
     assert [module._FOLDER.relative_to(ROOT) / "*.safetensors"] == patterns
     assert pretrained_hands() == ["human", "allegro", "sharpa"]
     assert {path.stem for path in module._FOLDER.glob("*.safetensors")} == {

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.hands.kinematics import grasp_frame, keypoints, link_transforms
-from common.task.constraints.priority import explain, resolve
+from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
+from congrasp.common.task.constraints.priority import explain, resolve
 from tests.scenes import HAND, scene
 
 

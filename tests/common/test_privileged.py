@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from common.config import SensingConfig, TaskConfig
-from common.hands import get_hand
-from common.hands.measures import tip_forces
-from common.policy.bundle import full_layout
-from common.task import privileged
-from common.task.constraints.base import Scene
-from common.task.privileged import Parameters
-from common.task.types import SceneState
+from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.measures import tip_forces
+from congrasp.common.policy.bundle import full_layout
+from congrasp.common.task import privileged
+from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.privileged import Parameters
+from congrasp.common.task.types import SceneState
 
 HAND = get_hand("human")
 TASK = TaskConfig(approach_steps=50, hold_steps=25, hold_steps_max=200)

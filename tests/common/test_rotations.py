@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from common import rotations
+from congrasp.common import rotations
 
 seeds = st.integers(0, 2**31)
 

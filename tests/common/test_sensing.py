@@ -10,11 +10,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common import rotations
-from common.config import SensingConfig, TaskConfig
-from common.task import observation, sensing
-from common.task.features import scene_of
-from common.task.sensing import Readings, Sensors
+from congrasp.common import rotations
+from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.task import observation, sensing
+from congrasp.common.task.features import scene_of
+from congrasp.common.task.sensing import Readings, Sensors
 from tests.scenes import HAND, F, L, N, scene
 
 TASK = TaskConfig(observation="tracked", surface_points=N, constraints=("heading", "affordance", "fingers"))

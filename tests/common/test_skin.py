@@ -5,11 +5,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
-from common.hands.flesh import surface_net
-from common.hands.skin import skin_of
-from common.hands.spec import Hand
-from services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.flesh import surface_net
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.hands.spec import Hand
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 
 HANDS = ("human", "allegro", "sharpa")
 

@@ -2,7 +2,7 @@ import time
 
 import pytest
 
-from common import stages
+from congrasp.common import stages
 
 
 @pytest.fixture(autouse=True)

@@ -11,19 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from common.config import RewardWeights, TaskConfig
-from common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
-from common.task import metrics
-from common.task.constraints import PAPER, blocks
-from common.task.constraints.heading import heading_wrist_pose
-from common.task.constraints.pose import pose_gate
-from common.task.constraints.trajectory import active_waypoint
-from common.task.control import decode, guidance_pose
-from common.task.features import features, scene_of
-from common.task.geometry import FAR, squash, wrist_pose, wrist_to_joints
-from common.task.metrics import errors
-from common.task.observation import layout, observe
-from common.task.reward import reward_terms, terms
+from congrasp.common.config import RewardWeights, TaskConfig
+from congrasp.common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
+from congrasp.common.task import metrics
+from congrasp.common.task.constraints import PAPER, blocks
+from congrasp.common.task.constraints.heading import heading_wrist_pose
+from congrasp.common.task.constraints.pose import pose_gate
+from congrasp.common.task.constraints.trajectory import active_waypoint
+from congrasp.common.task.control import decode, guidance_pose
+from congrasp.common.task.features import features, scene_of
+from congrasp.common.task.geometry import FAR, squash, wrist_pose, wrist_to_joints
+from congrasp.common.task.metrics import errors
+from congrasp.common.task.observation import layout, observe
+from congrasp.common.task.reward import reward_terms, terms
 from tests.scenes import HAND, F, K, L, active, moved, near_targets, scene
 
 TASK = TaskConfig(constraints=PAPER)

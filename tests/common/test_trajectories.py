@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame
-from common.task.sampling.approach_paths import AMPLITUDE, CONE, DISTANCE, ROTATION, make_trajectories
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.task.sampling.approach_paths import AMPLITUDE, CONE, DISTANCE, ROTATION, make_trajectories
 from tests.scenes import quaternions
 
 HAND = get_hand("human")

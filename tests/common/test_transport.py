@@ -12,12 +12,12 @@ import time
 import numpy as np
 import pytest
 
-from common.errors import CongraspError, OverloadedError, RefusedError, TransportError
-from common.transport.keys import Keys, check_name, flow, matches, parse_alive
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
-from common.wire.codec import Message, encode
+from congrasp.common.errors import CongraspError, OverloadedError, RefusedError, TransportError
+from congrasp.common.transport.keys import Keys, check_name, flow, matches, parse_alive
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.wire.codec import Message, encode
 from tests.socket_transport import SocketListener, SocketTransport
 
 pytestmark = pytest.mark.timeout(60)
@@ -368,9 +368,9 @@ def test_peer_that_comes_back_is_found_again():
 
 BUSY_PROCESS = """
     import contextlib, sys, threading, time
-    from common.transport.keys import Keys
-    from common.transport.zenoh_transport import ZenohTransport
-    from common.wire.codec import Message
+    from congrasp.common.transport.keys import Keys
+    from congrasp.common.transport.zenoh_transport import ZenohTransport
+    from congrasp.common.wire.codec import Message
     keys = Keys("test")
     server = ZenohTransport(listen=[sys.argv[1]])
     client = ZenohTransport(connect=[sys.argv[1]])

@@ -12,17 +12,17 @@ import time
 import pytest
 
 import tests.socket_transport  # noqa: F401  adds its scheme
-from actors.link import ActorLink
-from common.errors import CongraspError, TransportError
-from common.transport import urls
-from common.transport.keys import FLOWS, Keys, flow
-from common.transport.ports import free_port, local_url, rank_url, reachable_url
-from common.transport.security import RIGHTS, Credentials
-from common.wire.codec import Message
-from common.wire.schema import RolloutForm
-from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
-from services.ops.certificates import create_authority, issue
+from congrasp.actors.link import ActorLink
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import FLOWS, Keys, flow
+from congrasp.common.transport.ports import free_port, local_url, rank_url, reachable_url
+from congrasp.common.transport.security import RIGHTS, Credentials
+from congrasp.common.wire.codec import Message
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.staleness import StalenessManager
+from congrasp.services.ops.certificates import create_authority, issue
 from tests.cluster import ROOT, A, B, D, T, bundle, rollout
 
 pytestmark = pytest.mark.timeout(60)
@@ -166,7 +166,7 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
 
 TAKER = """
 import json, sys
-from common.transport import ports
+from congrasp.common.transport import ports
 ports._LOWEST, ports._COUNT = {lowest}, 61  # sixty to choose from, so that one would soon be chosen twice
 for line in sys.stdin:
     print(json.dumps([ports.free_port(1) for _ in range(int(line))]), flush=True)

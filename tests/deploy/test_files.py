@@ -12,7 +12,7 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from services.cli.main import load
+from congrasp.services.cli.main import load
 from tests.conftest import ROOT
 
 DEPLOY = ROOT / "deploy"

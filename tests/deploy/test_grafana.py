@@ -3,8 +3,8 @@
 import json
 import re
 
-from common.transport.ports import free_port
-from services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
+from congrasp.common.transport.ports import free_port
+from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
 from tests.conftest import ROOT
 from tests.services.ops.test_metrics import STATUS, scrape
 

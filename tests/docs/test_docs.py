@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from actors.env import episode_fields
-from common.config import TaskConfig
-from common.task.constraints import CONSTRAINTS
-from services.cli import main, parser
+from congrasp.actors.env import episode_fields
+from congrasp.common.config import TaskConfig
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.services.cli import main, parser
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "deploy" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -39,7 +39,7 @@ def command_lines():
 
 
 def module_of(name):
-    return importlib.import_module(f"services.cli.{name}")
+    return importlib.import_module(f"congrasp.services.cli.{name}")
 
 
 def commands_of_modules():

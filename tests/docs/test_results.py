@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from common.errors import CongraspError
-from common.policy.pretrained import pretrained_file, pretrained_hands
-from services.evaluate.results import KINDS, ROOT, filled, pages, read_results, recorded
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy.pretrained import pretrained_file, pretrained_hands
+from congrasp.services.evaluate.results import KINDS, ROOT, filled, pages, read_results, recorded
 
 RESULTS = recorded()
 MARKS = "<!-- results human {kind} -->\n{text}<!-- end of results -->\n"
@@ -16,7 +16,7 @@ MARKS = "<!-- results human {kind} -->\n{text}<!-- end of results -->\n"
 
 def test_pages_show_the_results():
     outdated = [str(path.relative_to(ROOT)) for path, _ in pages()]
-    assert not outdated, "Run: python -m services.evaluate.results"
+    assert not outdated, "Run: python -m congrasp.services.evaluate.results"
 
 
 @pytest.mark.parametrize("hand", pretrained_hands())

@@ -10,16 +10,16 @@ import time
 import numpy as np
 import pytest
 
-from common.errors import CongraspError
-from common.journal import AUDIT, Journal, read_journal
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message
-from learner.process import run_learner
-from learner.run_directory import LOGS, create_run
-from services.ops.audit import audit
-from services.record.reader import read_metrics
-from services.record.recorder import Recorder
+from congrasp.common.errors import CongraspError
+from congrasp.common.journal import AUDIT, Journal, read_journal
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message
+from congrasp.learner.process import run_learner
+from congrasp.learner.run_directory import LOGS, create_run
+from congrasp.services.ops.audit import audit
+from congrasp.services.record.reader import read_metrics
+from congrasp.services.record.recorder import Recorder
 from tests.learner.test_process import CONFIG, MadeUpActor
 
 

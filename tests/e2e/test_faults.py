@@ -9,11 +9,11 @@ import time
 
 import pytest
 
-from common.journal import AUDIT, read_journal
-from common.wire.codec import Message
-from learner.write_ahead import FOLDER
-from services.bench.second_reading import read_again
-from services.ops.audit import audit
+from congrasp.common.journal import AUDIT, read_journal
+from congrasp.common.wire.codec import Message
+from congrasp.learner.write_ahead import FOLDER
+from congrasp.services.bench.second_reading import read_again
+from congrasp.services.ops.audit import audit
 from tests.cluster import KEYS, Proxy, T, rollout
 
 pytestmark = pytest.mark.timeout(300)

@@ -19,34 +19,34 @@ import numpy as np
 import pytest
 import trimesh
 
-from common.config import NetworkConfig, RunConfig, TaskConfig, run_config_from_json, to_json
-from common.errors import CongraspError, TransportError
-from common.hands import get_hand
-from common.hands.files import hand_text, read_hand
-from common.journal import Journal, read_journal
-from common.objects import store
-from common.objects.procedural import generate
-from common.pickles import read_pickle
-from common.policy import bundle as bundles
-from common.policy import network, normalizer
-from common.policy.bundle import PolicyBundle
-from common.transport.keys import Keys
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
-from common.wire.codec import Message, encode
-from common.wire.schema import RolloutForm
-from learner.admission import Admission, Ranges
-from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
-from services.assets.objects.sources import read_mesh
-from services.export.motion_file import load_motion, motion_of_episode, save_motion
-from services.grasp.wrist_paths import read_bvh, read_wrist_path
-from services.record.entries import Converter
-from services.record.reader import read_episodes, read_metrics
-from services.record.recorder import Recorder
-from services.record.writer import LogWriter
-from services.serve.requests import Layout
-from services.serve.server import PolicyServer
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig, run_config_from_json, to_json
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_text, read_hand
+from congrasp.common.journal import Journal, read_journal
+from congrasp.common.objects import store
+from congrasp.common.objects.procedural import generate
+from congrasp.common.pickles import read_pickle
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy import network, normalizer
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.admission import Admission, Ranges
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.staleness import StalenessManager
+from congrasp.services.assets.objects.sources import read_mesh
+from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
+from congrasp.services.grasp.wrist_paths import read_bvh, read_wrist_path
+from congrasp.services.record.entries import Converter
+from congrasp.services.record.reader import read_episodes, read_metrics
+from congrasp.services.record.recorder import Recorder
+from congrasp.services.record.writer import LogWriter
+from congrasp.services.serve.requests import Layout
+from congrasp.services.serve.server import PolicyServer
 from tests.cluster import bundle
 from tests.episodes import episode
 from tests.rollouts import random_arrays

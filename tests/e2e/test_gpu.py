@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from common.policy import bundle as bundles
-from learner.run_directory import POLICY_FILE
+from congrasp.common.policy import bundle as bundles
+from congrasp.learner.run_directory import POLICY_FILE
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(600)]
 
@@ -24,7 +24,7 @@ def gpus():
 
 
 def congrasp(*arguments):
-    command = [sys.executable, "-m", "services.cli.main", *map(str, arguments)]
+    command = [sys.executable, "-m", "congrasp", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -11,16 +11,16 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.link import ActorLink
-from common.errors import TransportError
-from common.transport import urls
-from common.transport.keys import Keys, below
-from common.transport.ports import local_url, shifted
-from common.wire.codec import Message, encode
-from common.wire.schema import RolloutForm
-from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
-from services.bench.attacks import attacked, throttled
+from congrasp.actors.link import ActorLink
+from congrasp.common.errors import TransportError
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import Keys, below
+from congrasp.common.transport.ports import local_url, shifted
+from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.staleness import StalenessManager
+from congrasp.services.bench.attacks import attacked, throttled
 from tests.cluster import A, B, D, T, bundle, rollout
 
 pytestmark = pytest.mark.timeout(120)

@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from common.errors import CongraspError, TransportError
-from common.wire.codec import Message, encode
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.wire.codec import Message, encode
 from tests.cluster import KEYS, A, B, D, T, rollout
 
 pytestmark = pytest.mark.timeout(300)

@@ -13,13 +13,13 @@ import time
 import numpy as np
 import pytest
 
-from common.errors import TransportError
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message, decode
-from learner.audit import journal_path, replay
-from learner.process import run_learner
-from learner.run_directory import create_run, open_run
+from congrasp.common.errors import TransportError
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message, decode
+from congrasp.learner.audit import journal_path, replay
+from congrasp.learner.process import run_learner
+from congrasp.learner.run_directory import create_run, open_run
 from tests.learner.test_process import CONFIG
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

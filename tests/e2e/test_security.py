@@ -15,19 +15,19 @@ import pytest
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from actors.link import ActorLink
-from common.errors import CongraspError, TransportError
-from common.transport.certificates import read
-from common.transport.keys import Keys, below
-from common.transport.ports import free_port
-from common.transport.security import RIGHTS, Credentials
-from common.transport.zenoh_transport import ZenohTransport
-from common.wire.codec import Message, encode
-from common.wire.schema import RolloutForm
-from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
-from services.ops.certificates import create_authority, issue, revoke
-from services.serve.client import PolicyClient
+from congrasp.actors.link import ActorLink
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.transport.certificates import read
+from congrasp.common.transport.keys import Keys, below
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.security import RIGHTS, Credentials
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.staleness import StalenessManager
+from congrasp.services.ops.certificates import create_authority, issue, revoke
+from congrasp.services.serve.client import PolicyClient
 from tests.cluster import A, B, D, T, bundle, rollout
 
 pytestmark = pytest.mark.timeout(60)
@@ -433,9 +433,9 @@ def test_who_is_revoked_is_out_and_the_others_stay(run):
 
 ACTOR = """
 import sys
-from actors.link import ActorLink
-from common.errors import CongraspError
-from common.transport import urls
+from congrasp.actors.link import ActorLink
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport import urls
 
 try:
     transport = urls.connect(sys.argv[1], "actor", certs=sys.argv[2])
@@ -468,7 +468,7 @@ def forgiven(certs):
 
 
 def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(forgiven, run, certs):
-    status = ["-m", "services.cli.main", "status", "--watch", "--json", "--run", "safe", "--connect", run.endpoint]
+    status = ["-m", "congrasp", "status", "--watch", "--json", "--run", "safe", "--connect", run.endpoint]
     processes = _started("-c", ACTOR, run.endpoint, certs / "actor.0"), _started(*status, "--certs", certs)
     try:
         with PolicyClient(run.policy, "safe", certs=certs / "client.0") as client:
@@ -520,11 +520,7 @@ def test_the_command_line_says_why_in_one_line(run, evil, certs):
     for folder, words in ((evil, "not to be trusted"), (certs, None)):
         command = ["status", "--connect", run.endpoint, "--run", "safe", "--certs", str(folder), "--json"]
         done = subprocess.run(
-            [sys.executable, "-m", "services.cli.main", *command],
-            capture_output=True,
-            text=True,
-            timeout=50,
-            check=False,
+            [sys.executable, "-m", "congrasp", *command], capture_output=True, text=True, timeout=50, check=False
         )
         if words is None:
             assert done.returncode == 0 and json.loads(done.stdout)["run"] == "safe", done.stderr

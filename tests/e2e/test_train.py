@@ -12,10 +12,10 @@ import numpy as np
 import psutil
 import pytest
 
-from common.policy import bundle as bundles
-from services.bench.second_reading import read_again
-from services.ops.audit import audit
-from services.record.reader import read_episodes, read_metrics, read_rollouts
+from congrasp.common.policy import bundle as bundles
+from congrasp.services.bench.second_reading import read_again
+from congrasp.services.ops.audit import audit
+from congrasp.services.record.reader import read_episodes, read_metrics, read_rollouts
 
 pytestmark = pytest.mark.timeout(600)
 UPDATES = 40
@@ -58,7 +58,7 @@ def _version(run_dir: pathlib.Path) -> int:
 
 def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path):
     run_dir = tmp_path / "run"
-    command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(run_dir), *SMALL]
+    command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(run_dir), *SMALL]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         _eventually(lambda: _version(run_dir) >= 4, 300, process)
@@ -98,7 +98,7 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_within_seconds_and_costs_nothing_that_was_accepted(tmp_path, number):
     run_dir = tmp_path / "run"
-    command = [sys.executable, "-m", "services.cli.main", "train", "--run-dir", str(run_dir), *SMALL]
+    command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(run_dir), *SMALL]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         _eventually(lambda: _version(run_dir) >= 2, 300, process)

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from common.policy import network, normalizer
-from common.policy.normalizer import Statistics
-from common.wire.schema import RECORDED
-from learner.algorithms import gae
-from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
-from learner.batch import partition_specs
-from learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.common.policy import network, normalizer
+from congrasp.common.policy.normalizer import Statistics
+from congrasp.common.wire.schema import RECORDED
+from congrasp.learner.algorithms import gae
+from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from congrasp.learner.batch import partition_specs
+from congrasp.learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 SCHEMA = {name: spec for name, spec in RECORDED.items() if name != "log_probability"}
 OPTIMIZER = optax.adam(0.01)

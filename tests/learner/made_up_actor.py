@@ -5,11 +5,11 @@ import threading
 import jax
 import numpy as np
 
-from actors.link import ActorLink, RunFinished
-from common.errors import TransportError
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from common.wire.codec import Message
+from congrasp.actors.link import ActorLink, RunFinished
+from congrasp.common.errors import TransportError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.wire.codec import Message
 
 _PATIENCE = 300.0  # a learner may compile before it answers
 

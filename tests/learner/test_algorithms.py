@@ -10,19 +10,19 @@ import jax
 import numpy as np
 import pytest
 
-from actors.link import ActorLink, RunFinished
-from common.config import PPOConfig, RunConfig, run_config_from_json, to_json
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message
-from learner.admission import Ranges
-from learner.algorithms import ALGORITHMS, make_algorithm
-from learner.batch import collate, partition_specs
-from learner.process import run_learner
-from learner.run_directory import create_run
-from services.bench import toy
+from congrasp.actors.link import ActorLink, RunFinished
+from congrasp.common.config import PPOConfig, RunConfig, run_config_from_json, to_json
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message
+from congrasp.learner.admission import Ranges
+from congrasp.learner.algorithms import ALGORITHMS, make_algorithm
+from congrasp.learner.batch import collate, partition_specs
+from congrasp.learner.process import run_learner
+from congrasp.learner.run_directory import create_run
+from congrasp.services.bench import toy
 from tests.learner.a2c import A2C, SCHEMA
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -81,7 +81,7 @@ def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypa
     monkeypatch.setitem(ALGORITHMS, "a2c", A2C)
     monkeypatch.setattr(bundles, "policy_spec", lambda task, sizes: toy.SPEC)
     ranges = Ranges(np.full(sum(size for _, size in toy.LAYOUT), 1e6), 1e6, 1e6, {})
-    monkeypatch.setattr("learner.process.task_ranges", lambda task, curriculum: ranges)
+    monkeypatch.setattr("congrasp.learner.process.task_ranges", lambda task, curriculum: ranges)
     create_run(tmp_path, CONFIG)
     hub, events, stop = MemoryHub(), [], threading.Event()
     actor = ToyActor(MemoryTransport(hub))
@@ -111,10 +111,10 @@ def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypa
 TWO_DEVICES = """
 import jax, numpy as np
 from jax.sharding import Mesh
-from common.config import RunConfig
-from learner.batch import collate
-from learner.collectives import AXIS
-from services.bench import toy
+from congrasp.common.config import RunConfig
+from congrasp.learner.batch import collate
+from congrasp.learner.collectives import AXIS
+from congrasp.services.bench import toy
 from tests.learner.a2c import A2C, SCHEMA
 from tests.learner.test_ppo import rollout
 

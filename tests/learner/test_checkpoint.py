@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import CongraspError
-from learner.algorithms.ppo import PPO
-from learner.checkpoint import Checkpoints
-from services.bench import toy
+from congrasp.common.errors import CongraspError
+from congrasp.learner.algorithms.ppo import PPO
+from congrasp.learner.checkpoint import Checkpoints
+from congrasp.services.bench import toy
 from tests.learner.test_ppo import rollout
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -100,7 +100,7 @@ def test_a_process_that_dies_while_writing_leaves_the_previous_checkpoint(tmp_pa
     checkpoints.save(tree(1.0), {}, 1)
     script = """
 import os, pathlib, sys
-import learner.checkpoint as checkpoint
+import congrasp.learner.checkpoint as checkpoint
 from tests.learner.test_checkpoint import tree
 checkpoint.sync_directory = lambda path: None
 os.fsync = lambda descriptor: os._exit(9)  # gone after the data were written, before the rename

@@ -2,7 +2,7 @@
 
 import pytest
 
-from learner.collapse import CollapseWatch
+from congrasp.learner.collapse import CollapseWatch
 
 
 def first_alarm(success, links, patience=20):

@@ -12,10 +12,10 @@ TWO_DEVICES = """
 import dataclasses, functools
 import jax, numpy as np
 from jax.sharding import Mesh
-from learner.algorithms.ppo import PPO
-from learner.algorithms.protocol import NonFiniteUpdate
-from learner.collectives import AXIS, shard
-from services.bench import toy
+from congrasp.learner.algorithms.ppo import PPO
+from congrasp.learner.algorithms.protocol import NonFiniteUpdate
+from congrasp.learner.collectives import AXIS, shard
+from congrasp.services.bench import toy
 from tests.learner.test_ppo import fresh, rollout
 
 # One minibatch: then both have the same samples in it, whatever order they draw.

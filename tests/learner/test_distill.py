@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from common.config import DistillConfig, NetworkConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle, PolicySpec, mean_action, policy_spec
-from learner.algorithms.distill import Distillation
-from learner.algorithms.protocol import NonFiniteUpdate, random_policy
-from services.train.student import TRACKERS
+from congrasp.common.config import DistillConfig, NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle, PolicySpec, mean_action, policy_spec
+from congrasp.learner.algorithms.distill import Distillation
+from congrasp.learner.algorithms.protocol import NonFiniteUpdate, random_policy
+from congrasp.services.train.student import TRACKERS
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 NETWORK = NetworkConfig(hidden=(32,), encoder=4)
@@ -126,7 +126,7 @@ def test_a_teacher_that_does_not_fit_is_one_line(teacher):
 
 def test_the_command_line_s_teacher_is_the_whole_task(teacher, monkeypatch):
     """`--teacher FILE` takes its task, adds what a robot's sensors do, and names the file by its place."""
-    from services.cli.train import defaults
+    from congrasp.services.cli.train import defaults
 
     monkeypatch.chdir(teacher.parent)
     config = defaults(["--preset", "quickstart", "--teacher", teacher.name, "--updates", "7"])["config"]
@@ -140,7 +140,7 @@ def test_the_command_line_s_teacher_is_the_whole_task(teacher, monkeypatch):
 TWO_DEVICES = """
 import sys, jax, numpy as np
 from jax.sharding import Mesh
-from learner.collectives import AXIS
+from congrasp.learner.collectives import AXIS
 from tests.learner.test_distill import algorithm, batch, run_of
 
 mesh = Mesh(np.array(jax.devices()), (AXIS,))

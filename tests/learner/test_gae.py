@@ -3,7 +3,7 @@ import hypothesis.strategies as st
 import jax.numpy as jnp
 import numpy as np
 
-from learner.algorithms import gae
+from congrasp.learner.algorithms import gae
 
 
 def test_three_steps_by_hand():

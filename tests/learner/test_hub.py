@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from common.errors import CongraspError, RefusedError
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message, encode
-from common.wire.schema import RolloutForm
-from learner import hub
-from learner.admission import Admission, Ranges
-from learner.batch import collate
-from learner.deduplication import Sequences
-from learner.hub import LearnerHub
-from learner.rate_limit import RateLimit
-from learner.staleness import StalenessManager
-from learner.write_ahead import PART, WriteAheadLog
+from congrasp.common.errors import CongraspError, RefusedError
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner import hub
+from congrasp.learner.admission import Admission, Ranges
+from congrasp.learner.batch import collate
+from congrasp.learner.deduplication import Sequences
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.rate_limit import RateLimit
+from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.write_ahead import PART, WriteAheadLog
 
 pytestmark = pytest.mark.timeout(30)
 KEYS = Keys("test")
@@ -528,7 +528,7 @@ def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
 
 
 def _header(sequence):
-    from common.wire.messages import RolloutHeader
+    from congrasp.common.wire.messages import RolloutHeader
 
     return RolloutHeader("a", "01", sequence, 0, "e", "s", 1)
 

@@ -3,9 +3,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from common.config import NetworkConfig
-from common.policy import network
-from learner.algorithms import losses
+from congrasp.common.config import NetworkConfig
+from congrasp.common.policy import network
+from congrasp.learner.algorithms import losses
 
 LAYOUT = (
     ("state", 3),

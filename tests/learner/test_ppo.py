@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from common.config import PPOConfig
-from common.errors import CongraspError, PhysicsError
-from common.policy import bundle as bundles
-from common.policy import network, normalizer
-from learner.algorithms import ppo
-from learner.algorithms.ppo import PPO
-from learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
-from services.bench import toy
+from congrasp.common.config import PPOConfig
+from congrasp.common.errors import CongraspError, PhysicsError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy import network, normalizer
+from congrasp.learner.algorithms import ppo
+from congrasp.learner.algorithms.ppo import PPO
+from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
+from congrasp.services.bench import toy
 
 ALGORITHM = PPO(toy.SPEC, toy.SETTINGS)
 step = ALGORITHM.update

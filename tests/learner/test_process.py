@@ -14,18 +14,18 @@ import jax
 import numpy as np
 import pytest
 
-from common.config import NetworkConfig, PPOConfig, RunConfig
-from common.errors import CongraspError, PhysicsError
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
-from learner.admission import Admission
-from learner.algorithms import ppo
-from learner.process import run_learner
-from learner.run_directory import create_run, open_run
+from congrasp.common.config import NetworkConfig, PPOConfig, RunConfig
+from congrasp.common.errors import CongraspError, PhysicsError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.learner.admission import Admission
+from congrasp.learner.algorithms import ppo
+from congrasp.learner.process import run_learner
+from congrasp.learner.run_directory import create_run, open_run
 from tests.learner.made_up_actor import MadeUpActor
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -117,9 +117,9 @@ def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub):
 
 LEARNER = """
 import dataclasses, pathlib, sys, threading
-from common.transport.zenoh_transport import ZenohTransport
-from learner.process import run_learner
-from learner.run_directory import open_run
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.learner.process import run_learner
+from congrasp.learner.run_directory import open_run
 
 run_dir, endpoint, goal, resume = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), sys.argv[4] == "resume"
 with ZenohTransport(listen=[endpoint]) as transport:

@@ -5,19 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from actors.bank import build_bank
-from actors.physics.native import NativePhysics
-from actors.rollout import RolloutWorker, finished_episodes
-from common.config import CurriculumConfig, RewardWeights, TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects import procedural
-from common.task.constraints import PAPER
-from common.task.metrics import episode_fields
-from common.wire.codec import Message
-from common.wire.schema import PRIVILEGED, RECORDED
-from learner.admission import Admission
-from learner.ranges import task_ranges
+from congrasp.actors.bank import build_bank
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.rollout import RolloutWorker, finished_episodes
+from congrasp.common.config import CurriculumConfig, RewardWeights, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.task.constraints import PAPER
+from congrasp.common.task.metrics import episode_fields
+from congrasp.common.wire.codec import Message
+from congrasp.common.wire.schema import PRIVILEGED, RECORDED
+from congrasp.learner.admission import Admission
+from congrasp.learner.ranges import task_ranges
 
 TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, hold_steps_max=40)
 RANGES = task_ranges(TASK, CurriculumConfig())

@@ -14,11 +14,11 @@ import jax
 import numpy as np
 import pytest
 
-from common.errors import CongraspError, TransportError
-from common.transport.ports import free_port
-from learner import ranks as ranks_module
-from learner.ranks import Ranks, ended_by
-from learner.run_directory import create_run
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.transport.ports import free_port
+from congrasp.learner import ranks as ranks_module
+from congrasp.learner.ranks import Ranks, ended_by
+from congrasp.learner.run_directory import create_run
 from tests.learner.rank_process import CONFIG
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from common.errors import CongraspError
-from common.wire.codec import Message
-from learner.rate_limit import RateLimit
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message
+from congrasp.learner.rate_limit import RateLimit
 
 A, B = "congrasp/r/rollout/0.a", "congrasp/r/rollout/1.b"
 

@@ -4,11 +4,18 @@ import dataclasses
 
 import pytest
 
-from common.errors import CongraspError
-from learner.audit import AuditLog
-from learner.run_directory import continue_run, create_run, has_checkpoints, note_version, open_run, published_version
-from services.cli.train import defaults
-from services.train.presets import get_preset
+from congrasp.common.errors import CongraspError
+from congrasp.learner.audit import AuditLog
+from congrasp.learner.run_directory import (
+    continue_run,
+    create_run,
+    has_checkpoints,
+    note_version,
+    open_run,
+    published_version,
+)
+from congrasp.services.cli.train import defaults
+from congrasp.services.train.presets import get_preset
 
 
 @pytest.fixture

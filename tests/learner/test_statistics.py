@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from common.wire.codec import Message
-from learner.statistics import Pace, overall, summary
+from congrasp.common.wire.codec import Message
+from congrasp.learner.statistics import Pace, overall, summary
 
 
 def rollout(version: int = 0, steps: int = 1, **episodes: list[float]) -> Message:

@@ -12,14 +12,14 @@ from unittest import mock
 
 import pytest
 
-import services.cli.main as cli
-from common.transport.ports import free_port
-from services.cli.main import COMMANDS, load
+import congrasp.services.cli.main as cli
+from congrasp.common.transport.ports import free_port
+from congrasp.services.cli.main import COMMANDS, load
 
 
 def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Runs the command line in a process of its own."""
-    command = [sys.executable, "-m", "services.cli.main", *arguments]
+    command = [sys.executable, "-m", "congrasp", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
@@ -139,7 +139,7 @@ def test_a_path_that_cannot_be_used_is_one_line_and_a_fault_of_ours_is_not(numbe
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_log_on_a_full_disk_does_not_change_the_exit_code():
     """Only bad input ends a run's process for good; another code would start it again and again."""
-    command = [sys.executable, "-m", "services.cli.main", "levitate"]
+    command = [sys.executable, "-m", "congrasp", "levitate"]
     with open("/dev/full", "wb") as full:
         assert subprocess.run(command, stdout=full, stderr=full, timeout=60, check=False).returncode == 2
 
@@ -147,7 +147,7 @@ def test_a_log_on_a_full_disk_does_not_change_the_exit_code():
 def test_a_reader_that_is_gone_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)  # as `head` does when it has read enough
-    command = [sys.executable, "-m", "services.cli.main", "hands", "list", "--help"]
+    command = [sys.executable, "-m", "congrasp", "hands", "list", "--help"]
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
     os.close(writer)
     assert done.stderr == "" and done.returncode in (0, 128 + signal.SIGPIPE)

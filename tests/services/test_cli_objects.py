@@ -5,10 +5,10 @@ import pytest
 import trimesh
 from PIL import Image
 
-from common.errors import CongraspError
-from common.objects.store import Catalogue, digest
-from services.assets.objects.named import find_object
-from services.cli.main import load
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.store import Catalogue, digest
+from congrasp.services.assets.objects.named import find_object
+from congrasp.services.cli.main import load
 
 parse = load("objects")
 

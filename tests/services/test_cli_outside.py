@@ -4,9 +4,9 @@ import textwrap
 
 import pytest
 
-import services.cli
-from common.errors import CongraspError
-from services.cli import main
+from congrasp.common.errors import CongraspError
+from congrasp.services import cli
+from congrasp.services.cli import main
 
 FILE = '''
 """`congrasp weigh`: the mass of a box."""
@@ -19,7 +19,7 @@ def weigh(edge: float, density: float = 1000.0) -> int:
       edge: Edge of the box in m.
       density: In kg/m^3.
     """
-    from common.errors import CongraspError
+    from congrasp.common.errors import CongraspError
 
     if edge <= 0.0:
         raise CongraspError(f"--edge {edge:g} must be positive.")
@@ -39,7 +39,7 @@ COMMAND = weigh
 @pytest.fixture(autouse=True)
 def weigh(monkeypatch, tmp_path):
     (tmp_path / "weigh.py").write_text(textwrap.dedent(FILE))
-    monkeypatch.setattr(services.cli, "__path__", [*services.cli.__path__, str(tmp_path)])
+    monkeypatch.setattr(cli, "__path__", [*cli.__path__, str(tmp_path)])
     monkeypatch.setitem(main.COMMANDS, "weigh", "the mass of a box")
     monkeypatch.setattr(main, "_prepare_environment", lambda: None)
 

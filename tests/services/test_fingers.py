@@ -9,28 +9,28 @@ import onnxruntime
 import pytest
 import trimesh
 
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.errors import CongraspError, UnknownConstraintError
-from common.hands import get_hand
-from common.objects import procedural
-from common.policy.bundle import PolicyBundle
-from common.task import observation
-from common.task.constraints import PAPER
-from common.wire.codec import Message
-from services.cli.main import load
-from services.evaluate.evaluator import Evaluator
-from services.export.policy import describe, export_policy
-from services.grasp.files import RESULT
-from services.grasp.grasper import Grasper
-from services.grasp.parse import read_request
-from services.serve.inference import Inference, PolicyFunction
-from services.serve.load import example_episode
-from services.serve.requests import Layout
-from services.train.command import untrained
-from services.viz.studio import description
-from services.viz.studio.grasping import PolicyGrasping
-from services.viz.studio.lanes import for_page, lanes
-from services.viz.studio.state import Studio
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError, UnknownConstraintError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.task import observation
+from congrasp.common.task.constraints import PAPER
+from congrasp.common.wire.codec import Message
+from congrasp.services.cli.main import load
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.export.policy import describe, export_policy
+from congrasp.services.grasp.files import RESULT
+from congrasp.services.grasp.grasper import Grasper
+from congrasp.services.grasp.parse import read_request
+from congrasp.services.serve.inference import Inference, PolicyFunction
+from congrasp.services.serve.load import example_episode
+from congrasp.services.serve.requests import Layout
+from congrasp.services.train.command import untrained
+from congrasp.services.viz.studio import description
+from congrasp.services.viz.studio.grasping import PolicyGrasping
+from congrasp.services.viz.studio.lanes import for_page, lanes
+from congrasp.services.viz.studio.state import Studio
 
 HAND = get_hand("human")
 TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))

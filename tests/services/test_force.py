@@ -7,23 +7,23 @@ import numpy as np
 import pytest
 import trimesh
 
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects import procedural
-from common.policy.bundle import PolicyBundle
-from common.task.constraints import OURS, PAPER
-from common.wire.codec import Message
-from services.cli.main import load
-from services.evaluate.evaluator import Evaluator
-from services.export.motion_file import load_motion, save_motion
-from services.export.policy import describe
-from services.grasp.grasper import Grasper
-from services.grasp.parse import read_request
-from services.serve.inference import Inference, PolicyFunction
-from services.train.command import untrained
-from services.viz.studio import description
-from services.viz.studio.state import Studio
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.task.constraints import OURS, PAPER
+from congrasp.common.wire.codec import Message
+from congrasp.services.cli.main import load
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.export.motion_file import load_motion, save_motion
+from congrasp.services.export.policy import describe
+from congrasp.services.grasp.grasper import Grasper
+from congrasp.services.grasp.parse import read_request
+from congrasp.services.serve.inference import Inference, PolicyFunction
+from congrasp.services.train.command import untrained
+from congrasp.services.viz.studio import description
+from congrasp.services.viz.studio.state import Studio
 from tests.services.test_fingers import query
 
 __all__ = ["query"]

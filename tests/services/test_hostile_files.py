@@ -11,21 +11,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.config import NetworkConfig, TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.files import hand_text, read_hand
-from common.inputs import file_name, read_file
-from common.objects import store
-from common.objects.procedural import generate
-from common.policy import bundle as bundles
-from common.policy import network, normalizer
-from common.policy.bundle import PolicyBundle
-from common.policy.pretrained import policy_file
-from common.task import constraint_sets as stored_sets
-from common.wire.codec import Message, decode, encode
-from services.export.motion_file import load_motion, motion_of_episode, save_motion
-from services.grasp import constraint_sets
+from congrasp.common.config import NetworkConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_text, read_hand
+from congrasp.common.inputs import file_name, read_file
+from congrasp.common.objects import store
+from congrasp.common.objects.procedural import generate
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy import network, normalizer
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.task import constraint_sets as stored_sets
+from congrasp.common.wire.codec import Message, decode, encode
+from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
+from congrasp.services.grasp import constraint_sets
 from tests.episodes import episode
 from tests.limits import limited
 

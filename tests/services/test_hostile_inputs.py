@@ -6,14 +6,21 @@ import time
 import numpy as np
 import pytest
 
-from common.errors import CongraspError
-from common.inputs import read_json
-from common.wire.codec import Message, encode
-from services.grasp import wrist_paths
-from services.record.channels import Entry, JsonChannels, opaque_channel
-from services.record.reader import log_files, metrics_of, pick_episode, read_episodes, read_metrics, read_records
-from services.record.scene import EPISODE_SCHEMA
-from services.record.writer import LogWriter
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import read_json
+from congrasp.common.wire.codec import Message, encode
+from congrasp.services.grasp import wrist_paths
+from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel
+from congrasp.services.record.reader import (
+    log_files,
+    metrics_of,
+    pick_episode,
+    read_episodes,
+    read_metrics,
+    read_records,
+)
+from congrasp.services.record.scene import EPISODE_SCHEMA
+from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
 
 pytestmark = pytest.mark.timeout(60)

@@ -4,8 +4,8 @@ A family is a function of a random generator that returns a `Draft`, in the tabl
 (`common.objects.procedural`) weighs, recentres and checks what it gets, and asks again where it does not like it.
 """
 
-from common.objects.families import basic, flat, solids, tools, vessels
-from common.objects.families.draft import Builder, Draft
+from congrasp.common.objects.families import basic, flat, solids, tools, vessels
+from congrasp.common.objects.families.draft import Builder, Draft
 
 BASIC: dict[str, Builder] = basic.BUILDERS
 """Simple objects, those of a run that names no families."""

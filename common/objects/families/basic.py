@@ -8,9 +8,9 @@ import itertools
 
 import numpy as np
 
-from common.objects.families import draft
-from common.objects.families.draft import Builder, Draft, Rng
-from common.objects.spec import Piece
+from congrasp.common.objects.families import draft
+from congrasp.common.objects.families.draft import Builder, Draft, Rng
+from congrasp.common.objects.spec import Piece
 
 BUILDERS: dict[str, Builder] = {}
 _family = functools.partial(draft.enter, BUILDERS)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.objects.spec import Piece
+from congrasp.common.objects.spec import Piece
 
 Rng = np.random.Generator
 Vector = tuple[float, float, float]

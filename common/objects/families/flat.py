@@ -4,9 +4,9 @@ import functools
 
 import numpy as np
 
-from common.objects.families import draft
-from common.objects.families.draft import Builder, Draft, Rng
-from common.objects.families.profiles import hull, slab, sweep
+from congrasp.common.objects.families import draft
+from congrasp.common.objects.families.draft import Builder, Draft, Rng
+from congrasp.common.objects.families.profiles import hull, slab, sweep
 
 BUILDERS: dict[str, Builder] = {}
 _family = functools.partial(draft.enter, BUILDERS)

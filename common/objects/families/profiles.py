@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from common.objects.families.draft import mesh
-from common.objects.spec import MAX_MESH_VERTICES, Piece
+from congrasp.common.objects.families.draft import mesh
+from congrasp.common.objects.spec import MAX_MESH_VERTICES, Piece
 
 _SIDES = 16
 _FLAT = 3e-4  # m by which a profile may lie below the chord that replaces it

@@ -5,20 +5,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common.errors import CongraspError, UnknownConstraintError
-from common.hands.spec import Hand
-from common.request import GraspRequest
-from common.task.constraints.affordance import Affordance
-from common.task.constraints.base import Constraint, ErrorSpec, unknown_constraint
-from common.task.constraints.fingers import Fingers
-from common.task.constraints.force import Force
-from common.task.constraints.heading import Heading
-from common.task.constraints.pose import Pose
-from common.task.constraints.trajectory import Trajectory
-from common.task.types import Goal
+from congrasp.common.errors import CongraspError, UnknownConstraintError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.request import GraspRequest
+from congrasp.common.task.constraints.affordance import Affordance
+from congrasp.common.task.constraints.base import Constraint, ErrorSpec, unknown_constraint
+from congrasp.common.task.constraints.fingers import Fingers
+from congrasp.common.task.constraints.force import Force
+from congrasp.common.task.constraints.heading import Heading
+from congrasp.common.task.constraints.pose import Pose
+from congrasp.common.task.constraints.trajectory import Trajectory
+from congrasp.common.task.types import Goal
 
 if TYPE_CHECKING:
-    from common.config import TaskConfig
+    from congrasp.common.config import TaskConfig
 
 CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers(), Force())
 PAPER = ("heading", "affordance", "pose", "trajectory")

@@ -6,18 +6,26 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from common import rotations
-from common.hands.spec import Hand
-from common.task.constraints.base import Constraint, ErrorSpec, ObservationField, Option, Relation, Scene, Weight
-from common.task.constraints.heading import HeadingGoal
-from common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, square, squash
-from common.task.sampling.headings import INWARD, MAX_WIDTH
-from common.task.types import Array, Goal, Surface
+from congrasp.common import rotations
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints.base import (
+    Constraint,
+    ErrorSpec,
+    ObservationField,
+    Option,
+    Relation,
+    Scene,
+    Weight,
+)
+from congrasp.common.task.constraints.heading import HeadingGoal
+from congrasp.common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, square, squash
+from congrasp.common.task.sampling.headings import INWARD, MAX_WIDTH
+from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
-    from common.config import TaskConfig
-    from common.task.bank import Draw
-    from common.task.features import Contacts, Features
+    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.bank import Draw
+    from congrasp.common.task.features import Contacts, Features
 
 REACH = 0.15
 """Metres of approach before the heading position that are searched for the avoid region."""

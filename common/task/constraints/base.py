@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_type_h
 import jax.numpy as jnp
 import numpy as np
 
-from common.errors import CongraspError, UnknownConstraintError
-from common.hands.spec import Hand
-from common.task.types import Array, Goal, SceneState, Surface
+from congrasp.common.errors import CongraspError, UnknownConstraintError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.types import Array, Goal, SceneState, Surface
 
 if TYPE_CHECKING:
-    from common.config import TaskConfig
-    from common.task.bank import Draw
-    from common.task.features import Contacts, Features
-    from common.task.sensing import Readings
+    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.bank import Draw
+    from congrasp.common.task.features import Contacts, Features
+    from congrasp.common.task.sensing import Readings
 
 Window = Literal["approach", "hold"]
 """Over which steps an error is averaged: before the table's removal, or in the `hold_steps` after it."""

@@ -8,15 +8,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.errors import CongraspError
-from common.hands.spec import Hand
-from common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Scene, Weight
-from common.task.geometry import flat, share, squash
-from common.task.types import Array, Goal, Surface
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints.base import (
+    Constraint,
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Scene,
+    Weight,
+)
+from congrasp.common.task.geometry import flat, share, squash
+from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
-    from common.config import TaskConfig
-    from common.task.bank import Draw
+    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.bank import Draw
 
 MARGIN, SHARPNESS = 0.01, 0.003
 """Metres that the skin of the other fingers should keep from the object, and how sharply that is felt."""

@@ -7,15 +7,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.errors import CongraspError
-from common.hands.spec import Hand
-from common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Scene, Weight
-from common.task.geometry import FORCE_SCALE
-from common.task.types import Array, Surface
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints.base import (
+    Constraint,
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Scene,
+    Weight,
+)
+from congrasp.common.task.geometry import FORCE_SCALE
+from congrasp.common.task.types import Array, Surface
 
 if TYPE_CHECKING:
-    from common.config import TaskConfig
-    from common.task.bank import Draw
+    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.bank import Draw
 
 LEAST, MOST = 1.0, 20.0
 """N: limits that training draws, as far as the object's weight allows."""

@@ -7,19 +7,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common import rotations
-from common.hands import kinematics
-from common.hands.kinematics import grasp_frame
-from common.hands.spec import Hand
-from common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Scene, Weight
-from common.task.constraints.fingers import chosen_fingers
-from common.task.geometry import flat, hand_center, in_world
-from common.task.types import Array, Goal
+from congrasp.common import rotations
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints.base import (
+    Constraint,
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Scene,
+    Weight,
+)
+from congrasp.common.task.constraints.fingers import chosen_fingers
+from congrasp.common.task.geometry import flat, hand_center, in_world
+from congrasp.common.task.types import Array, Goal
 
 if TYPE_CHECKING:
-    from common.config import TaskConfig
-    from common.task.bank import Draw
-    from common.task.features import Contacts, Features
+    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.bank import Draw
+    from congrasp.common.task.features import Contacts, Features
 
 _FAR = 0.15
 """Metres beyond which the distance costs no more: what a fallen object carries away must not drown all else."""

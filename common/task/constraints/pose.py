@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common import rotations
-from common.hands import kinematics
-from common.hands.spec import Hand
-from common.task.constraints.base import (
+from congrasp.common import rotations
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
     GoalArray,
@@ -20,15 +20,15 @@ from common.task.constraints.base import (
     Scene,
     Weight,
 )
-from common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
-from common.task.geometry import flat, in_world, square, squared_distances, wrist_to_joints
-from common.task.sampling.disturbances import disturbed_fingers, disturbed_wrist
-from common.task.types import Array, Goal, Surface
+from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
+from congrasp.common.task.geometry import flat, in_world, square, squared_distances, wrist_to_joints
+from congrasp.common.task.sampling.disturbances import disturbed_fingers, disturbed_wrist
+from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
-    from common.config import TaskConfig
-    from common.task.bank import Draw
-    from common.task.features import Contacts, Features
+    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.bank import Draw
+    from congrasp.common.task.features import Contacts, Features
 
 TOUCHING = 0.015
 """Metres from a joint or fingertip of a reference pose to the surface that it is about to touch."""

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common.hands.spec import Hand
-from common.task.constraints import CONSTRAINTS, get_constraint
-from common.task.constraints.base import Constraint, Relation
-from common.task.constraints.heading import orthogonal_cross
-from common.task.types import Array, Goal, Surface
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints import CONSTRAINTS, get_constraint
+from congrasp.common.task.constraints.base import Constraint, Relation
+from congrasp.common.task.constraints.heading import orthogonal_cross
+from congrasp.common.task.types import Array, Goal, Surface
 
 
 class Resolution(NamedTuple):

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common import rotations
-from common.hands.spec import Hand
-from common.task.constraints.base import (
+from congrasp.common import rotations
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
     GoalArray,
@@ -19,16 +19,16 @@ from common.task.constraints.base import (
     Scene,
     Weight,
 )
-from common.task.constraints.fingers import chosen_fingers
-from common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
-from common.task.constraints.pose import heading_message
-from common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
-from common.task.sampling.disturbances import disturbed_wrist
-from common.task.types import Array, Goal, Surface
+from congrasp.common.task.constraints.fingers import chosen_fingers
+from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
+from congrasp.common.task.constraints.pose import heading_message
+from congrasp.common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
+from congrasp.common.task.sampling.disturbances import disturbed_wrist
+from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
-    from common.config import TaskConfig
-    from common.task.bank import Draw
+    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.bank import Draw
 
 APART = 0.02
 """Metres between a pose's wrist and a trajectory's end from which on they contradict."""

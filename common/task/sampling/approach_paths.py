@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common import rotations
-from common.hands.kinematics import grasp_frame
-from common.hands.spec import Hand
-from common.task.types import Array
+from congrasp.common import rotations
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.types import Array
 
 DISTANCE = (0.15, 0.25)
 CONE = np.deg2rad(15.0)

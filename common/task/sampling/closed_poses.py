@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common import rotations
-from common.hands import kinematics
-from common.hands.closure import closure_pose
-from common.hands.motors import transmission
-from common.hands.spec import Hand, chain_of
-from common.task.constraints.heading import HeadingGoal, heading_wrist_pose
-from common.task.geometry import squared_distances
-from common.task.types import Array
+from congrasp.common import rotations
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.closure import closure_pose
+from congrasp.common.hands.motors import transmission
+from congrasp.common.hands.spec import Hand, chain_of
+from congrasp.common.task.constraints.heading import HeadingGoal, heading_wrist_pose
+from congrasp.common.task.geometry import squared_distances
+from congrasp.common.task.types import Array
 
 _STEPS = 40
 

@@ -8,10 +8,10 @@ asked for is disturbed by an amount of its own, between nothing and all of the b
 import jax
 import jax.numpy as jnp
 
-from common import rotations
-from common.hands.motors import coupled
-from common.hands.spec import Hand
-from common.task.types import Array
+from congrasp.common import rotations
+from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.types import Array
 
 JOINTS = 0.3
 """rad, largest standard deviation of an independent error of every finger joint."""

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.hands.outline import CENTER, Outline, depth_below
-from common.objects.shapes import matrix
-from common.objects.spec import GraspObject
+from congrasp.common.hands.outline import CENTER, Outline, depth_below
+from congrasp.common.objects.shapes import matrix
+from congrasp.common.objects.spec import GraspObject
 
 COUNT = 256
 """Headings of an object."""

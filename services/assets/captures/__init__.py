@@ -5,10 +5,10 @@ why not, and `build` gathers them into objects and constraint sets.
 """
 
 IMPORTERS = {
-    "grab": "services.assets.captures.grab",
-    "oakink": "services.assets.captures.oakink",
-    "dexycb": "services.assets.captures.dexycb",
-    "myohand": "services.assets.captures.myohand",
+    "grab": "congrasp.services.assets.captures.grab",
+    "oakink": "congrasp.services.assets.captures.oakink",
+    "dexycb": "congrasp.services.assets.captures.dexycb",
+    "myohand": "congrasp.services.assets.captures.myohand",
 }
 """Module of each format. It has `read(path, meshes, mano)`, which yields `Sequence`s and what was `Dropped`, and
 `HOLDS`, which says what a folder of the data set holds."""

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from common.npz import read_npz
-from common.pickles import parse_pickle
+from congrasp.common.npz import read_npz
+from congrasp.common.pickles import parse_pickle
 
 
 def read_archive(path: pathlib.Path) -> dict[str, Any]:

@@ -9,27 +9,27 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from actors.bank import HEADINGS, SOFT, above_table, clear_of_table, headings_of, height_over_table
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands.human import HUMAN
-from common.hands.outline import CENTER, outline
-from common.hands.spec import Hand
-from common.objects import store
-from common.objects.pool import object_scale
-from common.objects.spec import GraspObject
-from common.task.bank import ConstraintBank
-from common.task.sampling.headings import Headings
-from common.wire.codec import Message
-from services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
-from services.assets.captures.objects import import_meshes
-from services.assets.captures.separate import deepest, separated
-from services.assets.captures.sequence import Dropped, Sequence
-from services.assets.captures.transfer import demonstrated_headings, transferred
-from services.assets.objects.affordance import near_points, relabelled, two_parts
-from services.assets.objects.meshes import UNLABELLED
-from services.assets.objects.sources import safe_name
-from services.grasp.constraint_sets import for_training, set_of
+from congrasp.actors.bank import HEADINGS, SOFT, above_table, clear_of_table, headings_of, height_over_table
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.outline import CENTER, outline
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects import store
+from congrasp.common.objects.pool import object_scale
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.sampling.headings import Headings
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
+from congrasp.services.assets.captures.objects import import_meshes
+from congrasp.services.assets.captures.separate import deepest, separated
+from congrasp.services.assets.captures.sequence import Dropped, Sequence
+from congrasp.services.assets.captures.transfer import demonstrated_headings, transferred
+from congrasp.services.assets.objects.affordance import near_points, relabelled, two_parts
+from congrasp.services.assets.objects.meshes import UNLABELLED
+from congrasp.services.assets.objects.sources import safe_name
+from congrasp.services.grasp.constraint_sets import for_training, set_of
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
 _Shapes = dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]

@@ -13,13 +13,13 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands.mano import VARIABLE, ManoModel
-from common.inputs import file_name, read_file
-from services.assets.captures import mano
-from services.assets.captures.archive import read_archive
-from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.mano import VARIABLE, ManoModel
+from congrasp.common.inputs import file_name, read_file
+from congrasp.services.assets.captures import mano
+from congrasp.services.assets.captures.archive import read_archive
+from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
 
 _LARGEST_YAML, _DEEPEST_YAML = 64 << 10, 16
 HOLDS = "<date>-subject-01/<session>/meta.yml"

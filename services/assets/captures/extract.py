@@ -16,11 +16,11 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from common.hands.human import HUMAN
-from common.objects.spec import GraspObject
-from services.assets.captures.fit import Fit, fit
-from services.assets.captures.sequence import FINGERS, Dropped, Sequence
-from services.export.frames import continuous_quaternions
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.objects.spec import GraspObject
+from congrasp.services.assets.captures.fit import Fit, fit
+from congrasp.services.assets.captures.sequence import FINGERS, Dropped, Sequence
+from congrasp.services.export.frames import continuous_quaternions
 
 STABLE = 5
 """Frames that thumb and another finger must touch in a row."""

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from common.hands.human import HUMAN
-from common.hands.spec import link_origin
-from services.assets.captures.sequence import FINGERS
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.spec import link_origin
+from congrasp.services.assets.captures.sequence import FINGERS
 
 
 class Fit(NamedTuple):

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands.mano import ManoModel
-from services.assets.captures import mano
-from services.assets.captures.archive import read_archive
-from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import FINGERS, Dropped, Sequence, array_of, read_or_drop
+from congrasp.common.hands.mano import ManoModel
+from congrasp.services.assets.captures import mano
+from congrasp.services.assets.captures.archive import read_archive
+from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.assets.captures.sequence import FINGERS, Dropped, Sequence, array_of, read_or_drop
 
 HOLDS = "s1/*.npz and the other subjects"
 _LABELS = {"thumb": (53, 55), "index": (41, 43), "middle": (44, 46), "ring": (50, 52), "little": (47, 49)}

@@ -10,12 +10,12 @@ import pathlib
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands.human import HUMAN
-from common.hands.mano import MANO_FINGERS, TIP_VERTICES, ManoModel
-from services.assets.captures.fit import joint_positions
-from services.assets.captures.sequence import FINGERS
-from services.assets.objects.sources import load_geometry
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.mano import MANO_FINGERS, TIP_VERTICES, ManoModel
+from congrasp.services.assets.captures.fit import joint_positions
+from congrasp.services.assets.captures.sequence import FINGERS
+from congrasp.services.assets.objects.sources import load_geometry
 
 TO_HUMAN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Vectors of MANO's wrist frame in that of the human hand."""

@@ -13,11 +13,11 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands.mano import ManoModel
-from services.assets.captures.archive import read_archive
-from services.assets.captures.fit import joint_positions
-from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
+from congrasp.common.hands.mano import ManoModel
+from congrasp.services.assets.captures.archive import read_archive
+from congrasp.services.assets.captures.fit import joint_positions
+from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
 
 HOLDS = "MyoHand_<object>_<action>.npz"
 _BASE = np.array([0.1, -0.55, 0.32])

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands.mano import ManoModel
-from common.inputs import file_name, read_file
-from common.pickles import read_pickle
-from services.assets.captures import mano
-from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Part, Sequence, read_or_drop
-from services.assets.objects.sources import read_mesh
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.mano import ManoModel
+from congrasp.common.inputs import file_name, read_file
+from congrasp.common.pickles import read_pickle
+from congrasp.services.assets.captures import mano
+from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.assets.captures.sequence import Dropped, Part, Sequence, read_or_drop
+from congrasp.services.assets.objects.sources import read_mesh
 
 HOLDS = "anno/seq_all.json"
 _LARGEST_JSON = 256 << 20

@@ -4,13 +4,13 @@ import dataclasses
 import pathlib
 from collections.abc import Callable, Mapping
 
-from common.errors import CongraspError
-from common.inputs import file_name
-from common.objects.spec import GraspObject
-from services.assets.captures.sequence import Dropped
-from services.assets.objects.meshes import import_sources
-from services.assets.objects.options import ImportOptions
-from services.assets.objects.sources import SUFFIXES, Source, find_sources
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import file_name
+from congrasp.common.objects.spec import GraspObject
+from congrasp.services.assets.captures.sequence import Dropped
+from congrasp.services.assets.objects.meshes import import_sources
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sources import SUFFIXES, Source, find_sources
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from common.hands.kinematics import link_transforms
-from common.hands.motors import transmission
-from common.hands.spec import Hand
-from common.task.plausibility import overlaps
-from common.task.types import Array
+from congrasp.common.hands.kinematics import link_transforms
+from congrasp.common.hands.motors import transmission
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.plausibility import overlaps
+from congrasp.common.task.types import Array
 
 DEEPEST = 0.001
 """Metres that two links may be in one another: skin and flesh give way by as much."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 

@@ -10,15 +10,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands.human import HUMAN
-from common.hands.kinematics import grasp_frame
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.task.sampling.closed_poses import closed_poses
-from common.task.sampling.headings import Headings
-from services.assets.captures.extract import Demonstration
-from services.assets.captures.fit import joint_positions
-from services.export.frames import continuous_quaternions
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.sampling.closed_poses import closed_poses
+from congrasp.common.task.sampling.headings import Headings
+from congrasp.services.assets.captures.extract import Demonstration
+from congrasp.services.assets.captures.fit import joint_positions
+from congrasp.services.export.frames import continuous_quaternions
 
 _AT_ONCE = 20
 """Poses that are closed in one compiled call."""

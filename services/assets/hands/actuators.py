@@ -9,7 +9,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from common.hands.spec import Coupling, Joint, Motor
+from congrasp.common.hands.spec import Coupling, Joint, Motor
 
 FINGERTIP_FORCE = 15.0
 """N, with which a joint without a torque limit can press its fingertip."""

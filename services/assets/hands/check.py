@@ -15,22 +15,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors import protocols
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.files import write_atomically
-from common.hands import kinematics
-from common.hands.kinematics import grasp_frame
-from common.hands.measures import tip_forces
-from common.hands.mjcf import overlapping
-from common.hands.spec import Hand, chain_of
-from common.inputs import read_json
-from common.objects import procedural
-from common.objects.pool import HELD_OUT_SEED
-from common.objects.spec import GraspObject
-from common.task import plausibility
-from services.assets.hands.grips import Grip, grips
-from services.assets.hands.servos import Response, closed_overlap, responses
+from congrasp.actors import protocols
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import write_atomically
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.measures import tip_forces
+from congrasp.common.hands.mjcf import overlapping
+from congrasp.common.hands.spec import Hand, chain_of
+from congrasp.common.inputs import read_json
+from congrasp.common.objects import procedural
+from congrasp.common.objects.pool import HELD_OUT_SEED
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task import plausibility
+from congrasp.services.assets.hands.grips import Grip, grips
+from congrasp.services.assets.hands.servos import Response, closed_overlap, responses
 
 Verdict = Literal["passed", "doubt", "failed"]
 _APART = 0.03, 0.06  # m from a finger's first joint to the palm: more is in doubt, and too much

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 MEMORY = 3 << 30
 """Bytes of address space for reading a file."""
@@ -72,7 +72,7 @@ def compiled_model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
     with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
         result = pathlib.Path(folder, "model.mjb")
         search = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
-        command = [sys.executable, "-m", "services.assets.hands.compile", str(path.resolve()), str(result)]
+        command = [sys.executable, "-m", "congrasp.services.assets.hands.compile", str(path.resolve()), str(result)]
         try:
             subprocess.run(
                 command,

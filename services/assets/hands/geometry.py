@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import trimesh
 
-from common.hands.spec import Capsule, Solid, vector
-from services.assets.hands.compile import LEAST
+from congrasp.common.hands.spec import Capsule, Solid, vector
+from congrasp.services.assets.hands.compile import LEAST
 
 _KINDS: dict[mujoco.mjtGeom, Literal["box", "cylinder", "capsule", "ellipsoid"]] = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",

@@ -15,17 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors import protocols
-from actors.physics.engine import PhysicsState, ResetState
-from actors.physics.native import NativePhysics
-from common import rotations
-from common.config import TaskConfig
-from common.hands.kinematics import grasp_frame
-from common.hands.motors import motor_positions
-from common.hands.spec import Hand
-from common.objects.families import draft
-from common.objects.plain import plain_object
-from common.objects.spec import GraspObject
+from congrasp.actors import protocols
+from congrasp.actors.physics.engine import PhysicsState, ResetState
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.motors import motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.families import draft
+from congrasp.common.objects.plain import plain_object
+from congrasp.common.objects.spec import GraspObject
 
 OBJECTS = ("ball", "cylinder", "box")
 SIZES = (0.4, 0.3)

@@ -8,8 +8,8 @@ import functools
 import mujoco
 import numpy as np
 
-from common.hands.mjcf import add_hand
-from common.hands.spec import Hand
+from congrasp.common.hands.mjcf import add_hand
+from congrasp.common.hands.spec import Hand
 
 
 @functools.cache

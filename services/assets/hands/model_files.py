@@ -10,19 +10,19 @@ import pathlib
 import mujoco
 import numpy as np
 
-from common.errors import CongraspError
-from common.hands.files import TAKEN_JOINTS, faults, hand_from_text, hand_text
-from common.hands.kinematics import grasp_frame
-from common.hands.measures import fitting_scale
-from common.hands.meshes import MAX_DISTANCE, Meshes
-from common.hands.motors import motor_limits
-from common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
-from services.assets.hands.actuators import Drive
-from services.assets.hands.compile import compiled_model
-from services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_box, solids_of, surface
-from services.assets.hands.poses import opening, propose_poses, thumb_of
-from services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
-from services.assets.hands.visual import link_mesh
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.files import TAKEN_JOINTS, faults, hand_from_text, hand_text
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.measures import fitting_scale
+from congrasp.common.hands.meshes import MAX_DISTANCE, Meshes
+from congrasp.common.hands.motors import motor_limits
+from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
+from congrasp.services.assets.hands.actuators import Drive
+from congrasp.services.assets.hands.compile import compiled_model
+from congrasp.services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_box, solids_of, surface
+from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
+from congrasp.services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
+from congrasp.services.assets.hands.visual import link_mesh
 
 _LEVER = 0.02  # m from a joint to the tip that it moves, at least
 _TURN = np.deg2rad(10)  # of the joint with the largest range, below which nothing can be grasped

@@ -13,10 +13,10 @@ import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
-from common.errors import CongraspError
-from common.hands.mjcf import add_hand
-from common.hands.motors import joint_positions, motor_limits, motor_positions
-from common.hands.spec import Hand, chain_of, link_origin
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.mjcf import add_hand
+from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
+from congrasp.common.hands.spec import Hand, chain_of, link_origin
 
 _CLOSED = 0.8  # share of the way from zero to a joint's end at which it is closed, where thumb and fingers can meet
 _FLEXED = 0.15  # the same for the fingers of an open hand, as far as nothing else matters

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from actors.physics.engine import PhysicsState, ResetState
-from actors.physics.native import NativePhysics
-from common.config import TaskConfig
-from common.hands.kinematics import link_transforms
-from common.hands.motors import motor_limits, motor_positions
-from common.hands.spec import Hand
-from common.task import plausibility
-from services.assets.hands.grips import grip_objects
+from congrasp.actors.physics.engine import PhysicsState, ResetState
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.kinematics import link_transforms
+from congrasp.common.hands.motors import motor_limits, motor_positions
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task import plausibility
+from congrasp.services.assets.hands.grips import grip_objects
 
 STEP = 0.1
 """rad, as far as a target moves in a control step."""

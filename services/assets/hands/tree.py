@@ -9,7 +9,7 @@ import re
 
 import mujoco
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 _CALLED = ("palm", "hand")
 _FREE = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import trimesh
 
-from common.files import write_atomically
-from common.hands.meshes import MAX_FACES, PARTS, Meshes, beside
-from services.assets.hands.geometry import geom_mesh
+from congrasp.common.files import write_atomically
+from congrasp.common.hands.meshes import MAX_FACES, PARTS, Meshes, beside
+from congrasp.services.assets.hands.geometry import geom_mesh
 
 
 def link_mesh(

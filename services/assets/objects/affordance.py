@@ -12,9 +12,9 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from common.errors import CongraspError
-from common.objects.spec import GraspObject
-from services.assets.objects.sources import load_geometry, read_mesh
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.spec import GraspObject
+from congrasp.services.assets.objects.sources import load_geometry, read_mesh
 
 LEAST_SHARE = 0.10
 """Least share of the surface that the graspable region must have (paper, section Constraint Setup)."""

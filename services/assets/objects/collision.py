@@ -8,13 +8,13 @@ import numpy as np
 import trimesh
 from scipy.spatial import QhullError
 
-from common.errors import CongraspError
-from common.objects import shapes
-from services.assets.objects import decompose, repair
-from services.assets.objects.fidelity import Fidelity, fidelity
-from services.assets.objects.options import ImportOptions
-from services.assets.objects.pieces import SQUEEZE, merge, simplify, squeeze
-from services.assets.objects.sources import Source
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import shapes
+from congrasp.services.assets.objects import decompose, repair
+from congrasp.services.assets.objects.fidelity import Fidelity, fidelity
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.pieces import SQUEEZE, merge, simplify, squeeze
+from congrasp.services.assets.objects.sources import Source
 
 _TOO_LARGE = 0.01  # share of the volume; pieces of thin walls fill the inside of their bends
 

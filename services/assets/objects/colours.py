@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 from trimesh.visual.color import uv_to_interpolated_color
 
-from common.errors import CongraspError
-from common.objects.spec import COLOUR_POINTS, Colours
-from services.assets.objects.sources import kind_of, load_geometry
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.spec import COLOUR_POINTS, Colours
+from congrasp.services.assets.objects.sources import kind_of, load_geometry
 
 _UNSAID = (102, 102, 102)  # what trimesh takes for the colour of a material without one
 

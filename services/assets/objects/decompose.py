@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.objects import shapes
-from common.objects.spec import MAX_MESH_PIECES
-from services.assets.objects.pieces import DEPTH, GROWTH, deepest, merge, solid_hull
+from congrasp.common.objects import shapes
+from congrasp.common.objects.spec import MAX_MESH_PIECES
+from congrasp.services.assets.objects.pieces import DEPTH, GROWTH, deepest, merge, solid_hull
 
 FALLBACK_LIMIT = 30.0
 """Seconds that V-HACD may take."""
@@ -78,7 +78,7 @@ def _in_child(
         mesh, result = os.path.join(folder, "mesh.npz"), os.path.join(folder, "pieces.npz")
         np.savez(mesh, vertices=vertices, faces=faces, volume=volume or 0.0)
         path = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
-        command = [sys.executable, "-m", "services.assets.objects.decompose"]
+        command = [sys.executable, "-m", "congrasp.services.assets.objects.decompose"]
         try:
             child = subprocess.run(
                 [*command, method, mesh, result, str(max_pieces), str(limit)],

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from common.objects import shapes
+from congrasp.common.objects import shapes
 
 POINTS = 50_000
 """Most points of a surface whose distances from the other are taken, to the nearest of all points of that one."""

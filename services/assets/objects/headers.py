@@ -5,7 +5,7 @@ import pathlib
 import stat
 from typing import Any
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 MAX_BYTES = 512 << 20
 """Bytes of a mesh file."""

@@ -3,7 +3,7 @@
 import pathlib
 import zipfile
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CONVERT = "Convert it to STL, OBJ, PLY or GLB."

@@ -13,20 +13,20 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from common.errors import CongraspError
-from common.files import cache_folder
-from common.objects import shapes, store
-from common.objects.procedural import MASS_RANGE
-from common.objects.resting import rest_poses
-from common.objects.spec import Colours, GraspObject, Piece
-from common.objects.surface import halves, mass_properties, sample_mesh
-from common.parallel import cores
-from services.assets.objects import decompose, repair
-from services.assets.objects.collision import convex_pieces
-from services.assets.objects.colours import sample_colours
-from services.assets.objects.options import ImportOptions, check_options
-from services.assets.objects.sizes import metres_per_unit
-from services.assets.objects.sources import Source, read_mesh
+from congrasp.common.errors import CongraspError
+from congrasp.common.files import cache_folder
+from congrasp.common.objects import shapes, store
+from congrasp.common.objects.procedural import MASS_RANGE
+from congrasp.common.objects.resting import rest_poses
+from congrasp.common.objects.spec import Colours, GraspObject, Piece
+from congrasp.common.objects.surface import halves, mass_properties, sample_mesh
+from congrasp.common.parallel import cores
+from congrasp.services.assets.objects import decompose, repair
+from congrasp.services.assets.objects.collision import convex_pieces
+from congrasp.services.assets.objects.colours import sample_colours
+from congrasp.services.assets.objects.options import ImportOptions, check_options
+from congrasp.services.assets.objects.sizes import metres_per_unit
+from congrasp.services.assets.objects.sources import Source, read_mesh
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""

@@ -5,13 +5,13 @@ import pathlib
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from common.errors import CongraspError
-from common.objects import store
-from common.objects.procedural import generate
-from common.objects.spec import GraspObject
-from services.assets.objects.meshes import import_source, import_sources
-from services.assets.objects.options import ImportOptions
-from services.assets.objects.sources import SUFFIXES, Source, find_sources
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import store
+from congrasp.common.objects.procedural import generate
+from congrasp.common.objects.spec import GraspObject
+from congrasp.services.assets.objects.meshes import import_source, import_sources
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sources import SUFFIXES, Source, find_sources
 
 _log = logging.getLogger(__name__)
 _METRES_OR_ASK = ImportOptions()

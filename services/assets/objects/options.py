@@ -2,9 +2,9 @@
 
 import dataclasses
 
-from common.errors import CongraspError
-from common.objects.spec import MAX_MESH_PIECES
-from services.assets.objects.sizes import Unit
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.spec import MAX_MESH_PIECES
+from congrasp.services.assets.objects.sizes import Unit
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from common.objects import shapes
-from common.objects.spec import MAX_MESH_VERTICES
-from services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME
+from congrasp.common.objects import shapes
+from congrasp.common.objects.spec import MAX_MESH_VERTICES
+from congrasp.services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME
 
 DEPTH = 1.5e-3
 """Metres that joining pieces may bury the surface, or stand out from it, while they are few enough."""

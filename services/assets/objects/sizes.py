@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from common.errors import CongraspError
+from congrasp.common.errors import CongraspError
 
 Unit = Literal["auto", "guess", "m", "cm", "mm", "in"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}

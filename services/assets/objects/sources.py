@@ -8,11 +8,11 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from common.errors import CongraspError
-from common.inputs import LONGEST_NAME
-from services.assets.objects import repair
-from services.assets.objects.headers import MAX_FACES, check_header
-from services.assets.objects.kinds import CONVERT, SUFFIXES, kind_of
+from congrasp.common.errors import CongraspError
+from congrasp.common.inputs import LONGEST_NAME
+from congrasp.services.assets.objects import repair
+from congrasp.services.assets.objects.headers import MAX_FACES, check_header
+from congrasp.services.assets.objects.kinds import CONVERT, SUFFIXES, kind_of
 
 _GRASPABLE_WORDS = ("handle", "grip", "neck", "stem", "shaft", "body")
 # GraspXL marks the absence of a non-graspable part by a cube of 1 cm here (m).

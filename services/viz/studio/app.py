@@ -7,27 +7,27 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import cast
 
-from common.errors import CongraspError
-from common.objects import procedural
-from common.objects.pool import HELD_OUT_SEED
-from common.objects.spec import GraspObject
-from common.policy.pretrained import hands_with_policy, policy_file
-from common.transport import urls
-from common.transport.base import Transport
-from common.transport.security import check_exposure
-from learner.run_directory import LOGS
-from services.assets.objects.named import objects_at, one_object
-from services.assets.objects.options import ImportOptions
-from services.assets.objects.sizes import Unit
-from services.assets.objects.sources import read_mesh
-from services.ops.logs import log
-from services.serve.server import follow_file, follow_run
-from services.viz.studio.catalogue import Catalogue
-from services.viz.studio.grasping import PolicyGrasping
-from services.viz.studio.recordings import Recordings
-from services.viz.studio.server import PageServer
-from services.viz.studio.session import Session
-from services.viz.studio.training import Follower, TrainingWindow
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import procedural
+from congrasp.common.objects.pool import HELD_OUT_SEED
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.policy.pretrained import hands_with_policy, policy_file
+from congrasp.common.transport import urls
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.security import check_exposure
+from congrasp.learner.run_directory import LOGS
+from congrasp.services.assets.objects.named import objects_at, one_object
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sizes import Unit
+from congrasp.services.assets.objects.sources import read_mesh
+from congrasp.services.ops.logs import log
+from congrasp.services.serve.server import follow_file, follow_run
+from congrasp.services.viz.studio.catalogue import Catalogue
+from congrasp.services.viz.studio.grasping import PolicyGrasping
+from congrasp.services.viz.studio.recordings import Recordings
+from congrasp.services.viz.studio.server import PageServer
+from congrasp.services.viz.studio.session import Session
+from congrasp.services.viz.studio.training import Follower, TrainingWindow
 
 _GUESS = ImportOptions(unit="guess")
 _FIRST = "mug"

@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.objects.shapes import matrix
-from common.objects.spec import GraspObject
-from common.task.sampling.headings import INWARD
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.shapes import matrix
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.sampling.headings import INWARD
 
 LARGEST = 1e6
 """Of each number of a place (m) or a direction that a page sends: single precision has its squares, too."""

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from common.errors import CongraspError
-from common.objects.painting import finer, painted
-from common.objects.spec import GraspObject
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.painting import finer, painted
+from congrasp.common.objects.spec import GraspObject
 
 _versions = itertools.count(1)
 

@@ -6,9 +6,9 @@ import tempfile
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from common.errors import CongraspError
-from common.objects.spec import GraspObject
-from services.assets.objects.sizes import UNIT_NAMES, guessed_unit, sizes_by_unit
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.spec import GraspObject
+from congrasp.services.assets.objects.sizes import UNIT_NAMES, guessed_unit, sizes_by_unit
 
 
 class Importer(Protocol):

@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from actors.initial import initial_hand
-from common import rotations
-from common.config import TaskConfig
-from common.hands import kinematics
-from common.hands.spec import Hand
-from common.objects.resting import rest_tilts
-from common.task.constraints import get_constraint, optional
-from common.task.sampling.closed_poses import Poses
-from common.task.types import Goal, Surface
-from services.grasp.grasper import surface_of
-from services.viz.studio.state import Studio
+from congrasp.actors.initial import initial_hand
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.resting import rest_tilts
+from congrasp.common.task.constraints import get_constraint, optional
+from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.common.task.types import Goal, Surface
+from congrasp.services.grasp.grasper import surface_of
+from congrasp.services.viz.studio.state import Studio
 
 
 def describe(studio: Studio) -> dict[str, Any]:

@@ -3,10 +3,10 @@
 import dataclasses
 from collections.abc import Callable, Iterator
 
-from common.request import GraspRequest
-from common.task.constraints import get_constraint
-from common.wire.codec import Message
-from services.evaluate.failures import cause
+from congrasp.common.request import GraspRequest
+from congrasp.common.task.constraints import get_constraint
+from congrasp.common.wire.codec import Message
+from congrasp.services.evaluate.failures import cause
 
 Held = Callable[[GraspRequest, str], int]
 """(request, what is left out of it) -> how many of the attempts under it hold."""

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.wire.codec import Message
-from services.export.motion_file import motion_of_episode, save_motion
-from services.export.motion_formats import FORMATS, export_motions
-from services.record.channels import JsonChannels
-from services.record.scene import episode_entries
-from services.record.writer import LogWriter
-from services.viz.render import render_episode_frames, save_episode_video
-from services.viz.scene import Camera
-from services.viz.sheets import png_of
-from services.viz.studio.arrow import vector
-from services.viz.studio.server import Download
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message
+from congrasp.services.export.motion_file import motion_of_episode, save_motion
+from congrasp.services.export.motion_formats import FORMATS, export_motions
+from congrasp.services.record.channels import JsonChannels
+from congrasp.services.record.scene import episode_entries
+from congrasp.services.record.writer import LogWriter
+from congrasp.services.viz.render import render_episode_frames, save_episode_video
+from congrasp.services.viz.scene import Camera
+from congrasp.services.viz.sheets import png_of
+from congrasp.services.viz.studio.arrow import vector
+from congrasp.services.viz.studio.server import Download
 
 DATA = ("npz", "mcap", *FORMATS)
 """What a motion can be saved as at once."""

@@ -7,22 +7,22 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from actors.attempts import Attempts, Outcome
-from actors.initial import RequestedEpisodes
-from common.config import TaskConfig
-from common.errors import CongraspError, TransportError
-from common.hands import get_hand
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.parallel import cores
-from common.request import GraspRequest
-from common.task.constraints import get_constraint, known, require_known
-from common.task.constraints.priority import explain
-from common.wire.codec import Message
-from services.grasp.grasper import costs, repeated, surface_of
-from services.serve.server import Source
-from services.viz.studio.diagnosis import why_nothing_held
-from services.viz.studio.jobs import Progress
+from congrasp.actors.attempts import Attempts, Outcome
+from congrasp.actors.initial import RequestedEpisodes
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.parallel import cores
+from congrasp.common.request import GraspRequest
+from congrasp.common.task.constraints import get_constraint, known, require_known
+from congrasp.common.task.constraints.priority import explain
+from congrasp.common.wire.codec import Message
+from congrasp.services.grasp.grasper import costs, repeated, surface_of
+from congrasp.services.serve.server import Source
+from congrasp.services.viz.studio.diagnosis import why_nothing_held
+from congrasp.services.viz.studio.jobs import Progress
 
 ATTEMPTS = 8
 """Grasps side by side: the one that was drawn, and others near it."""

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from services.viz.studio.state import Edit, Studio
+from congrasp.services.viz.studio.state import Edit, Studio
 
 ACTIONS = {
     "set_rest_pose": "resting pose",

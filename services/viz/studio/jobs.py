@@ -5,8 +5,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from common.errors import CongraspError
-from services.ops.logs import log
+from congrasp.common.errors import CongraspError
+from congrasp.services.ops.logs import log
 
 Progress = Callable[[str, float], None]
 """(what is being done, how much of it is done from 0 to 1)."""

@@ -6,15 +6,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common.hands import known_hand
-from common.objects.painting import painted
-from common.objects.spec import Colours
-from common.task.constraints import CONSTRAINTS
-from common.task.constraints.base import ErrorSpec
-from common.task.reward import GRASP
-from common.wire.codec import Message
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.record.goals import active_blocks, active_constraints
+from congrasp.common.hands import known_hand
+from congrasp.common.objects.painting import painted
+from congrasp.common.objects.spec import Colours
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.constraints.base import ErrorSpec
+from congrasp.common.task.reward import GRASP
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.record.goals import active_blocks, active_constraints
 
 TOUCH = 0.05
 """Newtons from which a link counts as touching."""

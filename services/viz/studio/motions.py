@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import CongraspError
-from common.wire.codec import Message
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message
 
 MOST = 30
 """Motions that are kept; the oldest goes first."""

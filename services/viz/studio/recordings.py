@@ -6,11 +6,11 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from common.errors import CongraspError
-from common.wire.codec import Message, decode
-from services.record.reader import is_episode, log_files, read_records
-from services.record.salvage import DAMAGE, intact_summary
-from services.record.scene import EPISODE_SCHEMA
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message, decode
+from congrasp.services.record.reader import is_episode, log_files, read_records
+from congrasp.services.record.salvage import DAMAGE, intact_summary
+from congrasp.services.record.scene import EPISODE_SCHEMA
 
 MOST = 60
 """Episodes that one search finds at most; the nearest to the time."""

@@ -9,9 +9,9 @@ import urllib.parse
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from common.errors import CongraspError, TransportError
-from common.wire.codec import Message, encode
-from services.ops.logs import log
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.wire.codec import Message, encode
+from congrasp.services.ops.logs import log
 
 STATIC = pathlib.Path(__file__).with_name("static")
 MOST_BYTES = 128 << 20

@@ -10,28 +10,28 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.skin import skin_of
-from common.hands.spec import Hand
-from common.objects.spec import GraspObject
-from common.request import GraspRequest
-from common.wire.codec import Message
-from services.assets.objects.sizes import METRES
-from services.viz.shapes import skin_colours
-from services.viz.studio.catalogue import Catalogue, Importer, Uploads
-from services.viz.studio.description import describe
-from services.viz.studio.files import DATA, DRAWN, data_file, drawing
-from services.viz.studio.history import ACTIONS, History
-from services.viz.studio.jobs import Jobs, Progress
-from services.viz.studio.lanes import for_page
-from services.viz.studio.motions import Motions
-from services.viz.studio.recordings import Recordings
-from services.viz.studio.server import Download, Get, Picture, Post
-from services.viz.studio.state import Studio
-from services.viz.studio.thumbnails import Thumbnails
-from services.viz.studio.training import TrainingWindow
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.request import GraspRequest
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.objects.sizes import METRES
+from congrasp.services.viz.shapes import skin_colours
+from congrasp.services.viz.studio.catalogue import Catalogue, Importer, Uploads
+from congrasp.services.viz.studio.description import describe
+from congrasp.services.viz.studio.files import DATA, DRAWN, data_file, drawing
+from congrasp.services.viz.studio.history import ACTIONS, History
+from congrasp.services.viz.studio.jobs import Jobs, Progress
+from congrasp.services.viz.studio.lanes import for_page
+from congrasp.services.viz.studio.motions import Motions
+from congrasp.services.viz.studio.recordings import Recordings
+from congrasp.services.viz.studio.server import Download, Get, Picture, Post
+from congrasp.services.viz.studio.state import Studio
+from congrasp.services.viz.studio.thumbnails import Thumbnails
+from congrasp.services.viz.studio.training import TrainingWindow
 
 _DRAWING = "drawing"
 """What a job says it made when that is a picture or a video, and no motion."""

@@ -8,22 +8,22 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands.spec import Hand
-from common.objects.shapes import matrix
-from common.objects.spec import GraspObject
-from common.request import GraspRequest
-from common.task.constraints import get_constraint, goal_of, optional, require_known
-from common.task.constraints.priority import Resolution, explain, resolve
-from common.task.sampling.closed_poses import Poses, closed_poses
-from common.task.sampling.headings import BACK_OFF, INWARD
-from common.task.types import Goal, Surface
-from common.wire.codec import Message
-from services.grasp.constraint_sets import make_sets
-from services.grasp.grasper import with_avoid
-from services.viz.studio.arrow import LARGEST, Arrow, arrow_of, from_above, vector
-from services.viz.studio.canvas import Canvas, Paint
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.shapes import matrix
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.request import GraspRequest
+from congrasp.common.task.constraints import get_constraint, goal_of, optional, require_known
+from congrasp.common.task.constraints.priority import Resolution, explain, resolve
+from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
+from congrasp.common.task.sampling.headings import BACK_OFF, INWARD
+from congrasp.common.task.types import Goal, Surface
+from congrasp.common.wire.codec import Message
+from congrasp.services.grasp.constraint_sets import make_sets
+from congrasp.services.grasp.grasper import with_avoid
+from congrasp.services.viz.studio.arrow import LARGEST, Arrow, arrow_of, from_above, vector
+from congrasp.services.viz.studio.canvas import Canvas, Paint
 
 TOOLS = ("affordance", "pose", "trajectory")
 """Constraints that have tools of their own; the page makes toggles for the flags of the others."""

@@ -2,11 +2,11 @@
 
 import threading
 
-from common.errors import CongraspError
-from common.objects.spec import GraspObject
-from services.viz.object_sheet import rest_picture
-from services.viz.sheets import png_of
-from services.viz.studio.server import Picture
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.spec import GraspObject
+from congrasp.services.viz.object_sheet import rest_picture
+from congrasp.services.viz.sheets import png_of
+from congrasp.services.viz.studio.server import Picture
 
 _SIZE = (150, 112)  # pixels
 

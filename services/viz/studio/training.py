@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from common.errors import CongraspError
-from common.task.constraints import CONSTRAINTS
-from common.transport.base import Transport
-from common.transport.keys import Keys
-from common.wire.codec import Message, decode
-from services.ops import status as statuses
-from services.record.channels import flatten
-from services.record.reader import Record, is_episode, log_files, metrics_of, read_records
-from services.viz.plots import figures
+from congrasp.common.errors import CongraspError
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message, decode
+from congrasp.services.ops import status as statuses
+from congrasp.services.record.channels import flatten
+from congrasp.services.record.reader import Record, is_episode, log_files, metrics_of, read_records
+from congrasp.services.viz.plots import figures
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows first."""

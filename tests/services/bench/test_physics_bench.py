@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from actors.physics.engine import ResetState
-from actors.physics.native import NativePhysics
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.objects import procedural
-from services.bench.physics import Recorder, replay, rolled
+from congrasp.actors.physics.engine import ResetState
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.services.bench.physics import Recorder, replay, rolled
 
 HAND = get_hand("human")
 TASK = TaskConfig()

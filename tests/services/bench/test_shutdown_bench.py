@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from services.bench import shutdown
+from congrasp.services.bench import shutdown
 
 ORPHANING = """
 import os, signal, subprocess, sys, time

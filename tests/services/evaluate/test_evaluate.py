@@ -6,14 +6,14 @@ import json
 import numpy as np
 import pytest
 
-from common.config import NetworkConfig, RunConfig
-from common.errors import CongraspError
-from common.objects import procedural
-from common.objects.store import Catalogue
-from common.policy import bundle as bundles
-from services.cli.main import load
-from services.evaluate.evaluator import Evaluator
-from services.train.command import untrained
+from congrasp.common.config import NetworkConfig, RunConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import procedural
+from congrasp.common.objects.store import Catalogue
+from congrasp.common.policy import bundle as bundles
+from congrasp.services.cli.main import load
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.train.command import untrained
 
 CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
 OBJECTS = procedural.generate_many(3, 1_000_000)
@@ -93,7 +93,7 @@ def test_numbers_out_of_range_are_refused(policy, arguments):
 
 
 def test_nominal_mass_and_friction(monkeypatch):
-    monkeypatch.setattr("services.evaluate.evaluator.build_bank", lambda *arguments: None)
+    monkeypatch.setattr("congrasp.services.evaluate.evaluator.build_bank", lambda *arguments: None)
     ranged = dataclasses.replace(CONFIG.task, mass_range=(0.8, 1.5), friction_range=(0.6, 1.0))
     task = Evaluator(untrained(CONFIG), OBJECTS, task=ranged).task
     assert task.mass_range == (1.0, 1.0) and task.friction_range == (1.0, 1.0)

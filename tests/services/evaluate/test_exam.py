@@ -6,16 +6,16 @@ import jax
 import numpy as np
 import pytest
 
-from actors.bank import build_bank
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.objects import procedural
-from common.objects.pool import FIGURES_SEED, HELD_OUT_SEED
-from services.evaluate import exam
-from services.evaluate.episodes import identity, reference
-from services.evaluate.heading_rules import HeadingRules, heading_rules
-from services.evaluate.loads import MASSES, PEERS, Load, at_load, payload
+from congrasp.actors.bank import build_bank
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED
+from congrasp.services.evaluate import exam
+from congrasp.services.evaluate.episodes import identity, reference
+from congrasp.services.evaluate.heading_rules import HeadingRules, heading_rules
+from congrasp.services.evaluate.loads import MASSES, PEERS, Load, at_load, payload
 from tests import draws
 
 HAND, TASK = get_hand("human"), TaskConfig(surface_points=64, p_force=0.5)

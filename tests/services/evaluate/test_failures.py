@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from common.objects.procedural import generate_many
-from common.wire.codec import Message
-from services.evaluate.evaluator import Evaluator
-from services.evaluate.failures import cause, failure_sheets
-from services.train.command import untrained
-from services.train.presets import get_preset
+from congrasp.common.objects.procedural import generate_many
+from congrasp.common.wire.codec import Message
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.failures import cause, failure_sheets
+from congrasp.services.train.command import untrained
+from congrasp.services.train.presets import get_preset
 
 
 def episode(heights, **metrics) -> Message:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.evaluate.intervals import clustered, independent_episodes, wilson
+from congrasp.services.evaluate.intervals import clustered, independent_episodes, wilson
 
 
 def test_wilson_interval():

@@ -5,15 +5,15 @@ import json
 
 import pytest
 
-from common.config import NetworkConfig, RunConfig
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from common.policy.pretrained import pretrained_hands
-from common.task.methods import with_method
-from services.cli.main import load
-from services.evaluate import tables
-from services.evaluate.lineup import ABLATION, line_up, read_entrants
-from services.train.command import untrained
+from congrasp.common.config import NetworkConfig, RunConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import pretrained_hands
+from congrasp.common.task.methods import with_method
+from congrasp.services.cli.main import load
+from congrasp.services.evaluate import tables
+from congrasp.services.evaluate.lineup import ABLATION, line_up, read_entrants
+from congrasp.services.train.command import untrained
 from tests.rows import row
 
 CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
@@ -121,7 +121,7 @@ def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monk
 def test_captured_sets_of_one_hand_are_not_evaluated_with_another(monkeypatch, tmp_path):
     sets = tables.Captured([], None, "human", "captured")
     monkeypatch.setattr(tables, "captured", lambda folder, split, objects: sets)
-    monkeypatch.setattr("services.assets.objects.named.objects_of", lambda *arguments, **options: [])
+    monkeypatch.setattr("congrasp.services.assets.objects.named.objects_of", lambda *arguments, **options: [])
     command = ["--hand", "allegro", "--objects", str(tmp_path), "--constraints", str(tmp_path)]
     with pytest.raises(CongraspError, match=r"sets are for the hand 'human', the policy for 'allegro'.*--hand allegro"):
         load("evaluate")(command)()

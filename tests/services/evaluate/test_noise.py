@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from actors.bank import build_bank
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame
-from common.objects import procedural
-from common.task import constraint_sets as stored_sets
-from services.evaluate.evaluator import Evaluator
-from services.evaluate.noise import LEVELS, Noise, with_noise
-from services.evaluate.noise_sheet import draw_curves
-from services.grasp import constraint_sets
-from services.train.command import untrained
+from congrasp.actors.bank import build_bank
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.objects import procedural
+from congrasp.common.task import constraint_sets as stored_sets
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.noise import LEVELS, Noise, with_noise
+from congrasp.services.evaluate.noise_sheet import draw_curves
+from congrasp.services.grasp import constraint_sets
+from congrasp.services.train.command import untrained
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]

@@ -6,14 +6,14 @@ import jax
 import numpy as np
 import pytest
 
-from actors.bank import build_bank
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.objects import procedural
-from common.task.constraints import OURS, PAPER, blocks
-from services.evaluate.plan import ALIGNED, batches, plan_row
-from services.evaluate.protocol import protocol
-from services.evaluate.scores import TABLES
+from congrasp.actors.bank import build_bank
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.task.constraints import OURS, PAPER, blocks
+from congrasp.services.evaluate.plan import ALIGNED, batches, plan_row
+from congrasp.services.evaluate.protocol import protocol
+from congrasp.services.evaluate.scores import TABLES
 
 HAND = get_hand("human")
 TASK = protocol(TaskConfig(constraints=PAPER), 200)

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from actors.bank import POSES, build_bank
-from common.config import TaskConfig
-from common.hands import get_hand
-from common.objects import procedural
-from common.policy import bundle as bundles
-from common.policy.pretrained import policy_file, pretrained_hands, reference_file
-from common.task.sampling.closed_poses import Poses
-from services.evaluate import references
-from services.evaluate.references import HELD_OUT, References, held_out
+from congrasp.actors.bank import POSES, build_bank
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import policy_file, pretrained_hands, reference_file
+from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.services.evaluate import references
+from congrasp.services.evaluate.references import HELD_OUT, References, held_out
 
 HAND = get_hand("human")
 TASK = TaskConfig()

@@ -11,23 +11,23 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from common.config import NetworkConfig, RunConfig, SensingConfig, TaskConfig
-from common.errors import CongraspError
-from common.hands import known_hand
-from common.hands.skin import skin_of
-from common.policy import bundle as bundles
-from services.assets.hands.check import Finding, write_findings
-from services.cli import main
-from services.evaluate.model_card import limits, model_card
-from services.evaluate.report import Commands, Picture, count_causes, curves_of, write_report
-from services.evaluate.reporting import Reported
-from services.evaluate.turntable import turntable
-from services.record.channels import JsonChannels
-from services.record.writer import LogWriter
-from services.train.command import untrained
-from services.train.presets import get_preset
-from services.viz.shapes import skin_shape
-from services.viz.sheets import save_png
+from congrasp.common.config import NetworkConfig, RunConfig, SensingConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import known_hand
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.policy import bundle as bundles
+from congrasp.services.assets.hands.check import Finding, write_findings
+from congrasp.services.cli import main
+from congrasp.services.evaluate.model_card import limits, model_card
+from congrasp.services.evaluate.report import Commands, Picture, count_causes, curves_of, write_report
+from congrasp.services.evaluate.reporting import Reported
+from congrasp.services.evaluate.turntable import turntable
+from congrasp.services.record.channels import JsonChannels
+from congrasp.services.record.writer import LogWriter
+from congrasp.services.train.command import untrained
+from congrasp.services.train.presets import get_preset
+from congrasp.services.viz.shapes import skin_shape
+from congrasp.services.viz.sheets import save_png
 from tests.episodes import episode
 from tests.pages import Reader
 from tests.rows import row as made_row
@@ -86,7 +86,7 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
         write_report(out, policy, file.name, rows, "8 episodes", [], [], Commands("c", ""), check)
         return Reported(rows, [CongraspError("Row x.", "Y.")])
 
-    monkeypatch.setattr("services.evaluate.reporting.report_on", report_on)
+    monkeypatch.setattr("congrasp.services.evaluate.reporting.report_on", report_on)
     command = ["report", str(tmp_path), "--out", str(out), "--episodes", "8", "--json", str(tmp_path / "rows.json")]
     assert main.run([*command, "--check", str(tmp_path / "check.json")]) == 0
     found = Reader(text := out.read_text())

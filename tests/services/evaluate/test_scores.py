@@ -6,12 +6,12 @@ import json
 import numpy as np
 import pytest
 
-from common.config import TaskConfig
-from common.task.constraints import blocks
-from services.evaluate.cells import RATES, rate_cells, tables_of
-from services.evaluate.intervals import clustered
-from services.evaluate.paper import paper_row
-from services.evaluate.scores import (
+from congrasp.common.config import TaskConfig
+from congrasp.common.task.constraints import blocks
+from congrasp.services.evaluate.cells import RATES, rate_cells, tables_of
+from congrasp.services.evaluate.intervals import clustered
+from congrasp.services.evaluate.paper import paper_row
+from congrasp.services.evaluate.scores import (
     PROBED_EPISODES,
     TABLES,
     Sample,

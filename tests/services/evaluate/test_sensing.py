@@ -8,17 +8,17 @@ import jax
 import numpy as np
 import pytest
 
-from actors.bank import build_bank
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.hands import get_hand
-from common.objects import procedural
-from common.task import sensing
-from services.evaluate import evaluator as evaluation
-from services.evaluate.evaluator import Evaluator
-from services.evaluate.protocol import protocol
-from services.evaluate.sensing import LEVELS, at_level, sensing_task
-from services.train.command import untrained
-from services.train.student import TRACKERS
+from congrasp.actors.bank import build_bank
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.task import sensing
+from congrasp.services.evaluate import evaluator as evaluation
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.protocol import protocol
+from congrasp.services.evaluate.sensing import LEVELS, at_level, sensing_task
+from congrasp.services.train.command import untrained
+from congrasp.services.train.student import TRACKERS
 from tests import draws
 
 HAND = get_hand("human")

@@ -4,12 +4,12 @@ import math
 
 import pytest
 
-from common.policy import bundle as bundles
-from common.policy.pretrained import policy_file, pretrained_hands
-from services.evaluate.evaluator import Evaluator
-from services.evaluate.exam import exam_pool
-from services.evaluate.intervals import NORMAL_95
-from services.evaluate.results import recorded
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import policy_file, pretrained_hands
+from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.exam import exam_pool
+from congrasp.services.evaluate.intervals import NORMAL_95
+from congrasp.services.evaluate.results import recorded
 
 EPISODES = 24
 """Of a row, one for each object of the development exam: so many are independent."""

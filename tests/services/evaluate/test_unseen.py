@@ -5,15 +5,15 @@ import types
 import numpy as np
 import pytest
 
-from actors.env import metric_names
-from common.config import NetworkConfig, RunConfig
-from common.errors import CongraspError
-from common.objects import procedural
-from common.objects.store import Catalogue
-from services.evaluate import exam, unseen
-from services.evaluate.scores import Sample
-from services.evaluate.unseen import Loaded, Pools, evaluate_objects, folder_pools, procedural_pools
-from services.train.command import untrained
+from congrasp.actors.env import metric_names
+from congrasp.common.config import NetworkConfig, RunConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import procedural
+from congrasp.common.objects.store import Catalogue
+from congrasp.services.evaluate import exam, unseen
+from congrasp.services.evaluate.scores import Sample
+from congrasp.services.evaluate.unseen import Loaded, Pools, evaluate_objects, folder_pools, procedural_pools
+from congrasp.services.train.command import untrained
 
 CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
 POLICY = untrained(CONFIG)

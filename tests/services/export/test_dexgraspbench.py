@@ -11,20 +11,20 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.kinematics import keypoints, link_transforms
-from common.hands.mjcf import add_hand
-from common.hands.spec import Motor
-from services.assets.hands import grips
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.assets.objects.decompose import Decomposition
-from services.cli.main import run
-from services.export import benchmark_objects, dexgraspbench
-from services.export.benchmark_hands import BENCHMARK_HANDS, benchmarked, match_hand
-from services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
-from services.export.replay import replay
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import keypoints, link_transforms
+from congrasp.common.hands.mjcf import add_hand
+from congrasp.common.hands.spec import Motor
+from congrasp.services.assets.hands import grips
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.assets.objects.decompose import Decomposition
+from congrasp.services.cli.main import run
+from congrasp.services.export import benchmark_objects, dexgraspbench
+from congrasp.services.export.benchmark_hands import BENCHMARK_HANDS, benchmarked, match_hand
+from congrasp.services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
+from congrasp.services.export.replay import replay
 from tests.docs.test_docs import ROOT
 from tests.episodes import episode
 

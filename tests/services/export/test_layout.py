@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from common.errors import CongraspError
-from common.wire.codec import Message
-from services.export.layout import export_layout
-from services.record.channels import flatten
-from services.record.entries import Converter
-from services.record.reader import read_records
-from services.record.writer import LogWriter
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message
+from congrasp.services.export.layout import export_layout
+from congrasp.services.record.channels import flatten
+from congrasp.services.record.entries import Converter
+from congrasp.services.record.reader import read_records
+from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
 
 

@@ -15,18 +15,18 @@ import trimesh
 from pxr import Usd, UsdGeom, UsdSkel
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.skin import skin_of
-from common.objects.spec import Colours
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.cli.main import main
-from services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
-from services.export.camera import camera_for, pictures
-from services.export.motion_file import GraspMotion, hand_arrays, load_motion, motion_of_episode, save_motion
-from services.record.channels import Entry
-from services.record.entries import Converter
-from services.record.writer import LogWriter
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.objects.spec import Colours
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.cli.main import main
+from congrasp.services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
+from congrasp.services.export.camera import camera_for, pictures
+from congrasp.services.export.motion_file import GraspMotion, hand_arrays, load_motion, motion_of_episode, save_motion
+from congrasp.services.record.channels import Entry
+from congrasp.services.record.entries import Converter
+from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
 
 T = 7

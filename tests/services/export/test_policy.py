@@ -16,23 +16,23 @@ import onnxruntime
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.policy import bundle as bundles
-from common.policy import network
-from common.policy.bundle import PolicyBundle, policy_spec
-from common.policy.normalizer import Statistics
-from common.policy.pretrained import policy_file
-from common.request import GraspRequest
-from common.task import observation
-from common.task.constraints import blocks, goal_of
-from common.task.features import scene_of
-from common.task.sensing import Readings
-from common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
-from services.export import policy as exports
-from services.serve.limits import JointLimits, Limiter
-from services.train.command import untrained
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy import network
+from congrasp.common.policy.bundle import PolicyBundle, policy_spec
+from congrasp.common.policy.normalizer import Statistics
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.request import GraspRequest
+from congrasp.common.task import observation
+from congrasp.common.task.constraints import blocks, goal_of
+from congrasp.common.task.features import scene_of
+from congrasp.common.task.sensing import Readings
+from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
+from congrasp.services.export import policy as exports
+from congrasp.services.serve.limits import JointLimits, Limiter
+from congrasp.services.train.command import untrained
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "examples" / "onnx_grasp.py"
@@ -114,7 +114,7 @@ def pretrained_onnx(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 def test_the_example_grasps_with_onnxruntime_alone(pretrained_onnx: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    absent = "import sys, runpy; sys.modules.update(dict.fromkeys(['jax', 'flax', 'common', 'services', 'actors'])); "
+    absent = "import sys, runpy; sys.modules.update(dict.fromkeys(['jax', 'flax', 'congrasp'])); "
     code = f"{absent}sys.argv[1:] = [{str(pretrained_onnx)!r}]; runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr

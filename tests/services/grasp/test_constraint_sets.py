@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from actors.bank import build_bank
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.outline import outline
-from common.objects import procedural, store
-from common.task import constraint_sets as stored_sets
-from common.task.sampling.headings import Headings, within_reach
-from common.wire.codec import Message
-from services.cli.main import load
-from services.grasp import constraint_sets
-from services.grasp.parse import read_request
+from congrasp.actors.bank import build_bank
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.outline import outline
+from congrasp.common.objects import procedural, store
+from congrasp.common.task import constraint_sets as stored_sets
+from congrasp.common.task.sampling.headings import Headings, within_reach
+from congrasp.common.wire.codec import Message
+from congrasp.services.cli.main import load
+from congrasp.services.grasp import constraint_sets
+from congrasp.services.grasp.parse import read_request
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
@@ -79,7 +79,7 @@ def test_files_come_back_whole_and_others_are_refused(sets, file, tmp_path):
 
 
 def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("services.viz.constraint_sheet._SIZE", (48, 36))
+    monkeypatch.setattr("congrasp.services.viz.constraint_sheet._SIZE", (48, 36))
     picture = tmp_path / "sheet.png"
     assert load("constraints")(["show", str(file), "--png", str(picture)])() == 0
     words = capsys.readouterr().out

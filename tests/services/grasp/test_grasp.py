@@ -9,22 +9,22 @@ import pytest
 import trimesh
 from PIL import Image
 
-from actors.attempts import Outcome
-from actors.protocols import ASSESSED, SURVIVAL
-from actors.rollout import Trace
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from common.policy.pretrained import policy_file
-from common.request import GraspRequest
-from common.rotations import rotate
-from services.assets.objects.named import one_object
-from services.assets.objects.options import ImportOptions
-from services.cli.main import load
-from services.export.motion_file import load_motion, motion_of_episode
-from services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
-from services.grasp.grasper import Grasp, Grasper, costs
-from services.grasp.parse import read_request
-from services.record.reader import read_episodes
+from congrasp.actors.attempts import Outcome
+from congrasp.actors.protocols import ASSESSED, SURVIVAL
+from congrasp.actors.rollout import Trace
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.request import GraspRequest
+from congrasp.common.rotations import rotate
+from congrasp.services.assets.objects.named import one_object
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.cli.main import load
+from congrasp.services.export.motion_file import load_motion, motion_of_episode
+from congrasp.services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
+from congrasp.services.grasp.grasper import Grasp, Grasper, costs
+from congrasp.services.grasp.parse import read_request
+from congrasp.services.record.reader import read_episodes
 from tests.episodes import episode
 
 SIDES = (0.05, 0.06, 0.14)

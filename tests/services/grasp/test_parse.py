@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from services.assets.objects.named import objects_of
-from services.assets.objects.options import ImportOptions
-from services.export.motion_file import motion_of_episode, save_motion
-from services.grasp.parse import read_request
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.services.assets.objects.named import objects_of
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.export.motion_file import motion_of_episode, save_motion
+from congrasp.services.grasp.parse import read_request
 from tests.episodes import HEIGHT, episode
 
 HAND = get_hand("human")

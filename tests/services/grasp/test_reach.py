@@ -7,18 +7,18 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame
-from common.objects import procedural
-from common.rotations import rotate
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.export.motion_file import motion_of_episode
-from services.grasp.files import _steps_to_draw
-from services.grasp.jobs import find_objects, rest_pose
-from services.grasp.parse import grasp_part
-from services.grasp.reach import ACCELERATION, CLEARANCE, SPEED, TURNING, Reach, plan_reach, with_reach
-from services.viz.render import grasp_steps
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.objects import procedural
+from congrasp.common.rotations import rotate
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.export.motion_file import motion_of_episode
+from congrasp.services.grasp.files import _steps_to_draw
+from congrasp.services.grasp.jobs import find_objects, rest_pose
+from congrasp.services.grasp.parse import grasp_part
+from congrasp.services.grasp.reach import ACCELERATION, CLEARANCE, SPEED, TURNING, Reach, plan_reach, with_reach
+from congrasp.services.viz.render import grasp_steps
 from tests.episodes import CONTROL_DT, episode
 
 DT = 0.01
@@ -139,7 +139,7 @@ def test_resting_poses_by_name_and_number() -> None:
 
 
 def test_names_of_a_folder_stand_for_files(tmp_path, monkeypatch) -> None:
-    from common.objects.store import Catalogue
+    from congrasp.common.objects.store import Catalogue
 
     mug = procedural.generate(7, "mug")
     Catalogue(tmp_path / "mine").add(mug)

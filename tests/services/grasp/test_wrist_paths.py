@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from services.grasp.wrist_paths import read_bvh, read_wrist_path
+from congrasp.common.errors import CongraspError
+from congrasp.services.grasp.wrist_paths import read_bvh, read_wrist_path
 
 FRAMES = 12
 T = np.linspace(0, 1, FRAMES)

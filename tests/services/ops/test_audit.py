@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import CongraspError
-from common.journal import AUDIT, Journal
-from services.cli.audit import audit as command
-from services.ops.audit import audit
+from congrasp.common.errors import CongraspError
+from congrasp.common.journal import AUDIT, Journal
+from congrasp.services.cli.audit import audit as command
+from congrasp.services.ops.audit import audit
 
 CONTENT = ["c0", "c1", "c2", "c3", "c4", "c5"]
 

@@ -7,10 +7,10 @@ import subprocess
 
 import pytest
 
-from common.errors import CongraspError
-from common.transport.certificates import find, read
-from common.transport.security import NUMBERS, Credentials, check_exposure, parse_identity, secured
-from services.ops.certificates import certificates, create_authority, issue, revoke
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.certificates import find, read
+from congrasp.common.transport.security import NUMBERS, Credentials, check_exposure, parse_identity, secured
+from congrasp.services.ops.certificates import certificates, create_authority, issue, revoke
 
 
 @pytest.fixture

@@ -13,14 +13,14 @@ import types
 import jax
 import pytest
 
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
-from common.wire.schema import RolloutForm
-from learner.hub import LearnerHub
-from learner.staleness import StalenessManager
-from services.cli.doctor import doctor as command
-from services.ops import doctor
-from services.ops.certificates import create_authority, issue
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.staleness import StalenessManager
+from congrasp.services.cli.doctor import doctor as command
+from congrasp.services.ops import doctor
+from congrasp.services.ops.certificates import create_authority, issue
 
 ALWAYS = ("python", "mujoco", "mujoco-mjx", "jax", "flax", "eclipse-zenoh", "gpu", "ports", "disk", "clock")
 

@@ -14,10 +14,10 @@ import urllib.request
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from common.errors import CongraspError, TransportError
-from common.transport.ports import free_port
-from services.ops.logs import log, logging_as
-from services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.transport.ports import free_port
+from congrasp.services.ops.logs import log, logging_as
+from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
 
 STATUS = {
     "version": 7,
@@ -100,7 +100,7 @@ def test_a_server_counts_answers_and_batches_from_many_threads():
 @contextlib.contextmanager
 def role(*arguments):
     """A role that runs while the block does; what it has said is in the list afterwards. It must end when told to."""
-    command = [sys.executable, "-m", "services.cli.main", *arguments, "--log-format", "json"]
+    command = [sys.executable, "-m", "congrasp", *arguments, "--log-format", "json"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         lines: list[dict] = []
         try:
@@ -129,10 +129,7 @@ def test_a_learner_and_an_actor_are_scraped(tmp_path):
     small = ("--network.hidden", "32", "--environments", "4", "--objects.count", "1", "--objects.families", "box")
     learner = ("learner", "--run-dir", str(tmp_path / "run"), "--listen", endpoint, *small)
     actor = ("actor", "--connect", endpoint, "--run", "quickstart", "--id", "worker", "--physics", "native")
-    with (
-        role(*learner, "--metrics-port", str(ports[0])),
-        role(*actor, "--metrics-port", str(ports[1])) as said,
-    ):
+    with role(*learner, "--metrics-port", str(ports[0])), role(*actor, "--metrics-port", str(ports[1])) as said:
         wanted = {("congrasp_learner_roles", "actor"): 1, ("congrasp_learner_ready",): 1}
         found = scraped_until(ports[0], lambda found: wanted.items() <= found.items())
         assert found["congrasp_learner_ledger_balanced",] == 1
@@ -147,7 +144,7 @@ def test_a_learner_and_an_actor_are_scraped(tmp_path):
 
 
 def test_an_error_is_the_last_line_of_a_log_in_json(tmp_path):
-    command = [sys.executable, "-m", "services.cli.main", "actor", "--connect", "nonsense", "--log-format", "json"]
+    command = [sys.executable, "-m", "congrasp", "actor", "--connect", "nonsense", "--log-format", "json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     line = json.loads(done.stdout)
     assert done.returncode == 2 and done.stderr == "" and line["level"] == "error"

@@ -10,7 +10,7 @@ import pytest
 
 STUCK = """
 import threading
-from services.ops.shutdown import on_signal
+from congrasp.services.ops.shutdown import on_signal
 with on_signal(grace=0.2):
     print("ready", flush=True)
     lock = threading.Lock()
@@ -19,7 +19,7 @@ with on_signal(grace=0.2):
 """
 POLITE = """
 import sys, time
-from services.ops.shutdown import on_signal
+from congrasp.services.ops.shutdown import on_signal
 with on_signal() as stop:
     print("ready", flush=True)
     stop.wait(30)
@@ -31,7 +31,7 @@ sys.exit(stop.exit_code)
 PARENT = """
 import os, subprocess, sys, time
 child = subprocess.Popen(
-    [sys.executable, "-c", "import time; from services.ops.shutdown import follow_parent; follow_parent();"
+    [sys.executable, "-c", "import time; from congrasp.services.ops.shutdown import follow_parent; follow_parent();"
      "print('ready', flush=True); time.sleep(60)"],
     env={**os.environ, "CONGRASP_PARENT": str(os.getpid())}, stdout=subprocess.PIPE, start_new_session=True)
 child.stdout.readline()

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from common.config import RunConfig
-from common.errors import CongraspError, TransportError
-from common.transport.keys import Keys
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
-from common.wire.schema import RolloutForm
-from learner.hub import LearnerHub
-from learner.run_directory import POLICY_FILE, create_run, listening
-from learner.staleness import StalenessManager
-from services.cli.status import status
-from services.cli.view import _of_folder, view
-from services.ops.status import ask, tables, warnings
+from congrasp.common.config import RunConfig
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.hub import LearnerHub
+from congrasp.learner.run_directory import POLICY_FILE, create_run, listening
+from congrasp.learner.staleness import StalenessManager
+from congrasp.services.cli.status import status
+from congrasp.services.cli.view import _of_folder, view
+from congrasp.services.ops.status import ask, tables, warnings
 from tests.rollouts import ACTION, OBSERVATION, SCHEMA, bundle, rollout
 
 
@@ -107,7 +107,7 @@ def test_counters_that_do_not_add_up_are_named(endpoint):
 
 @pytest.mark.timeout(60)
 def test_watching_goes_on_until_it_is_interrupted(endpoint):
-    command = [sys.executable, "-m", "services.cli.main", "status", "--connect", endpoint, "--run", "r"]
+    command = [sys.executable, "-m", "congrasp", "status", "--connect", endpoint, "--run", "r"]
     with subprocess.Popen(
         [*command, "--watch", "--every", "0.1", "--json"], stdout=subprocess.PIPE, text=True
     ) as process:

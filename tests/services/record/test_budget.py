@@ -9,14 +9,14 @@ import sys
 import numpy as np
 import pytest
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.files import hand_text
-from common.transport.keys import Keys
-from common.wire.codec import Message
-from services.record.budget import LogBudget
-from services.record.entries import Converter
-from services.record.live import LiveServer
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_text
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.budget import LogBudget
+from congrasp.services.record.entries import Converter
+from congrasp.services.record.live import LiveServer
 from tests.episodes import episode
 
 pytestmark = pytest.mark.timeout(120)
@@ -49,10 +49,10 @@ def test_ever_new_names_cost_a_bounded_schema_and_the_others_nothing():
 
 RECORDER = """
 import pathlib, resource, sys
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message
-from services.record.recorder import Recorder
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.recorder import Recorder
 
 transport, keys, out = MemoryTransport(MemoryHub()), Keys("r"), pathlib.Path(sys.argv[1])
 with Recorder(transport, "r", out, warn=lambda text: None) as recorder:
@@ -166,7 +166,7 @@ def test_an_actor_cannot_send_its_episodes_far_ahead_of_time():
 
 
 def test_a_live_view_bounds_what_waits(monkeypatch):
-    monkeypatch.setattr("services.record.live._BYTES", 1 << 20)
+    monkeypatch.setattr("congrasp.services.record.live._BYTES", 1 << 20)
     convert = Converter()
     with LiveServer(0) as server:
         entries = convert(KEYS.log("episode", "actor", "1.b"), episode(), 2**62)  # to be sent in a hundred years

@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from common.errors import CongraspError
-from common.wire.codec import Message, encode
-from services.record.channels import CONVENTIONS, Entry, JsonChannels, opaque_channel
-from services.record.reader import is_complete, log_files, read_episodes, read_metrics, read_records
-from services.record.writer import LogWriter
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message, encode
+from congrasp.services.record.channels import CONVENTIONS, Entry, JsonChannels, opaque_channel
+from congrasp.services.record.reader import is_complete, log_files, read_episodes, read_metrics, read_records
+from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
 
 SECOND = 10**9
@@ -126,8 +126,8 @@ def test_episodes_come_back_as_they_were_sent(tmp_path: pathlib.Path) -> None:
 
 KILLED = """
 import pathlib, sys, time
-from services.record.channels import JsonChannels
-from services.record.writer import LogWriter
+from congrasp.services.record.channels import JsonChannels
+from congrasp.services.record.writer import LogWriter
 writer, channels = LogWriter(pathlib.Path(sys.argv[1]), "log"), JsonChannels()
 for i in range(10_000):
     writer.write(channels.entry("/metrics/learner/0", i, {"update": i, "values": {"kl": 0.1}}))

@@ -10,13 +10,13 @@ import time
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from common.errors import CongraspError
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message
-from services.record.channels import JsonChannels
-from services.record.live import LiveServer
-from services.record.recorder import Recorder
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.channels import JsonChannels
+from congrasp.services.record.live import LiveServer
+from congrasp.services.record.recorder import Recorder
 from tests.episodes import CONTROL_DT, episode
 
 MESSAGE_DATA = 1  # operation code of a binary frame with a message

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.export.motion_file import load_motion, motion_of_episode, save_motion
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from tests.episodes import CONTROL_DT, episode
 
 

@@ -14,16 +14,23 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from common.hands import get_hand
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
-from common.wire.codec import Message
-from services.record.channels import Entry
-from services.record.reader import is_complete, log_files, read_episodes, read_metrics, read_records, read_rollouts
-from services.record.recorder import Recorder
-from services.record.writer import LogWriter
+from congrasp.common.hands import get_hand
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.channels import Entry
+from congrasp.services.record.reader import (
+    is_complete,
+    log_files,
+    read_episodes,
+    read_metrics,
+    read_records,
+    read_rollouts,
+)
+from congrasp.services.record.recorder import Recorder
+from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
 
 KEYS = Keys("r")
@@ -156,7 +163,7 @@ def test_files_rotate_while_recording(transport: MemoryTransport, tmp_path: path
 
 
 def start_recorder(endpoint: str, out: pathlib.Path, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "services.cli.main", "record", "--connect", endpoint, "--run", "r"]
+    command = [sys.executable, "-m", "congrasp", "record", "--connect", endpoint, "--run", "r"]
     return subprocess.Popen(
         [*command, "--out", str(out), *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -16,19 +16,19 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands import get_hand, kinematics
-from common.hands.skin import skin_of
-from common.hands.spec import link_origin
-from common.wire.codec import Message, decode
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.record.channels import Entry
-from services.record.entries import Converter
-from services.record.goals import active_blocks, active_constraints
-from services.record.palette import FLESH
-from services.record.scene import SPACING
-from services.record.surface import surface_parts
-from services.record.writer import LogWriter
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand, kinematics
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.hands.spec import link_origin
+from congrasp.common.wire.codec import Message, decode
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.record.channels import Entry
+from congrasp.services.record.entries import Converter
+from congrasp.services.record.goals import active_blocks, active_constraints
+from congrasp.services.record.palette import FLESH
+from congrasp.services.record.scene import SPACING
+from congrasp.services.record.surface import surface_parts
+from congrasp.services.record.writer import LogWriter
 from tests.episodes import CONTROL_DT, FORCE, episode, older
 
 HAND = get_hand("human")

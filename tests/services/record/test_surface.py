@@ -8,13 +8,13 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.skin import Skin, skin_of
-from services.assets.hands.kinematics import mujoco_link_poses
-from services.record import surface
-from services.record.palette import FLESH, JOINT, SKIN
-from services.record.surface import surface_parts, surface_points
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.skin import Skin, skin_of
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.record import surface
+from congrasp.services.record.palette import FLESH, JOINT, SKIN
+from congrasp.services.record.surface import surface_parts, surface_points
 
 
 def _posed(name: str, share: float) -> tuple[np.ndarray, np.ndarray, Skin]:

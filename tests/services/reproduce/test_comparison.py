@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.evaluate.paper import TABLES, paper_lines, paper_row
-from services.evaluate.scores import Row
-from services.reproduce.comparison import SUCCESS, compare, unmatched
-from services.reproduce.evaluation import Result
-from services.reproduce.latex import escape, latex
-from services.reproduce.layout import not_comparable, tables
-from services.reproduce.page import summary
-from services.reproduce.plan import Part, Policy, parts, policies
+from congrasp.services.evaluate.paper import TABLES, paper_lines, paper_row
+from congrasp.services.evaluate.scores import Row
+from congrasp.services.reproduce.comparison import SUCCESS, compare, unmatched
+from congrasp.services.reproduce.evaluation import Result
+from congrasp.services.reproduce.latex import escape, latex
+from congrasp.services.reproduce.layout import not_comparable, tables
+from congrasp.services.reproduce.page import summary
+from congrasp.services.reproduce.plan import Part, Policy, parts, policies
 from tests.rows import row
 
 HANDS = ("human", "allegro", "sharpa")

@@ -5,15 +5,15 @@ import json
 
 import pytest
 
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
-from common.policy import bundle as bundles
-from services.cli.main import load
-from services.evaluate.lineup import read_entrant
-from services.reproduce import evaluation, run
-from services.reproduce.evaluation import Numbers, Result
-from services.reproduce.plan import Policy
-from services.train.command import untrained
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
+from congrasp.services.cli.main import load
+from congrasp.services.evaluate.lineup import read_entrant
+from congrasp.services.reproduce import evaluation, run
+from congrasp.services.reproduce.evaluation import Numbers, Result
+from congrasp.services.reproduce.plan import Policy
+from congrasp.services.train.command import untrained
 from tests.pages import Reader
 from tests.rows import row
 
@@ -114,7 +114,7 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, 
     ],
 )
 def test_bad_input_is_refused_before_anything_begins(policy, tmp_path, monkeypatch, arguments, words):
-    monkeypatch.setattr("services.train.processes.accelerators", lambda: ("cpu", 1))
+    monkeypatch.setattr("congrasp.services.train.processes.accelerators", lambda: ("cpu", 1))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(CongraspError, match=words):
         load("reproduce")([text.format(policy=policy) for text in arguments])()

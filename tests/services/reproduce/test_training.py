@@ -7,12 +7,12 @@ import time
 
 import pytest
 
-from services.cli import main
-from services.reproduce import training
-from services.reproduce.plan import Policy
-from services.train import unattended
-from services.train.presets import get_preset
-from services.train.processes import Child
+from congrasp.services.cli import main
+from congrasp.services.reproduce import training
+from congrasp.services.reproduce.plan import Policy
+from congrasp.services.train import unattended
+from congrasp.services.train.presets import get_preset
+from congrasp.services.train.processes import Child
 
 OURS, GRAPSXL, PHASES = (Policy("human", method) for method in ("ours", "graspxl", "two-phase"))
 FINISHES = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'policy.safetensors').touch()"

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import CongraspError, LateError, OverloadedError
-from services.serve.batching import Batcher, Parts
+from congrasp.common.errors import CongraspError, LateError, OverloadedError
+from congrasp.services.serve.batching import Batcher, Parts
 
 
 class Gate:
@@ -90,7 +90,7 @@ def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
 @pytest.fixture
 def several(monkeypatch):
     """However long ago another peer has asked, it counts."""
-    monkeypatch.setattr("services.serve.batching._ALONE", 1e6)
+    monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6)
 
 
 class Letters(Gate):

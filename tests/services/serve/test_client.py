@@ -5,16 +5,16 @@ import time
 import numpy as np
 import pytest
 
-from common.config import TaskConfig
-from common.errors import RefusedError, TransportError
-from common.hands import get_hand
-from common.request import GraspRequest
-from common.transport.keys import Keys, below
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
-from common.wire.codec import Message
-from services.serve.client import PolicyClient
-from services.serve.requests import PACKED, Layout
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import RefusedError, TransportError
+from congrasp.common.hands import get_hand
+from congrasp.common.request import GraspRequest
+from congrasp.common.transport.keys import Keys, below
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.wire.codec import Message
+from congrasp.services.serve.client import PolicyClient
+from congrasp.services.serve.requests import PACKED, Layout
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 REQUEST = GraspRequest(

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import CongraspError, RefusedError, TransportError
-from common.request import GraspRequest
-from services.serve.guard import Guard
-from services.serve.limits import JointLimits
-from services.serve.policy import Answer
-from services.serve.ticker import Ticker
+from congrasp.common.errors import CongraspError, RefusedError, TransportError
+from congrasp.common.request import GraspRequest
+from congrasp.services.serve.guard import Guard
+from congrasp.services.serve.limits import JointLimits
+from congrasp.services.serve.policy import Answer
+from congrasp.services.serve.ticker import Ticker
 
 FINGERS = 2
 OPEN = np.array([0.3, -0.3])

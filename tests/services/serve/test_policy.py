@@ -5,19 +5,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from common.config import NetworkConfig, RunConfig, TaskConfig
-from common.errors import CongraspError, ContradictionError, RefusedError, UnknownConstraintError
-from common.policy import bundle as bundles
-from common.request import GraspRequest
-from common.transport import urls
-from common.transport.ports import free_port
-from services.serve.client import PolicyClient
-from services.serve.episode import EpisodePolicy
-from services.serve.load import example_episode
-from services.serve.local import LocalPolicy, load_policy
-from services.serve.policy import Policy
-from services.serve.server import PolicyServer, follow_file
-from services.train.command import untrained
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError, ContradictionError, RefusedError, UnknownConstraintError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.request import GraspRequest
+from congrasp.common.transport import urls
+from congrasp.common.transport.ports import free_port
+from congrasp.services.serve.client import PolicyClient
+from congrasp.services.serve.episode import EpisodePolicy
+from congrasp.services.serve.load import example_episode
+from congrasp.services.serve.local import LocalPolicy, load_policy
+from congrasp.services.serve.policy import Policy
+from congrasp.services.serve.server import PolicyServer, follow_file
+from congrasp.services.train.command import untrained
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.files import hand_text
-from common.task.constraints import PAPER
-from common.wire.codec import Message
-from services.serve.requests import Layout
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_text
+from congrasp.common.task.constraints import PAPER
+from congrasp.common.wire.codec import Message
+from congrasp.services.serve.requests import Layout
 
 HAND = get_hand("human")
 LAYOUT = Layout(HAND, TaskConfig(constraints=PAPER, surface_points=8, trajectory_points=3))

@@ -9,12 +9,12 @@ import psutil
 import pytest
 
 import congrasp
-from common.config import NetworkConfig
-from common.hands import get_hand
-from common.policy import bundle as bundles
-from services.serve.load import wait_until_ready
-from services.train.command import untrained
-from services.train.presets import get_preset
+from congrasp.common.config import NetworkConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.policy import bundle as bundles
+from congrasp.services.serve.load import wait_until_ready
+from congrasp.services.train.command import untrained
+from congrasp.services.train.presets import get_preset
 
 EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "robot_loop.py"
 SECONDS = 120.0

@@ -17,10 +17,10 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import congrasp
-from common.hands import get_hand
-from common.objects import procedural
-from common.transport.ports import free_port
-from services.serve.policy import Answer
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.transport.ports import free_port
+from congrasp.services.serve.policy import Answer
 
 EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "ros2_node.py"
 STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -12,8 +12,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from common.config import NetworkConfig
-from common.errors import (
+from congrasp.common.config import NetworkConfig
+from congrasp.common.errors import (
     CongraspError,
     ContradictionError,
     OverloadedError,
@@ -21,21 +21,21 @@ from common.errors import (
     TransportError,
     UnknownConstraintError,
 )
-from common.policy import bundle as bundles
-from common.request import GraspRequest
-from common.transport.keys import Keys, below
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.transport.ports import free_port
-from common.transport.zenoh_transport import ZenohTransport
-from common.wire.codec import Message
-from services.ops.metrics import ServerMetrics, exposed
-from services.serve.client import PolicyClient
-from services.serve.inference import Inference, PolicyFunction
-from services.serve.load import example_episode
-from services.serve.requests import Query
-from services.serve.server import DEPTH, PolicyServer, follow_file, follow_run
-from services.train.command import untrained
-from services.train.presets import get_preset
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.request import GraspRequest
+from congrasp.common.transport.keys import Keys, below
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.wire.codec import Message
+from congrasp.services.ops.metrics import ServerMetrics, exposed
+from congrasp.services.serve.client import PolicyClient
+from congrasp.services.serve.inference import Inference, PolicyFunction
+from congrasp.services.serve.load import example_episode
+from congrasp.services.serve.requests import Query
+from congrasp.services.serve.server import DEPTH, PolicyServer, follow_file, follow_run
+from congrasp.services.train.command import untrained
+from congrasp.services.train.presets import get_preset
 from tests.services.ops.test_metrics import scrape
 
 pytestmark = pytest.mark.timeout(300)
@@ -145,7 +145,7 @@ def test_constraints_that_contradict_each_other_are_refused_alone(served):
 
 def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(served, monkeypatch):
     path, endpoint, episode = served
-    monkeypatch.setattr("services.serve.server._FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
     policy = untrained(CONFIG)
     swapped = threading.Event()
 
@@ -177,7 +177,7 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
 def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(served, beside_others, monkeypatch):
     """Beside other clients the eleven are inferred in two parts."""
     _, endpoint, episode = served
-    monkeypatch.setattr("services.serve.batching._ALONE", 1e6 if beside_others else 0.0)
+    monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6 if beside_others else 0.0)
     if beside_others:
         with PolicyClient(endpoint, timeout=5.0) as other:
             other.reset(episode.request)

@@ -7,12 +7,20 @@ import types
 import pytest
 from rich.console import Console
 
-from common.config import NetworkConfig, ObjectsConfig, RunConfig, TaskConfig
-from common.errors import CongraspError
-from services.ops.certificates import create_authority, issue
-from services.train import command
-from services.train.command import EPISODE, PRETRAINED, _check_connections, _compare, _minutes, _next_steps, _Progress
-from services.train.presets import get_preset
+from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig, TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.services.ops.certificates import create_authority, issue
+from congrasp.services.train import command
+from congrasp.services.train.command import (
+    EPISODE,
+    PRETRAINED,
+    _check_connections,
+    _compare,
+    _minutes,
+    _next_steps,
+    _Progress,
+)
+from congrasp.services.train.presets import get_preset
 
 CONFIG = RunConfig(updates=10, environments=4, rollout_steps=5)  # 40 steps an update
 
@@ -102,7 +110,7 @@ def test_the_comparison_claims_no_more_than_the_noise_allows(said, after, verdic
 
 
 def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, tmp_path):
-    from services.cli.main import COMMANDS
+    from congrasp.services.cli.main import COMMANDS
 
     (tmp_path / EPISODE).touch()
     _next_steps(tmp_path)

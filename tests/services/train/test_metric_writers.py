@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
-from common.config import MetricWriter, RunConfig
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message
-from services.record.reader import read_metrics
-from services.train import metric_writers
-from services.train.metric_writers import recorded
+from congrasp.common.config import MetricWriter, RunConfig
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.reader import read_metrics
+from congrasp.services.train import metric_writers
+from congrasp.services.train.metric_writers import recorded
 from tests.episodes import episode
 
 

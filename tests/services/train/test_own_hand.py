@@ -11,19 +11,19 @@ import time
 
 import pytest
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.files import hand_text
-from common.policy import bundle as bundles
-from common.policy.pretrained import own_policy_file, policy_file
-from learner.run_directory import CHECKPOINTS, CONFIG_FILE, open_run
-from services.assets.hands.check import Finding, write_findings
-from services.assets.hands.model_files import import_hand
-from services.cli import main
-from services.train import own_hand
-from services.train.command import untrained
-from services.train.own_hand import CHECK, HAND, REPORT, Request, train_hand
-from services.train.presets import get_preset
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_text
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import own_policy_file, policy_file
+from congrasp.learner.run_directory import CHECKPOINTS, CONFIG_FILE, open_run
+from congrasp.services.assets.hands.check import Finding, write_findings
+from congrasp.services.assets.hands.model_files import import_hand
+from congrasp.services.cli import main
+from congrasp.services.train import own_hand
+from congrasp.services.train.command import untrained
+from congrasp.services.train.own_hand import CHECK, HAND, REPORT, Request, train_hand
+from congrasp.services.train.presets import get_preset
 
 CLAW = pathlib.Path(__file__).parents[2] / "hands" / "claw.urdf"
 TINY = (
@@ -142,7 +142,7 @@ def test_a_policy_of_more_experience_stays(stages, hand, tmp_path):
 
 def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
     ran, _ = stages
-    monkeypatch.setattr("services.train.processes.accelerators", lambda: ("cpu", 1))
+    monkeypatch.setattr("congrasp.services.train.processes.accelerators", lambda: ("cpu", 1))
     (tmp_path / "hands" / "claw.json").unlink()
     command = ["hands", "train", str(CLAW), "--out", str(tmp_path / "out"), "--training=--updates 3"]
     assert main.run(command) == 0
@@ -168,7 +168,7 @@ def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(hand,
     (out / HAND).write_text(hand_text(hand))
     write_findings(out / CHECK, GOOD)
     run_dir = out / "short"
-    command = [sys.executable, "-m", "services.cli.main", "hands", "train", "claw", "--out", str(out)]
+    command = [sys.executable, "-m", "congrasp", "hands", "train", "claw", "--out", str(out)]
     process = subprocess.Popen(
         [*command, f"--training={TINY.format(10_000)}"], stdout=subprocess.PIPE, start_new_session=True, env=os.environ
     )

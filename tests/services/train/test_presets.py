@@ -5,14 +5,14 @@ import pathlib
 
 import pytest
 
-from common.config import run_config_from_json, to_json
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.files import hand_text
-from common.objects import procedural
-from services.assets.hands.model_files import import_hand
-from services.cli.train import defaults
-from services.train.presets import PRESETS, easier, get_preset, with_hand
+from congrasp.common.config import run_config_from_json, to_json
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_text
+from congrasp.common.objects import procedural
+from congrasp.services.assets.hands.model_files import import_hand
+from congrasp.services.cli.train import defaults
+from congrasp.services.train.presets import PRESETS, easier, get_preset, with_hand
 
 CLAW = pathlib.Path(__file__).parents[2] / "hands" / "claw.urdf"
 

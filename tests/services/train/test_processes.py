@@ -7,10 +7,10 @@ import threading
 
 import pytest
 
-from common.errors import CongraspError
-from common.transport.memory import MemoryHub, MemoryTransport
-from services.train import processes
-from services.train.processes import Child
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.services.train import processes
+from congrasp.services.train.processes import Child
 
 WAITS = "import time; time.sleep(60)"
 

@@ -4,10 +4,10 @@ import dataclasses
 
 import pytest
 
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame
-from common.hands.measures import fitting_scale, tip_forces
-from services.train.recipe import Rules, recipe, rules
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.measures import fitting_scale, tip_forces
+from congrasp.services.train.recipe import Rules, recipe, rules
 
 RULES = {
     # By hand: k = s^2 5/G is 1, 1.96 x 5/4 = 2.45 and 1.21.

@@ -3,8 +3,8 @@
 import pathlib
 import threading
 
-from common.config import RunConfig
-from services.train import warmup
+from congrasp.common.config import RunConfig
+from congrasp.services.train import warmup
 
 
 def test_it_ends_with_the_first_update_and_leaves_no_run_behind(monkeypatch):

@@ -6,13 +6,13 @@ import pathlib
 import numpy as np
 import pytest
 
-from actors.env import metric_names
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.task.constraints import CONSTRAINTS
-from services.cli.plot import plot
-from services.evaluate.plots import cells, plot_evaluation
-from services.evaluate.scores import Sample, summarise, write_json
+from congrasp.actors.env import metric_names
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.services.cli.plot import plot
+from congrasp.services.evaluate.plots import cells, plot_evaluation
+from congrasp.services.evaluate.scores import Sample, summarise, write_json
 
 TASK = TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))
 METRICS = metric_names(TASK)

@@ -8,15 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.task.constraints import CONSTRAINTS
-from common.task.metrics import episode_fields
-from services.cli.plot import plot
-from services.record.channels import JsonChannels, nest
-from services.record.writer import LogWriter
-from services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth
-from services.viz.titles import titled
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.metrics import episode_fields
+from congrasp.services.cli.plot import plot
+from congrasp.services.record.channels import JsonChannels, nest
+from congrasp.services.record.writer import LogWriter
+from congrasp.services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth
+from congrasp.services.viz.titles import titled
 
 METRICS = {
     "episode/return": 3.0,

@@ -13,18 +13,18 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.skin import skin_of
-from common.wire.codec import encode
-from services.cli.main import load
-from services.record.channels import Entry, opaque_channel
-from services.record.palette import FLESH, OBJECT
-from services.record.reader import pick_episode
-from services.record.writer import LogWriter
-from services.viz.hand_sheets import hand_sheet
-from services.viz.raster import render_scene, visible
-from services.viz.render import (
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.wire.codec import encode
+from congrasp.services.cli.main import load
+from congrasp.services.record.channels import Entry, opaque_channel
+from congrasp.services.record.palette import FLESH, OBJECT
+from congrasp.services.record.reader import pick_episode
+from congrasp.services.record.writer import LogWriter
+from congrasp.services.viz.hand_sheets import hand_sheet
+from congrasp.services.viz.raster import render_scene, visible
+from congrasp.services.viz.render import (
     OBJECT_AVOID,
     TOUCHING,
     best_camera,
@@ -36,10 +36,10 @@ from services.viz.render import (
     render_episode_frames,
     thumb_camera,
 )
-from services.viz.scene import Camera, Shape, between
-from services.viz.shapes import arrow, beads, fit
-from services.viz.sheets import contact_sheet, save_png, save_video
-from services.viz.triangles import cut, smooth_corners
+from congrasp.services.viz.scene import Camera, Shape, between
+from congrasp.services.viz.shapes import arrow, beads, fit
+from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
+from congrasp.services.viz.triangles import cut, smooth_corners
 from tests.cluster import ROOT
 from tests.episodes import CONTROL_DT, episode, older
 
@@ -303,7 +303,9 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
 
 
 def test_pictures_need_no_folder_that_can_be_written() -> None:
-    script = "from services.viz import kernels; import numpy as np; print(kernels.averaged(np.ones((2, 2, 3)), 2))"
+    script = (
+        "import numpy as np; from congrasp.services.viz import kernels; print(kernels.averaged(np.ones((2, 2, 3)), 2))"
+    )
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": "/proc/nowhere"}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120)
     assert done.stdout.split() == ["[[[255", "255", "255]]]"], done.stderr

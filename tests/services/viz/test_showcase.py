@@ -3,8 +3,8 @@
 import numpy as np
 from PIL import Image
 
-from services.evaluate import showcase as module
-from services.evaluate.showcase import showcase
+from congrasp.services.evaluate import showcase as module
+from congrasp.services.evaluate.showcase import showcase
 from tests.episodes import episode
 
 

@@ -2,9 +2,9 @@ import json
 
 import pytest
 
-from common.task.constraint_sets import load as load_set
-from services.assets.captures.build import Report
-from services.cli.main import load
+from congrasp.common.task.constraint_sets import load as load_set
+from congrasp.services.assets.captures.build import Report
+from congrasp.services.cli.main import load
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -7,12 +7,12 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
-from common.hands.human import HUMAN
-from common.hands.mano import MANO_FINGERS
-from services.assets.captures.fit import joint_positions
-from services.assets.captures.mano import TO_HUMAN
-from services.assets.captures.separate import separated
-from services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.mano import MANO_FINGERS
+from congrasp.services.assets.captures.fit import joint_positions
+from congrasp.services.assets.captures.mano import TO_HUMAN
+from congrasp.services.assets.captures.separate import separated
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 
 FRAMES, GRASP = 90, 60
 """Frames of a sequence, and the one in which the fingers have closed."""

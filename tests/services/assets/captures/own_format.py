@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from common.hands.mano import ManoModel
-from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped, Sequence, read_or_drop
+from congrasp.common.hands.mano import ManoModel
+from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.assets.captures.sequence import Dropped, Sequence, read_or_drop
 
 HOLDS = "*.capture.npz"
 

@@ -5,8 +5,8 @@ import pathlib
 import numpy as np
 import pytest
 
-from services.assets.captures.extract import _before_carried
-from services.assets.captures.sequence import Sequence
+from congrasp.services.assets.captures.extract import _before_carried
+from congrasp.services.assets.captures.sequence import Sequence
 
 
 def motion(wrist, lift, present=None):

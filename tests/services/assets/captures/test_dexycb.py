@@ -5,8 +5,8 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from services.assets.captures.dexycb import OBJECTS
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.captures.dexycb import OBJECTS
 from tests.mano_file import content, mano_pickle, skeleton
 from tests.services.assets.captures import known
 

@@ -4,9 +4,9 @@ import pathlib
 
 import numpy as np
 
-from common.wire.codec import Message
-from services.assets.captures.build import Report, _from_below
-from services.cli.constraints import _print_report
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.captures.build import Report, _from_below
+from congrasp.services.cli.constraints import _print_report
 
 
 def test_from_below_is_what_only_the_direction_of_the_approach_excludes():

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from services.assets.captures.mano import MEAN_WRIST
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.captures.mano import MEAN_WRIST
 from tests.mano_file import content, mano_pickle, skeleton
 from tests.services.assets.captures import known
 

@@ -4,9 +4,9 @@ import threading
 
 import trimesh
 
-from common.errors import CongraspError
-from services.assets.captures.objects import import_meshes
-from services.assets.objects import meshes
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.captures.objects import import_meshes
+from congrasp.services.assets.objects import meshes
 
 
 def test_meshes_are_imported_side_by_side(tmp_path, monkeypatch):

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.objects.store import Catalogue
-from common.task.constraint_sets import bank_of, load_for
-from services.assets.captures.myohand import wrist_pose
+from congrasp.common.objects.store import Catalogue
+from congrasp.common.task.constraint_sets import bank_of, load_for
+from congrasp.services.assets.captures.myohand import wrist_pose
 from tests.services.assets.captures import known
 
 # MyoHand's arm on its table (Apache-2.0, MyoHub), from the base to the lunate.

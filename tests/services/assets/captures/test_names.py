@@ -4,11 +4,11 @@ import pathlib
 
 import pytest
 
-from common.errors import CongraspError
-from services.assets.captures.dexycb import _betas, _yaml
-from services.assets.captures.grab import _template
-from services.assets.captures.objects import Meshes
-from services.assets.captures.sequence import Dropped
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.captures.dexycb import _betas, _yaml
+from congrasp.services.assets.captures.grab import _template
+from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.assets.captures.sequence import Dropped
 
 
 def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folders(tmp_path):

@@ -13,9 +13,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from common.errors import CongraspError
-from services.assets.captures.oakink import read
-from services.assets.captures.objects import Meshes
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.captures.oakink import read
+from congrasp.services.assets.captures.objects import Meshes
 from tests.services.assets.captures import known
 
 STAMP = "2021-09-26-19-59-58"

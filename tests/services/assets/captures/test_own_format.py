@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from common.errors import CongraspError
-from services.assets.captures import IMPORTERS
-from services.assets.captures.fit import joint_positions
-from services.cli.main import load
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.captures import IMPORTERS
+from congrasp.services.assets.captures.fit import joint_positions
+from congrasp.services.cli.main import load
 from tests.services.assets.captures import known
 
 

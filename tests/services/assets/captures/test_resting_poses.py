@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 
-from common import rotations
-from common.hands.human import HUMAN
-from common.hands.kinematics import capsules, grasp_frame, link_transforms
-from services.assets.captures.build import _resting_poses
+from congrasp.common import rotations
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
+from congrasp.services.assets.captures.build import _resting_poses
 
 
 def test_the_hand_is_not_in_the_table_or_as_little_as_can_be():

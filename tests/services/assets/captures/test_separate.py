@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from common.hands import get_hand
-from common.hands.human import HUMAN
-from common.hands.kinematics import link_transforms
-from common.hands.motors import coupled
-from common.hands.spec import Capsule, Coupling, Hand, Joint, Link
-from common.task.plausibility import hand_hand
-from services.assets.captures.separate import DEEPEST, deepest, separated
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.kinematics import link_transforms
+from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.spec import Capsule, Coupling, Hand, Joint, Link
+from congrasp.common.task.plausibility import hand_hand
+from congrasp.services.assets.captures.separate import DEEPEST, deepest, separated
 
 ASIDE, LONG, RADIUS = 0.02, 0.05, 0.005
 

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from actors.bank import HEADINGS
-from common.hands import get_hand
-from common.hands.human import HUMAN
-from common.hands.kinematics import grasp_frame, keypoints, link_transforms
-from common.task.constraint_sets import bank_of
-from services.assets.captures.fit import joint_positions
-from services.grasp.constraint_sets import describe
+from congrasp.actors.bank import HEADINGS
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
+from congrasp.common.task.constraint_sets import bank_of
+from congrasp.services.assets.captures.fit import joint_positions
+from congrasp.services.grasp.constraint_sets import describe
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write
 

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from services.assets.hands.actuators import Drive, servos
+from congrasp.services.assets.hands.actuators import Drive, servos
 
 _FINGER = """
 <mujoco>

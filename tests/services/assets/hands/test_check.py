@@ -8,14 +8,14 @@ import re
 import numpy as np
 import pytest
 
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.files import faults, hand_text
-from services.assets.hands import check, servos
-from services.assets.hands.check import check_hand
-from services.assets.hands.model_files import import_hand
-from services.cli import main
-from services.train.recipe import recipe
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import faults, hand_text
+from congrasp.services.assets.hands import check, servos
+from congrasp.services.assets.hands.check import check_hand
+from congrasp.services.assets.hands.model_files import import_hand
+from congrasp.services.cli import main
+from congrasp.services.train.recipe import recipe
 
 CLAW = import_hand(pathlib.Path(__file__).parents[3] / "hands" / "claw.urdf").hand
 HANDS = {"claw": CLAW, **{name: get_hand(name) for name in ("human", "allegro", "sharpa")}}

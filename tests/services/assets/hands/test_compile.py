@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from common.errors import CongraspError
-from services.assets.hands import compile as compiling
-from services.assets.hands.compile import compiled_model
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.hands import compile as compiling
+from congrasp.services.assets.hands.compile import compiled_model
 
 HANDS = pathlib.Path(__file__).parents[3] / "hands"
 _GEOM = '<body><geom size="0.1"/></body>'

@@ -9,27 +9,27 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from actors.physics.mjx import MjxPhysics
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import VARIABLE, get_hand
-from common.hands.files import hand_from_text, hand_text
-from common.hands.kinematics import grasp_frame, link_transforms
-from common.hands.meshes import MAX_FACES, load_meshes
-from common.hands.mjcf import add_hand
-from common.hands.skin import skin_of, skin_of_meshes
-from common.hands.spec import chain_of
-from common.objects.distance import distance_field
-from common.objects.plain import plain_object
-from common.objects.spec import Piece
-from common.task import plausibility
-from services.assets.hands.model_files import Choices, describe, import_hand
-from services.assets.hands.visual import save_meshes
-from services.cli import main
-from services.export.frames import skin_of_motion
-from services.export.motion_file import hand_arrays, motion_of_episode
-from services.viz.hand_sheets import hands_sheet
-from services.viz.shapes import posed_hand
+from congrasp.actors.physics.mjx import MjxPhysics
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import VARIABLE, get_hand
+from congrasp.common.hands.files import hand_from_text, hand_text
+from congrasp.common.hands.kinematics import grasp_frame, link_transforms
+from congrasp.common.hands.meshes import MAX_FACES, load_meshes
+from congrasp.common.hands.mjcf import add_hand
+from congrasp.common.hands.skin import skin_of, skin_of_meshes
+from congrasp.common.hands.spec import chain_of
+from congrasp.common.objects.distance import distance_field
+from congrasp.common.objects.plain import plain_object
+from congrasp.common.objects.spec import Piece
+from congrasp.common.task import plausibility
+from congrasp.services.assets.hands.model_files import Choices, describe, import_hand
+from congrasp.services.assets.hands.visual import save_meshes
+from congrasp.services.cli import main
+from congrasp.services.export.frames import skin_of_motion
+from congrasp.services.export.motion_file import hand_arrays, motion_of_episode
+from congrasp.services.viz.hand_sheets import hands_sheet
+from congrasp.services.viz.shapes import posed_hand
 from tests.episodes import episode
 
 HANDS = pathlib.Path(__file__).parents[3] / "hands"

@@ -6,17 +6,17 @@ import pathlib
 import numpy as np
 import pytest
 
-from common.config import TaskConfig, run_config_from_json, to_json
-from common.errors import CongraspError
-from common.hands import VARIABLE, get_hand
-from common.hands.files import hand_from_text, hand_text, read_hand
-from common.hands.kinematics import grasp_frame
-from common.hands.mjcf import add_hand
-from common.policy.bundle import policy_spec
-from services.assets.hands.model_files import Choices, describe, import_hand
-from services.cli import main
-from services.train.presets import get_preset, with_hand
-from services.viz.hand_sheets import hands_sheet, joints_sheet
+from congrasp.common.config import TaskConfig, run_config_from_json, to_json
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import VARIABLE, get_hand
+from congrasp.common.hands.files import hand_from_text, hand_text, read_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.mjcf import add_hand
+from congrasp.common.policy.bundle import policy_spec
+from congrasp.services.assets.hands.model_files import Choices, describe, import_hand
+from congrasp.services.cli import main
+from congrasp.services.train.presets import get_preset, with_hand
+from congrasp.services.viz.hand_sheets import hands_sheet, joints_sheet
 
 HANDS = pathlib.Path(__file__).parents[3] / "hands"
 ENDS = {"left_root": -0.96, "left_middle": -1.28, "opposing_root": 0.96, "opposing_middle": 1.28}

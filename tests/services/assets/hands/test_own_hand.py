@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from actors.physics.scene import scene_spec
-from common.config import TaskConfig
-from common.hands import HANDS, VARIABLE, get_hand
-from common.hands.kinematics import grasp_frame
+from congrasp.actors.physics.scene import scene_spec
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import HANDS, VARIABLE, get_hand
+from congrasp.common.hands.kinematics import grasp_frame
 
 
 def link(name, parent, joints, start, end, tip=None):

@@ -19,9 +19,9 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from common.hands.kinematics import grasp_frame, keypoints, link_transforms
-from common.hands.spec import chain_of
-from services.assets.hands.model_files import Proposal, import_hand
+from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
+from congrasp.common.hands.spec import chain_of
+from congrasp.services.assets.hands.model_files import Proposal, import_hand
 
 VARIABLE = "CONGRASP_TEST_HANDS"
 SHADOW = "gymnasium_robotics/envs/assets/hand/reach.xml"

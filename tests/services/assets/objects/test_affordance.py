@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from common.errors import CongraspError
-from common.objects import store
-from services.assets.objects.affordance import in_half_space, on_part_mesh, painted, two_parts
-from services.assets.objects.named import objects_of
-from services.assets.objects.options import ImportOptions
-from services.cli.main import load
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import store
+from congrasp.services.assets.objects.affordance import in_half_space, on_part_mesh, painted, two_parts
+from congrasp.services.assets.objects.named import objects_of
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.cli.main import load
 
 EDGES, SHIFT = np.array([0.05, 0.05, 0.12]), np.array([0.01, 0.02, 0.06])
 

@@ -8,20 +8,20 @@ import pytest
 import trimesh
 from PIL import Image
 
-from actors.episode import _geometry
-from common.errors import CongraspError
-from common.objects import store
-from common.objects.spec import COLOUR_POINTS, Colours
-from common.wire.codec import Message
-from services.assets.objects.colours import sample_colours
-from services.assets.objects.meshes import import_source
-from services.assets.objects.options import ImportOptions
-from services.assets.objects.sources import find_sources
-from services.export.motion_file import load_motion, motion_of_episode, save_motion
-from services.record.scene import check_episode
-from services.viz.raster import render_scene
-from services.viz.render import _object
-from services.viz.scene import Camera
+from congrasp.actors.episode import _geometry
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import store
+from congrasp.common.objects.spec import COLOUR_POINTS, Colours
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.objects.colours import sample_colours
+from congrasp.services.assets.objects.meshes import import_source
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sources import find_sources
+from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
+from congrasp.services.record.scene import check_episode
+from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.render import _object
+from congrasp.services.viz.scene import Camera
 from tests.episodes import episode
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.assets.objects.fidelity import Fidelity, fidelity
+from congrasp.services.assets.objects.fidelity import Fidelity, fidelity
 
 SIDES = np.array([0.04, 0.06, 0.08])
 

@@ -9,8 +9,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import CongraspError
-from services.assets.objects.sources import read_mesh
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.objects.sources import read_mesh
 from tests.limits import limited
 
 _PLY = (

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from common.errors import CongraspError
-from common.objects import shapes
-from common.objects.resting import settle
-from common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES
-from common.objects.store import digest
-from services.assets.objects import decompose, meshes
-from services.assets.objects.named import objects_of
-from services.assets.objects.options import ImportOptions
-from services.assets.objects.sources import find_sources
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import shapes
+from congrasp.common.objects.resting import settle
+from congrasp.common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES
+from congrasp.common.objects.store import digest
+from congrasp.services.assets.objects import decompose, meshes
+from congrasp.services.assets.objects.named import objects_of
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sources import find_sources
 
 SIDES = np.array([0.04, 0.06, 0.08])
 

@@ -4,10 +4,10 @@ import pathlib
 
 import pytest
 
-from common.errors import CongraspError
-from common.objects.procedural import generate
-from common.objects.store import digest
-from services.assets.objects.named import find_object, objects_at
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.procedural import generate
+from congrasp.common.objects.store import digest
+from congrasp.services.assets.objects.named import find_object, objects_at
 
 
 def test_a_family_and_a_seed_name_an_object_wherever_paths_do():

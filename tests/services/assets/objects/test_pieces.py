@@ -3,9 +3,9 @@
 import numpy as np
 import trimesh
 
-from common.objects import shapes
-from common.objects.spec import MAX_MESH_VERTICES
-from services.assets.objects import pieces
+from congrasp.common.objects import shapes
+from congrasp.common.objects.spec import MAX_MESH_VERTICES
+from congrasp.services.assets.objects import pieces
 
 
 def block(sides, center):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from common.errors import CongraspError
-from services.assets.objects import repair
-from services.assets.objects.meshes import import_source
-from services.assets.objects.options import ImportOptions
-from services.assets.objects.repair import closed, largest_body, reduced
-from services.assets.objects.sources import find_sources
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.objects import repair
+from congrasp.services.assets.objects.meshes import import_source
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.repair import closed, largest_body, reduced
+from congrasp.services.assets.objects.sources import find_sources
 
 RADIUS = 0.03
 

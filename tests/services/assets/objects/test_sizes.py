@@ -5,9 +5,9 @@ import pathlib
 import pytest
 import trimesh
 
-from common.errors import CongraspError
-from services.assets.objects.sizes import METRES, guessed_unit, metres_per_unit, sizes_by_unit
-from services.viz.studio.app import MeshImporter
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.objects.sizes import METRES, guessed_unit, metres_per_unit, sizes_by_unit
+from congrasp.services.viz.studio.app import MeshImporter
 
 
 @pytest.mark.parametrize(

@@ -14,13 +14,13 @@ import numpy as np
 import trimesh
 from playwright.sync_api import sync_playwright
 
-from common.objects import procedural
-from common.objects.spec import GraspObject
-from common.request import GraspRequest
-from common.wire.codec import Message
-from services.viz.studio.catalogue import Catalogue
-from services.viz.studio.server import PageServer
-from services.viz.studio.session import Session
+from congrasp.common.objects import procedural
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.request import GraspRequest
+from congrasp.common.wire.codec import Message
+from congrasp.services.viz.studio.catalogue import Catalogue
+from congrasp.services.viz.studio.server import PageServer
+from congrasp.services.viz.studio.session import Session
 from tests.services.viz.studio.conftest import BROWSERS, SIZE
 from tests.studio import MadeUpGrasping, MadeUpImporter
 

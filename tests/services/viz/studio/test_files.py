@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from common.errors import CongraspError
-from common.request import GraspRequest
-from services.viz.studio.diagnosis import why_nothing_held
-from services.viz.studio.files import drawing
+from congrasp.common.errors import CongraspError
+from congrasp.common.request import GraspRequest
+from congrasp.services.viz.studio.diagnosis import why_nothing_held
+from congrasp.services.viz.studio.files import drawing
 from tests.episodes import episode
 
 VIEW = {"position": [0.5, -0.6, 0.4], "target": [0.0, 0.0, 0.06], "field_of_view": 32.0}

@@ -6,15 +6,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from actors.attempts import Outcome
-from actors.protocols import ASSESSED
-from common.errors import CongraspError, TransportError
-from common.policy import bundle as bundles
-from common.policy.bundle import PolicyBundle
-from common.policy.pretrained import policy_file
-from services.viz.studio import grasping
-from services.viz.studio.grasping import ATTEMPTS, PolicyGrasping
-from services.viz.studio.state import Studio
+from congrasp.actors.attempts import Outcome
+from congrasp.actors.protocols import ASSESSED
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.services.viz.studio import grasping
+from congrasp.services.viz.studio.grasping import ATTEMPTS, PolicyGrasping
+from congrasp.services.viz.studio.state import Studio
 from tests.studio import objects
 
 SHIPPED = bundles.load(policy_file(None))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from common.task.constraints import get_constraint
-from common.wire.codec import Message, decode, encode
-from services.viz.studio.lanes import for_page, lanes
+from congrasp.common.task.constraints import get_constraint
+from congrasp.common.wire.codec import Message, decode, encode
+from congrasp.services.viz.studio.lanes import for_page, lanes
 from tests.episodes import episode, older
 
 STEPS, REMOVAL = 30, 18

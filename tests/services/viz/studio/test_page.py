@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from common.config import TaskConfig
-from common.transport.keys import Keys
-from services.export.motion_file import load_motion
-from services.record.reader import read_episodes
-from services.viz.studio.recordings import Recordings
-from services.viz.studio.server import PageServer
-from services.viz.studio.session import Session
-from services.viz.studio.training import TrainingWindow
+from congrasp.common.config import TaskConfig
+from congrasp.common.transport.keys import Keys
+from congrasp.services.export.motion_file import load_motion
+from congrasp.services.record.reader import read_episodes
+from congrasp.services.viz.studio.recordings import Recordings
+from congrasp.services.viz.studio.server import PageServer
+from congrasp.services.viz.studio.session import Session
+from congrasp.services.viz.studio.training import TrainingWindow
 from tests import studio as made_up
 from tests.episodes import older
 from tests.studio import BEGIN, DIP

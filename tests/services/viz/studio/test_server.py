@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from common.errors import CongraspError
-from common.wire.codec import decode
-from services.cli.main import main
-from services.export.motion_file import load_motion
-from services.record.reader import read_episodes
-from services.viz.studio import files
-from services.viz.studio.catalogue import Uploads
-from services.viz.studio.server import PageServer
-from services.viz.studio.session import Session
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import decode
+from congrasp.services.cli.main import main
+from congrasp.services.export.motion_file import load_motion
+from congrasp.services.record.reader import read_episodes
+from congrasp.services.viz.studio import files
+from congrasp.services.viz.studio.catalogue import Uploads
+from congrasp.services.viz.studio.server import PageServer
+from congrasp.services.viz.studio.session import Session
 from tests import studio as made_up
 
 

@@ -5,17 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from common.config import TaskConfig
-from common.errors import CongraspError
-from common.hands import get_hand
-from common.hands.kinematics import grasp_frame
-from common.objects import procedural
-from common.objects.shapes import matrix
-from common.task.constraints import PAPER
-from common.task.sampling.headings import BACK_OFF, INWARD
-from services.viz.studio.description import describe
-from services.viz.studio.history import ACTIONS, History
-from services.viz.studio.state import Studio
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.objects import procedural
+from congrasp.common.objects.shapes import matrix
+from congrasp.common.task.constraints import PAPER
+from congrasp.common.task.sampling.headings import BACK_OFF, INWARD
+from congrasp.services.viz.studio.description import describe
+from congrasp.services.viz.studio.history import ACTIONS, History
+from congrasp.services.viz.studio.state import Studio
 
 MUG = procedural.generate(1, "mug")
 

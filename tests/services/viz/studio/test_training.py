@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from mcap.writer import MCAP0_MAGIC
 
-from common.errors import CongraspError
-from common.transport.keys import Keys
-from common.transport.memory import MemoryHub, MemoryTransport
-from common.wire.codec import Message
-from services.record.recorder import Recorder
-from services.viz.studio.recordings import MOST, Recordings
-from services.viz.studio.training import FIRST, Curve, Follower, TrainingWindow, labels_of
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.recorder import Recorder
+from congrasp.services.viz.studio.recordings import MOST, Recordings
+from congrasp.services.viz.studio.training import FIRST, Curve, Follower, TrainingWindow, labels_of
 from tests import studio as made_up
 from tests.studio import BEGIN, DIP
 

@@ -1,0 +1,97 @@
+"""Dexterous grasps under constraints: what a program of one's own imports.
+
+    import congrasp
+
+    found = congrasp.grasp("mug.obj", heading="0 0 -1", fingers="thumb index")   # a motion for an object
+    congrasp.save_motion("mug.npz", found.motion)
+
+    with congrasp.PolicyClient("tcp/127.0.0.1:7457") as policy:                  # or congrasp.load_policy()
+        policy.reset(congrasp.GraspRequest(...))
+        answer = policy.act(state)
+
+Names are imported when they are first used: the client and its errors need numpy and zenoh alone.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from congrasp.common.errors import (
+        CongraspError,
+        ContradictionError,
+        LateError,
+        OverloadedError,
+        PhysicsError,
+        RefusedError,
+        TransportError,
+        UnknownConstraintError,
+    )
+    from congrasp.common.request import GraspRequest
+    from congrasp.services.assets.objects.options import ImportOptions
+    from congrasp.services.export.motion_file import GraspMotion, load_motion, save_motion
+    from congrasp.services.grasp.grasper import Grasp, Grasper, grasp
+    from congrasp.services.serve.client import PolicyClient
+    from congrasp.services.serve.guard import Command, Guard
+    from congrasp.services.serve.limits import JointLimits
+    from congrasp.services.serve.local import load_policy
+    from congrasp.services.serve.policy import Answer, Policy
+    from congrasp.services.serve.ticker import Ticker
+
+__all__ = [
+    "Answer",
+    "Command",
+    "CongraspError",
+    "ContradictionError",
+    "Grasp",
+    "GraspMotion",
+    "GraspRequest",
+    "Grasper",
+    "Guard",
+    "ImportOptions",
+    "JointLimits",
+    "LateError",
+    "OverloadedError",
+    "PhysicsError",
+    "Policy",
+    "PolicyClient",
+    "RefusedError",
+    "Ticker",
+    "TransportError",
+    "UnknownConstraintError",
+    "grasp",
+    "load_motion",
+    "load_policy",
+    "save_motion",
+]
+
+_MODULES = {
+    "Answer": "congrasp.services.serve.policy",
+    "Command": "congrasp.services.serve.guard",
+    "Grasp": "congrasp.services.grasp.grasper",
+    "GraspMotion": "congrasp.services.export.motion_file",
+    "GraspRequest": "congrasp.common.request",
+    "Grasper": "congrasp.services.grasp.grasper",
+    "Guard": "congrasp.services.serve.guard",
+    "ImportOptions": "congrasp.services.assets.objects.options",
+    "JointLimits": "congrasp.services.serve.limits",
+    "Policy": "congrasp.services.serve.policy",
+    "PolicyClient": "congrasp.services.serve.client",
+    "Ticker": "congrasp.services.serve.ticker",
+    "grasp": "congrasp.services.grasp.grasper",
+    "load_motion": "congrasp.services.export.motion_file",
+    "load_policy": "congrasp.services.serve.local",
+    "save_motion": "congrasp.services.export.motion_file",
+}
+"""Where each name is defined; the others are errors."""
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported (PEP 562)."""
+    if name not in __all__:
+        raise AttributeError(f"module 'congrasp' has no attribute '{name}'")
+    globals()[name] = found = getattr(importlib.import_module(_MODULES.get(name, "congrasp.common.errors")), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

@@ -1,0 +1,5 @@
+"""Runs the command line: `python -m congrasp`."""
+
+from congrasp.services.cli.main import main
+
+main()
