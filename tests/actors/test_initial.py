@@ -78,7 +78,8 @@ def _sampler(task: TaskConfig) -> Callable:
 def _begun(surface: Surface, asked: Goal, constraints: dict[str, np.ndarray]) -> tuple[Goal, jax.Array]:
     """The goal after the priority rules, and the fingers at the start."""
     goal = resolve(HAND, surface, asked, constraints).goal
-    return goal, initial_hand(HAND, TASK, goal, jnp.tile(jnp.array([0, 0, 0.1, 1.0, 0, 0, 0]), (4, 1)))[0]
+    rest = jnp.tile(jnp.array([0, 0, 0.1, 1.0, 0, 0, 0]), (4, 1))
+    return goal, initial_hand(HAND, TASK, goal, surface, rest)[0]
 
 
 @functools.cache

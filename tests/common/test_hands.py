@@ -216,8 +216,13 @@ def test_scaled_objects_keep_their_density():
     for a, b in zip(larger.pieces, obj.pieces, strict=True):
         np.testing.assert_allclose([*a.size, *a.pos], 1.4 * np.array([*b.size, *b.pos]))
     hand = get_hand("allegro")
-    assert scale_objects(hand, TaskConfig(), [obj])[0].mass == larger.mass
-    assert scale_objects(hand, TaskConfig(object_scale=1.0), [obj])[0] is obj
+    literal = TaskConfig(constant_mass=False)
+    assert scale_objects(hand, literal, [obj])[0].mass == larger.mass
+    assert scale_objects(hand, dataclasses.replace(literal, object_scale=1.0), [obj])[0] is obj
+    household = scale_objects(hand, TaskConfig(), [obj])[0]
+    assert household.mass == pytest.approx(obj.mass)
+    np.testing.assert_allclose(household.inertia, 1.4**2 * obj.inertia)
+    np.testing.assert_allclose(household.points, larger.points)
 
 
 def test_a_hand_that_does_not_exist_is_one_line_with_those_that_do():
