@@ -1,8 +1,8 @@
 """Figures of record: the files of `docs/results`, and the tables that pages show of them.
 
-`congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m congrasp.services.evaluate.results` writes each
-table between `<!-- results NAME KIND -->` and `<!-- end of results -->` in the README and in `docs`; KIND is one of
-`KINDS`.
+`congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m congrasp.services.evaluate.results` writes
+each table between `<!-- results NAME KIND -->` and `<!-- end of results -->` in the README and in `docs`. KIND is one
+of `KINDS`.
 """
 
 import dataclasses
