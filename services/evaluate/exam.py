@@ -1,4 +1,4 @@
-"""Procedural objects of an exam: those that figures are made with, and those that development may look at."""
+"""Procedural objects of the two exams: one for published figures, one for development."""
 
 import zlib
 from typing import Literal
@@ -11,7 +11,7 @@ from congrasp.common.objects.spec import GraspObject
 
 Exam = Literal["figures", "development"]
 FAMILIES = tuple(sorted(procedural.FAMILIES, key=lambda family: zlib.crc32(family.encode())))
-"""All families, which take turns among an exam's objects, mixed so that a few objects are of all kinds of families."""
+"""All families, which take turns among an exam's objects, in an order that mixes basic and household ones."""
 POOL = len(procedural.FAMILIES)
 """Objects of an exam's rows where no number is given: one of each family."""
 _SEEDS: dict[Exam, int] = {"figures": FIGURES_SEED, "development": HELD_OUT_SEED}

@@ -1,4 +1,4 @@
-"""Effect of the rules for headings: how many the paper's sampling gives, and how many of these a hand may follow."""
+"""Effect of the rules for headings: shares of the sampled headings that are kept, dropped and moved."""
 
 import dataclasses
 from collections.abc import Sequence

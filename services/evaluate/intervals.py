@@ -24,7 +24,7 @@ def wilson(rate: float, count: float) -> tuple[float, float]:
 
 
 def independent_episodes(outcomes: np.ndarray, clusters: np.ndarray) -> float:
-    """Number of independent episodes that tell as much of a rate as these clustered ones.
+    """Number of independent episodes with the same variance of the rate as these clustered ones.
 
     It is the number of episodes over the design effect (Kish, Survey Sampling, 1965): the cluster-robust variance of
     the rate, G / (G - 1) sum_g (sum_{i in g} (y_i - p))^2 / n^2, over p (1 - p) / n. The design effect is at least 1.

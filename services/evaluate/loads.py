@@ -1,6 +1,6 @@
-"""Levels of load: masses and frictions at which a policy's episodes are repeated, one's own and those of peers.
+"""Levels of load: masses and frictions, such as those of other projects, at which the same episodes are evaluated.
 
-The same episodes are evaluated at every level, under the heading constraint. A mass scales the inertia with it.
+All levels have the heading constraint. The inertia is scaled with the mass.
 """
 
 import dataclasses

@@ -67,7 +67,7 @@ def test_conditions_name_the_policy_the_machine_and_the_command():
         assert part in text
 
 
-@pytest.mark.parametrize("marks", ["human nothing", "nobody rates"])
+@pytest.mark.parametrize("marks", ["human nothing", "unknown rates"])
 def test_a_mark_without_results_is_an_error(marks):
     with pytest.raises(CongraspError, match="does not exist"):
         filled(f"<!-- results {marks} -->\n<!-- end of results -->", RESULTS)
