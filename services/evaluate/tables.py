@@ -118,7 +118,7 @@ def evaluate_tables(
             names, left_out = evaluator.allowed(names)
             advance = track("Episodes", len(names) * setup.episodes)
             rows = evaluator.rows(names, setup.episodes, advance, keep=keep)
-        if "single" in wanted and "heading" in names and not setup.bank and policy.task.headings == "all":
+        if "single" in wanted and "heading" in names and setup.bank is None and policy.task.headings == "all":
             advance = track("Episodes with other rules for headings", setup.episodes)
             by_center, rules = evaluator.row_by_center(setup.episodes, advance)
             rows.insert(names.index("heading") + 1, by_center)
