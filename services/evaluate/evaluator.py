@@ -5,6 +5,7 @@ import functools
 import itertools
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -38,6 +39,14 @@ _KEPT = 8
 """Episodes of a row that can be looked at afterwards: so many that hold the object to the end, and so many others."""
 MEASURED = 512
 """Objects beyond which their surfaces' distance fields are left out, and plausibility with them."""
+
+
+class _Level(NamedTuple):
+    """One of several changes of the same episodes."""
+
+    change: Callable[[InitialConditions], InitialConditions]
+    objects: Sequence[GraspObject] = ()
+    """In place of the evaluator's, if there are any."""
 
 
 class Evaluator:
@@ -191,40 +200,39 @@ class Evaluator:
         """A row for each of `services.evaluate.sensing.LEVELS`; see `_rows_at`."""
         task = sensing.sensing_task(self.task)
         levels = {
-            level.label: functools.partial(sensing.at_level, level=level, control_dt=task.control_dt)
+            level.label: _Level(functools.partial(sensing.at_level, level=level, control_dt=task.control_dt))
             for level in sensing.LEVELS
         }
         return self._rows_at(sensing.CONSTRAINT, levels, episodes, progress, task)
 
     def rows_under_loads(self, levels: Sequence[Load], progress: Callable[[int], None], episodes: int) -> list[Row]:
         """A row for each load; see `_rows_at`."""
-        masses = [obj.mass for obj in self.objects]
-        changes = {load.label: functools.partial(loads.at_load, load=load, masses=masses) for load in levels}
-        return self._rows_at(loads.CONSTRAINT, changes, episodes, progress, self.task)
+        found = {
+            load.label: _Level(functools.partial(loads.at_load, load=load), loads.loaded(self.objects, load))
+            for load in levels
+        }
+        return self._rows_at(loads.CONSTRAINT, found, episodes, progress, self.task)
 
     def _rows_at(
         self,
         constraint: str,
-        levels: Mapping[str, Callable[[InitialConditions], InitialConditions]],
+        levels: Mapping[str, _Level],
         episodes: int,
         progress: Callable[[int], None],
         task: TaskConfig,
     ) -> list[Row]:
-        """A row for each level of something that changes how the same episodes begin.
+        """A row of a constraint for each level, by its label; all of them begin with the same episodes.
 
-        Args:
-          constraint: of the rows.
-          levels: label of each level, and its change of the episodes.
-          episodes: for each row, at least.
-          progress: receives the number of finished episodes of all rows.
-          task: of the episodes.
+        `episodes` is the least number of each row, and `progress` receives the number of finished ones of all rows.
         """
         rows: list[Row] = []
         plan, bank = self.plan(constraint, episodes), self.bank_for(constraint)
         with self._episodes(episodes, task=task) as running:
-            for label, change in levels.items():
+            for label, level in levels.items():
+                if level.objects:
+                    running.replace_objects(level.objects, self._field)
                 drawn = batches(self._hand, task, bank, plan, self._seed, running.batch)
-                conditions = ((change(begun), count) for begun, count in drawn)
+                conditions = ((level.change(begun), count) for begun, count in drawn)
                 advance = functools.partial(lambda done, n: progress(done + n), sum(row.episodes for row in rows))
                 rows.append(self.row(constraint, simulate(running, conditions, plan.total, advance), label))
         return rows

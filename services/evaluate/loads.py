@@ -1,6 +1,8 @@
 """Levels of load: masses and frictions, such as those of other projects, at which the same episodes are evaluated.
 
-All levels have the heading constraint. The inertia is scaled with the mass.
+All levels have the heading constraint. The inertia is scaled with the mass. Objects are replaced instead of scaling the
+mass of an episode: engines derive the softness of contacts from the mass that a scene is compiled with, and diverge far
+from it.
 """
 
 import dataclasses
@@ -10,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from congrasp.actors.initial import InitialConditions
+from congrasp.common.objects.spec import GraspObject
 from congrasp.services.evaluate.episodes import identity
 
 CONSTRAINT = "heading"
@@ -18,7 +21,7 @@ CONSTRAINT = "heading"
 
 @dataclasses.dataclass(frozen=True)
 class Load:
-    """Mass and friction of an episode's object, each uniform in a range; by default those of the evaluation."""
+    """Mass of an object and friction of an episode, each uniform in a range; by default those of the evaluation."""
 
     label: str
     mass: tuple[float, float] | None = None
@@ -52,25 +55,22 @@ def payload(scale: float, *, constant_mass: bool) -> tuple[Load, ...]:
     return found if scale == 1.0 else (*found, literal)
 
 
-def at_load(conditions: InitialConditions, load: Load, masses: Sequence[float]) -> InitialConditions:
-    """Episodes at a load. An episode's place in its ranges follows from the episode alone.
-
-    Args:
-      conditions: B episodes.
-      load: the load.
-      masses: (N,) kg, of the objects.
-    """
-    start, episodes = conditions.reset_state, identity(conditions)
-    scale, friction = np.asarray(start.mass_scale) * load.factor, np.asarray(start.friction)
-    if load.mass:
-        scale = _within(load.mass, episodes, b"mass") / np.asarray(masses)[np.asarray(start.object_index)]
-    if load.friction:
-        friction = _within(load.friction, episodes, b"friction")
-    changed = {"mass_scale": scale.astype(np.float32), "friction": friction.astype(np.float32)}
-    return conditions._replace(reset_state=start._replace(**changed))
+def loaded(objects: Sequence[GraspObject], load: Load) -> list[GraspObject]:
+    """The objects with their masses at a load; the place of a mass in its range follows from the object's name."""
+    found = []
+    for obj in objects:
+        mass = load.factor * obj.mass
+        if load.mass:
+            mass = load.mass[0] + (load.mass[1] - load.mass[0]) * zlib.crc32(obj.name.encode()) / 2**32
+        found.append(dataclasses.replace(obj, mass=mass, inertia=obj.inertia * mass / obj.mass))
+    return found
 
 
-def _within(limits: tuple[float, float], episodes: np.ndarray, name: bytes) -> np.ndarray:
-    """(B,) places in a range, uniform over the identities of episodes (B,) uint32."""
-    share = np.array([zlib.crc32(name + episode.tobytes()) for episode in episodes]) / 2**32
-    return limits[0] + (limits[1] - limits[0]) * share
+def at_load(conditions: InitialConditions, load: Load) -> InitialConditions:
+    """Episodes with their frictions at a load; the place of a friction in its range follows from the episode alone."""
+    if not load.friction:
+        return conditions
+    low, high = load.friction
+    share = np.array([zlib.crc32(episode.tobytes()) for episode in identity(conditions)]) / 2**32
+    friction = (low + (high - low) * share).astype(np.float32)
+    return conditions._replace(reset_state=conditions.reset_state._replace(friction=friction))

@@ -68,7 +68,7 @@ def test_the_exam_has_a_row_of_the_hands_centre_alone_and_rows_of_loads(evaluato
     assert 0 < rules.kept < rules.kept_by_center < 1
     light, heavy = evaluator.rows_under_loads([Load("light", mass=(0.1, 0.1)), Load("heavy", mass=(2, 2))], print, 3)
     assert (light.group, light.mass_kg, heavy.mass_kg) == ("light", pytest.approx(0.1), pytest.approx(2.0))
-    assert light.constraint == "heading" and light.paper is None
+    assert light.constraint == "heading" and light.paper is None and heavy.diverged == 0
 
 
 def test_a_row_is_the_same_alone_and_among_others(evaluator):

@@ -15,7 +15,7 @@ from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED
 from congrasp.services.evaluate import exam
 from congrasp.services.evaluate.episodes import identity, reference
 from congrasp.services.evaluate.heading_rules import HeadingRules, heading_rules
-from congrasp.services.evaluate.loads import MASSES, PEERS, Load, at_load, payload
+from congrasp.services.evaluate.loads import MASSES, PEERS, Load, at_load, loaded, payload
 from tests import draws
 
 HAND, TASK = get_hand("human"), TaskConfig(surface_points=64, p_force=0.5)
@@ -71,21 +71,22 @@ def test_the_rules_are_said_in_one_sentence_each():
     assert "centre" not in HeadingRules(kept=0.24, from_below=0.45, no_room=0.31, moved=0.4).sentence("human")
 
 
-def test_a_load_sets_mass_and_friction_of_the_same_episodes(conditions):
-    masses = np.array([0.1, 0.4])
-    objects = conditions.reset_state.object_index
-    heavy = at_load(conditions, Load("2 kg", mass=(2.0, 2.0)), masses).reset_state
-    np.testing.assert_allclose(heavy.mass_scale * masses[objects], 2.0, rtol=1e-6)
-    np.testing.assert_array_equal(heavy.friction, conditions.reset_state.friction)
-    dexsuite = at_load(conditions, PEERS[1], masses).reset_state
-    drawn = dexsuite.mass_scale * masses[objects]
-    assert 0.04 <= drawn.min() < 0.15 and 0.4 < drawn.max() <= 0.5
+def test_a_load_sets_the_mass_of_objects_and_the_friction_of_the_same_episodes(conditions):
+    for obj, heavy in zip(OBJECTS, loaded(OBJECTS, Load("2 kg", mass=(2.0, 2.0))), strict=True):
+        assert heavy.mass == 2.0 and heavy.name == obj.name
+        np.testing.assert_allclose(heavy.inertia * obj.mass, 2.0 * obj.inertia)
+    for obj, half in zip(OBJECTS, loaded(OBJECTS, Load("half", factor=0.5)), strict=True):
+        assert half.mass == pytest.approx(obj.mass / 2)
+    many = [dataclasses.replace(OBJECTS[0], name=f"box_{i}") for i in range(64)]
+    masses = np.array([obj.mass for obj in loaded(many, PEERS[1])])
+    assert 0.04 <= masses.min() < 0.1 and 0.44 < masses.max() <= 0.5 and 0.2 < masses.mean() < 0.34
+    dexsuite = at_load(conditions, PEERS[1]).reset_state
     assert 0.5 <= dexsuite.friction.min() < 0.6 and 0.9 < dexsuite.friction.max() <= 1.0
     np.testing.assert_array_equal(dexsuite.q, conditions.reset_state.q)
-    assert abs(np.corrcoef(drawn, dexsuite.friction)[0, 1]) < 0.4, "mass and friction are drawn apart"
-    # An episode's load does not depend on the others.
+    assert at_load(conditions, Load("2 kg", mass=(2.0, 2.0))) is conditions
+    # An episode's friction does not depend on the others.
     last = jax.tree.map(lambda leaf: leaf[-1:], conditions)
-    assert at_load(last, PEERS[1], masses).reset_state.mass_scale[0] == dexsuite.mass_scale[-1]
+    assert at_load(last, PEERS[1]).reset_state.friction[0] == dexsuite.friction[-1]
 
 
 @pytest.mark.parametrize("constant_mass", [True, False])
