@@ -31,6 +31,7 @@ lint: install
 	$(VENV)/bin/mypy
 
 docs: install
+	$(VENV)/bin/python -m congrasp.services.evaluate.results
 	$(VENV)/bin/python -m sphinx -W --keep-going docs build/docs
 
 bench:

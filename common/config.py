@@ -164,8 +164,9 @@ class TaskConfig(_Shares):
     """K, waypoints of a wrist trajectory."""
     constraints: tuple[str, ...] = OURS
     """Constraints that the policy knows: what it observes, and can be asked for."""
-    headings: Literal["all", "above"] = "all"
-    """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier)."""
+    headings: Literal["all", "above", "center"] = "all"
+    """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier); `center`
+    keeps headings at which the hand's centre alone is above the table (harder: a row of the exam)."""
     own_references: bool = True
     """Half of an object's reference poses and trajectories are remade from the policy's own grasps as it learns; the
     others, or all without, stay those that closing the hand around the objects gave."""

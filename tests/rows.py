@@ -1,17 +1,38 @@
-"""Rows of an evaluation that nobody made, for what shows and compares them."""
+"""Rows of an evaluation that no evaluation made, for what shows and compares them."""
 
 from congrasp.services.evaluate.paper import paper_row
 from congrasp.services.evaluate.scores import ERRORS, Row
 
 FORCES = {f"{name}_{of}": 1.0 for name in ("link_force", "force_sum", "torque_share") for of in ("mean", "p95")}
-FORCES |= dict.fromkeys(("force_peak_n", "force_mean_n"), 1.0)
+FORCES |= {"force_peak_n": 1.0, "force_mean_n": 1.0}
 
 
 def row(constraint, success, low, high, *, hand="human", method="ours", group="", errors=None, margins=None, source=""):
     """A row of 100 episodes on 8 objects."""
-    means = {name: 0.0 for names in ERRORS.values() for name in names.values()} | (errors or {})
-    paper = paper_row(source, hand, method, constraint, group)
     return Row(
-        constraint, hand, method, group, 100, 8, 8, success, low, high, None, None, None, means, FORCES, 0.0, 5.0, 0.0,
-        paper, margins=margins or {},
-    )  # fmt: skip
+        constraint=constraint,
+        hand=hand,
+        method=method,
+        group=group,
+        episodes=100,
+        covered=8,
+        pool=8,
+        distinct=100,
+        independent=100.0,
+        mass_kg=0.2,
+        success=success,
+        success_low=low,
+        success_high=high,
+        success_all=success,
+        held_2s=None,
+        held_2s_low=None,
+        held_2s_high=None,
+        held_all=None,
+        errors={name: 0.0 for names in ERRORS.values() for name in names.values()} | (errors or {}),
+        forces=FORCES,
+        episode_return=0.0,
+        links_at_removal=5.0,
+        diverged=0.0,
+        paper=paper_row(source, hand, method, constraint, group),
+        margins=margins or {},
+    )

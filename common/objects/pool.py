@@ -11,7 +11,9 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.store import Catalogue
 
 HELD_OUT_SEED = 1_000_000
-"""Seeds from here upward are never trained on."""
+"""Seeds from here upward are never trained on; those below `FIGURES_SEED` are for development."""
+FIGURES_SEED = 2_000_000
+"""Seeds from here upward are for figures alone: nothing is tuned on their objects."""
 
 
 def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:

@@ -19,13 +19,17 @@ if TYPE_CHECKING:
     from congrasp.services.evaluate.lineup import Entrant, Lineup
     from congrasp.services.evaluate.tables import Found
 
-Table = Literal["single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "all"]
+Table = Literal[
+    "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
+]
+Exam = Literal["figures", "development"]
 _PICTURED = 4
 
 
 def evaluate(
     policy: tuple[str, ...] = (),
     table: tuple[Table, ...] = ("single",),
+    exam: Exam = "figures",
     objects: pathlib.Path | None = None,
     constraints: pathlib.Path | None = None,
     split: Split = "all",
@@ -44,10 +48,11 @@ def evaluate(
     """Evaluate policies by the paper's protocol, beside the paper's figures.
 
     An episode has 50 control steps with the table and 2 s without it. Success is counted after the paper's 25 steps
-    without the table, and again after the 2 s (held). Rates come with 95 % Wilson intervals; errors and forces are
-    those of successful episodes in the paper's window of 25 steps. The policy acts by its mean. Every object has the
-    same number of episodes in a row, which is the same whatever other rows are asked for. Reference poses and
-    trajectories are grasps of a reference policy, which never had any; the last fifth of each object's 20 is evaluated.
+    without the table, and again after the 2 s (held). Rates come with 95 % intervals whose clusters are objects
+    (captured sequences); 'of all objects' counts uncovered objects as failures. Errors and forces are those of
+    successful episodes in the paper's window of 25 steps. The policy acts by its mean. Every object has the same number
+    of episodes in a row, which is the same whatever other rows are requested. Reference poses and trajectories are
+    grasps of a reference policy, which never had any; the last fifth of each object's 20 is evaluated.
 
     Args:
       policy: Policy files (policy.safetensors of a run), as FILE or METHOD=FILE, or folders of runs; by default a
@@ -57,17 +62,20 @@ def evaluate(
         and what it is without one of its parts, where --policy names policies of them; objects: the heading alone on
         any number of objects, by size, mass and family; noise: poses and trajectories with errors, as captured ones
         have; sensing: the heading alone with a tracker's object poses, by their noise, delay, rate and losses, by
-        friction and by errors of gains, a student beside the pretrained policy; all: every table of one policy.
-        Several may be named.
-      objects: Objects to grasp: a folder as 'congrasp objects import' takes it, or one that it made. By default
-        procedural objects of seeds that training never uses.
+        friction and by errors of gains, a student beside the pretrained policy; payload: the heading alone by the
+        objects' mass, from 0.05 to 2 kg; peers: the heading alone at the masses and frictions of RobustDexGrasp and of
+        Isaac Lab's dexsuite; all: every table of one policy. Several may be named.
+      exam: Procedural objects of all families: figures has seeds from 2,000,000, to be used for figures alone;
+        development has seeds from 1,000,000. Training uses neither.
+      objects: Objects to grasp instead: a folder as 'congrasp objects import' takes it, or one that it made.
       constraints: Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import'; its
         references are used instead of the reference policy's. Objects without a set are left out.
       split: Of these sets all constraints, the 80 % for training, or those that are held out. Objects without a heading
         among them are left out, and rows of poses and trajectories are of the objects that have one among them.
       episodes: Episodes in each row; of the table 'objects', episodes in all.
       physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
-      pool: Number of procedural objects; 0 takes 64, and for the table 'objects' one an episode, at most 50,000.
+      pool: Number of procedural objects; 0 takes one of each family, and for the table 'objects' one an episode, at
+        most 50,000.
       batch: Worlds that run side by side; 0 chooses by the engine.
       seed: Seed of constraints and episodes.
       json: Also write the rows to this file.
@@ -96,7 +104,7 @@ def evaluate(
     lineup = line_up(table, read_entrants(policy, method), hand, method)
     engine = resolve_physics(physics)
     settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
-    setup = Setup(episodes, pool=pool, folder=objects, **settings)
+    setup = Setup(episodes, exam=exam, pool=pool, folder=objects, **settings)
     pools = json and json.with_name(f"{json.name}.pools")
     without: list[str] = []
     with tracked() as track:
@@ -113,16 +121,19 @@ def evaluate(
         for one, tables in lineup.entrants:
             own = dataclasses.replace(setup, keep=pools and pools / f"{one.hand}-{one.method}")
             results.append(evaluate_tables(one.policy, tables, own, track, keep=pictures is not None))
-    _show(
-        results,
-        lineup,
-        f"{_who(lineup)}, on {_source(lineup, objects)}, {engine_title(engine)}, friction {friction:g}",
-        by,
-    )
+    source = _source(lineup, objects, exam)
+    _show(results, lineup, f"{_who(lineup)}, on {source}, {engine_title(engine)}, friction {friction:g}", by)
     if without:
         print(f"Left out: objects without a constraint set, or a heading in it ({split}): {', '.join(without)}.")
     if json and pools:
-        about = _about(lineup, objects, constraints, split) | settings
+        about = {
+            **_about(lineup, results),
+            "objects": source,
+            "exam": None if objects else exam,
+            "constraints": str(constraints) if constraints else None,
+            "split": split if constraints else None,
+            **settings,
+        }
         write_json([row for found in results for row in found.rows], json, about)
         shutil.rmtree(pools, ignore_errors=True)
     if pictures is not None:
@@ -161,11 +172,11 @@ def _who(lineup: "Lineup") -> str:
     return f"method {one.method}, {what}" if get_method(one.method).learns else f"method {one.method}"
 
 
-def _source(lineup: "Lineup", objects: pathlib.Path | None) -> str:
+def _source(lineup: "Lineup", objects: pathlib.Path | None, exam: Exam) -> str:
     """The objects, in the size of the hand where there is one."""
     from congrasp.services.evaluate.protocol import objects_label
 
-    labels = list(dict.fromkeys(objects_label(one.policy, objects) for one, _ in lineup.entrants))
+    labels = list(dict.fromkeys(objects_label(one.policy, objects, exam) for one, _ in lineup.entrants))
     return labels[0] if len(labels) == 1 else f"{labels[0].partition(',')[0]} in each hand's size"
 
 
@@ -179,35 +190,39 @@ def _console() -> "Console":
 
 
 def _show(results: "Sequence[Found]", lineup: "Lineup", title: str, by: str | None) -> None:
-    """Prints the tables, where references come from, and why rows were left out."""
-    from congrasp.services.evaluate.scores import object_table, tables_of
+    """Prints the tables, the effect of the rules for headings, the references' source, and why rows were left out."""
+    from congrasp.services.evaluate.cells import object_table, tables_of
 
     console, rows = _console(), [row for found in results for row in found.rows]
     for shown in tables_of(rows, title, lineup.missing) + ([object_table(rows)] if by == "object" else []):
         console.print(shown)
+    for (one, _), found in zip(lineup.entrants, results, strict=True):
+        if found.heading_rules:
+            console.print(found.heading_rules.sentence(one.hand), markup=False, soft_wrap=True)
     for text in dict.fromkeys(found.references for found in results if found.references):
         console.print(text, markup=False, soft_wrap=True)
     for error in dict.fromkeys(str(error) for found in results for error in found.left_out):
         console.print(f"Left out: {error}", markup=False, soft_wrap=True)
 
 
-def _about(
-    lineup: "Lineup", objects: pathlib.Path | None, constraints: pathlib.Path | None, split: Split
-) -> dict[str, Any]:
-    """What the JSON file says beside rows and settings."""
-    from congrasp.common.objects.pool import HELD_OUT_SEED
+def _about(lineup: "Lineup", results: "Sequence[Found]") -> dict[str, Any]:
+    """Policies, and how the rows were made, as the JSON file has them."""
     from congrasp.services.evaluate.lineup import facts
+    from congrasp.services.evaluate.results import provenance
 
     policies = [facts(one) for one, _ in lineup.entrants]
+    rules = {
+        one.hand: dataclasses.asdict(found.heading_rules)
+        for (one, _), found in zip(lineup.entrants, results, strict=True)
+        if found.heading_rules
+    }
     return {
+        **provenance(),
         "policy": policies[0],
         "policies": policies,
         "missing": [one._asdict() for one in lineup.missing],
-        "objects": _source(lineup, objects),
-        "first_object_seed": None if objects else HELD_OUT_SEED,
         "headings": lineup.entrants[0][0].policy.task.headings,
-        "constraints": str(constraints) if constraints else None,
-        "split": split if constraints else None,
+        "heading_rules": rules,
     }
 
 

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import zlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -23,7 +24,8 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, act_by_mean
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.task import plausibility
-from congrasp.common.task.types import Array, Surface
+from congrasp.common.task.constraints import get_constraint
+from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.protocol import two_seconds
 from congrasp.services.evaluate.scores import Sample
@@ -132,11 +134,18 @@ class Episodes:
             )
             return self._message(begun, trace, {name: float(x[episode]) for name, x in values.items()}, episode)
 
-        return Batch(Sample(values, force, torque), message)
+        return Batch(Sample({**values, **self._facts(conditions)}, force, torque), message)
 
     def take_grasps(self) -> Grasps:
         """Grasps of the last batch's episodes that may become references."""
         return self._worker.take_grasps()
+
+    def _facts(self, conditions: InitialConditions) -> dict[str, np.ndarray]:
+        """Columns (B,) of what episodes begin with: masses in kg, and their identities."""
+        start = jax.tree.map(np.asarray, conditions.reset_state)
+        masses = np.array([obj.mass for obj in self._objects])[start.object_index]
+        mass = (masses * start.mass_scale).astype(np.float32)
+        return {"mass_kg": mass, "identity": identity(conditions), "reference": reference(conditions)}
 
     def _begin(self, conditions: InitialConditions, after: int) -> EnvState:
         """Starts episodes with the full hold and `after` steps more, and returns how they begin."""
@@ -168,6 +177,41 @@ class Episodes:
                 "metrics": metrics,
             },
         )
+
+
+def identity(conditions: InitialConditions) -> np.ndarray:
+    """(B,) uint32, equal for episodes that begin alike under the same active constraints, whatever sensors show.
+
+    Numbers are compared in steps of 1e-4.
+    """
+    start, goal = conditions.reset_state, conditions.goal
+    return _hashes([*start, *(array for name in goal.values for array in _active(goal, name))])
+
+
+def reference(conditions: InitialConditions) -> np.ndarray:
+    """(B,) uint32, equal for episodes with the same object and the same reference.
+
+    Where poses and trajectories are drawn each for itself, that of the pose counts.
+    """
+    goal = conditions.goal
+    drawn = [_active(goal, name) for name in goal.values if get_constraint(name).from_reference]
+    return _hashes([conditions.reset_state.object_index, *(array for arrays in drawn for array in arrays)])
+
+
+def _active(goal: Goal, name: str) -> list[np.ndarray]:
+    """Goal arrays (B, ...) of a constraint, zero where it is not active."""
+    constraint, arrays = get_constraint(name), [np.asarray(array) for array in goal[name]]
+    if not constraint.blocks:
+        return arrays
+    active = np.any([goal.active[block] for block in constraint.blocks], 0)
+    return [np.where(active.reshape(-1, *[1] * (array.ndim - 1)), array, 0) for array in arrays]
+
+
+def _hashes(arrays: Sequence[Array]) -> np.ndarray:
+    """(B,) uint32 of the rows of arrays (B, ...), rounded to 1e-4."""
+    rows = [np.asarray(array, np.float64).reshape(len(arrays[0]), -1) for array in arrays]
+    whole = np.round(np.concatenate(rows, 1) * 1e4).astype(np.int64)
+    return np.array([zlib.crc32(row.tobytes()) for row in whole], np.uint32)
 
 
 class _Effort(NamedTuple):

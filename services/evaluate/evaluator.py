@@ -1,9 +1,11 @@
 """Evaluation by the paper's protocol: the deterministic policy under chosen constraints on a pool of objects."""
 
+import dataclasses
 import functools
 import itertools
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -20,9 +22,12 @@ from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.wire.codec import Message
-from congrasp.services.evaluate import references, sensing
+from congrasp.services.evaluate import loads, references, sensing
 from congrasp.services.evaluate.episodes import Batch, Episodes
+from congrasp.services.evaluate.heading_rules import HeadingRules, heading_rules
+from congrasp.services.evaluate.loads import Load
 from congrasp.services.evaluate.noise import LEVELS, Noise, with_noise
+from congrasp.services.evaluate.paper import CENTER_GROUP
 from congrasp.services.evaluate.plan import RowPlan, batches, from_references, plan_row
 from congrasp.services.evaluate.protocol import NOMINAL_FRICTION, protocol, two_seconds
 from congrasp.services.evaluate.references import References
@@ -34,6 +39,14 @@ _KEPT = 8
 """Episodes of a row that can be looked at afterwards: so many that hold the object to the end, and so many others."""
 MEASURED = 512
 """Objects beyond which their surfaces' distance fields are left out, and plausibility with them."""
+
+
+class _Level(NamedTuple):
+    """One of several changes of the same episodes."""
+
+    change: Callable[[InitialConditions], InitialConditions]
+    objects: Sequence[GraspObject] = ()
+    """In place of the evaluator's, if there are any."""
 
 
 class Evaluator:
@@ -184,23 +197,59 @@ class Evaluator:
         return rows
 
     def rows_under_sensing(self, progress: Callable[[int], None], episodes: int) -> list[Row]:
-        """A row for each of `services.evaluate.sensing.LEVELS`; see there. All of them have the same episodes.
+        """A row for each of `services.evaluate.sensing.LEVELS`; see `_rows_at`."""
+        task = sensing.sensing_task(self.task)
+        levels = {
+            level.label: _Level(functools.partial(sensing.at_level, level=level, control_dt=task.control_dt))
+            for level in sensing.LEVELS
+        }
+        return self._rows_at(sensing.CONSTRAINT, levels, episodes, progress, task)
 
-        Args:
-          progress: is told how many episodes of all rows there are.
-          episodes: for each row, at least.
+    def rows_under_loads(self, levels: Sequence[Load], progress: Callable[[int], None], episodes: int) -> list[Row]:
+        """A row for each load; see `_rows_at`."""
+        found = {
+            load.label: _Level(functools.partial(loads.at_load, load=load), loads.loaded(self.objects, load))
+            for load in levels
+        }
+        return self._rows_at(loads.CONSTRAINT, found, episodes, progress, self.task)
+
+    def _rows_at(
+        self,
+        constraint: str,
+        levels: Mapping[str, _Level],
+        episodes: int,
+        progress: Callable[[int], None],
+        task: TaskConfig,
+    ) -> list[Row]:
+        """A row of a constraint for each level, by its label; all of them begin with the same episodes.
+
+        `episodes` is the least number of each row, and `progress` receives the number of finished ones of all rows.
         """
         rows: list[Row] = []
-        task, plan = sensing.sensing_task(self.task), self.plan(sensing.CONSTRAINT, episodes)
-        bank = self.bank_for(sensing.CONSTRAINT)
+        plan, bank = self.plan(constraint, episodes), self.bank_for(constraint)
         with self._episodes(episodes, task=task) as running:
-            for level in sensing.LEVELS:
+            for label, level in levels.items():
+                if level.objects:
+                    running.replace_objects(level.objects, self._field)
                 drawn = batches(self._hand, task, bank, plan, self._seed, running.batch)
-                conditions = ((sensing.at_level(begun, level, task.control_dt), count) for begun, count in drawn)
+                conditions = ((level.change(begun), count) for begun, count in drawn)
                 advance = functools.partial(lambda done, n: progress(done + n), sum(row.episodes for row in rows))
-                sample = simulate(running, conditions, plan.total, advance)
-                rows.append(self.row(sensing.CONSTRAINT, sample, level.label))
+                rows.append(self.row(constraint, simulate(running, conditions, plan.total, advance), label))
         return rows
+
+    def row_by_center(self, episodes: int, progress: Callable[[int], None]) -> tuple[Row, HeadingRules]:
+        """The heading row whose headings leave room for the hand's centre alone, and the effect of the rules.
+
+        Args:
+          episodes: of the row, at least.
+          progress: receives the number of finished episodes.
+        """
+        task = dataclasses.replace(self.task, headings="center")
+        bank = build_bank(self._hand, task, self.objects, self._seed)
+        plan = plan_row(task, bank, self.objects, "heading", episodes)
+        with self._episodes(episodes) as running:
+            row = self.row("heading", self._run(running, "", plan, bank, progress), CENTER_GROUP)
+        return row, heading_rules(self._bank, self.objects, bank)
 
     def noisy_example(self, noise: Noise) -> Message | None:
         """An episode under a noisy reference in which the object is held to the end, if there is one."""
@@ -230,6 +279,7 @@ class Evaluator:
             self._hand.name,
             sample,
             held_2s=self._hold == two_seconds(self.task),
+            by_reference=self._given and from_references(name),
             group=group,
             method=self.task.method,
             paper=self.paper,

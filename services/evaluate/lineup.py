@@ -1,6 +1,7 @@
 """Which policies the tables of an evaluation compare: those given, pretrained ones, and methods without a policy."""
 
 import dataclasses
+import hashlib
 import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple
@@ -11,7 +12,9 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands
 from congrasp.common.task.methods import STUDENT, evaluated_as
 
-Table = Literal["single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "all"]
+Table = Literal[
+    "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
+]
 ABLATION = ("ours", "no-dynamic-center", "no-feedforward", "single-stage", "two-phase")
 """Methods of the table `ablation`."""
 _POLICY = "policy.safetensors"
@@ -140,6 +143,7 @@ def facts(one: Entrant) -> dict[str, Any]:
         "hand": one.hand,
         "method": one.method,
         "file": one.file.name,
+        "sha256": hashlib.sha256(one.file.read_bytes()).hexdigest(),
         "version": one.policy.version,
         "transitions": one.policy.transitions,
     }

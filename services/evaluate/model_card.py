@@ -24,6 +24,11 @@ _SIMULATED = (
     "robot."
 )
 _MET = "It met rigid objects that fit the hand: no soft or jointed ones, no clutter and no obstacles."
+_HEADINGS = {
+    "all": "all headings",
+    "above": "headings within 30° of straight down",
+    "center": "headings with the hand's centre above the table",
+}
 _TRACKER_UNITS = {"period": "s", "delay": "s", "position_noise": "m", "rotation_noise": "rad", "dropout": ""}
 _CITATION = """@article{congraspxl,
   title  = {ConGraspXL: Controllable Constraint-Conditioned Dexterous Grasping Motion Synthesis},
@@ -111,8 +116,7 @@ def _trained(task: TaskConfig) -> str:
     if task.gain_range != (1.0, 1.0):
         ranges.append(f"servo gains x {_range(task.gain_range)}")
     ranges += _tracker(task.sensing)
-    headings = "all headings" if task.headings == "all" else "headings within 30° of straight down"
-    return f"In training: {headings}; {', '.join(parts) or 'no other constraint'}; {', '.join(ranges)}."
+    return f"In training: {_HEADINGS[task.headings]}; {', '.join(parts) or 'no other constraint'}; {', '.join(ranges)}."
 
 
 def _tracker(sensing: SensingConfig) -> list[str]:

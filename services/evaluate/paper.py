@@ -79,6 +79,9 @@ _OBJECTS = {
     "graspxl": {"": 0.822, "small": 0.859, "medium": 0.845, "large": 0.790},
     "no-dynamic-center": {"": 0.880, "small": 0.871, "medium": 0.893, "large": 0.877},
 }
+CENTER_GROUP = "hand's centre alone above the table"
+"""Group of the row whose headings leave room for the hand's centre instead of the whole hand: the paper states no rule
+for the hand."""
 SOURCES = {
     "hands": "procedural references for each hand (hand morphology)",
     "captured": "captured constraints of GRAB and OakInk (single and composed constraints, ablation)",
@@ -101,7 +104,7 @@ def paper_row(source: str, hand: str, method: str, constraint: str, group: str =
       group: which objects or pairs; its first word counts.
     """
     word = group.split(" ")[0]
-    if source == "hands" and method == "ours" and not group:
+    if source == "hands" and method == "ours" and group in ("", CENTER_GROUP):
         return _HANDS.get(hand, {}).get(constraint)
     if hand != "human":
         return None

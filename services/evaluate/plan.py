@@ -62,7 +62,7 @@ def plan_row(
     constraint, aligned = name.removesuffix(ALIGNED), name.endswith(ALIGNED)
     require_known(constraint.split("+"), task)
     allowed = initial.allowing(dataclasses.replace(task, aligned_references=aligned), bank, constraint.split("+"))
-    allowed = allowed & ~_repeated(np.asarray(bank.rest))
+    allowed = allowed & ~repeated_rests(np.asarray(bank.rest))
     covered = np.asarray(allowed.any(1))
     if not covered.any():
         raise CongraspError(
@@ -117,7 +117,7 @@ def batches(
 _planned = jax.jit(initial.planned, static_argnums=(0, 1, 5))
 
 
-def _repeated(rest: np.ndarray) -> np.ndarray:
+def repeated_rests(rest: np.ndarray) -> np.ndarray:
     """(N, R) bool: resting poses (N, R, 7) that only fill the row of an object with fewer of them."""
     same = (rest[:, :, None] == rest[:, None]).all(-1)
     repeated: np.ndarray = np.tril(same, -1).any(-1)

@@ -38,8 +38,8 @@ def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) ->
     )
 
 
-def objects_label(bundle: PolicyBundle, folder: pathlib.Path | None) -> str:
+def objects_label(bundle: PolicyBundle, folder: pathlib.Path | None, exam: str = "figures") -> str:
     """Name of the objects' source, with the factor on their lengths for the policy's hand."""
     scale = object_scale(get_hand(bundle.spec.hand), bundle.task)
-    source = str(folder) if folder else "held-out procedural objects"
+    source = str(folder) if folder else f"procedural objects ({exam})"
     return source if scale == 1.0 else f"{source}, lengths x {scale:g} for the {bundle.spec.hand_name} hand"

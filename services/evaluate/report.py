@@ -12,17 +12,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.wire.codec import encode
+from congrasp.services.evaluate.cells import FORCES, error_title, force_cells, paper_cells, rate_cells, scaled
 from congrasp.services.evaluate.model_card import model_card
-from congrasp.services.evaluate.scores import (
-    ERRORS,
-    FORCES,
-    Row,
-    error_title,
-    force_cells,
-    paper_cells,
-    rate_cells,
-    scaled,
-)
+from congrasp.services.evaluate.scores import ERRORS, Row
 from congrasp.services.record.reader import read_metrics
 from congrasp.services.viz.plots import draw, encoded, figures
 
@@ -166,7 +158,7 @@ def _summary(rows: Sequence[Row]) -> str:
 
 def _compared(row: Row, errors: Sequence[str]) -> Mapping[str, Any]:
     """A row for the template: its rates, the paper's success, and pairs of errors, its own and the paper's."""
-    name, episodes, objects, success, held, _, _ = rate_cells(row)
+    name, episodes, objects, success, held, *_ = rate_cells(row)
     paper = row.paper.errors if row.paper else {}
     pairs = [(scaled(error, row.errors.get(error)), scaled(error, paper.get(error))) for error in errors]
     cells = {"name": name, "episodes": episodes, "objects": objects, "success": success, "held": held}

@@ -5,14 +5,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from congrasp.actors.physics import PhysicsName, resolve_physics
-from congrasp.common.config import ObjectsConfig
 from congrasp.common.errors import CongraspError
-from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.runtime.engines import engine_title
 from congrasp.common.runtime.parallel import cores
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.exam import exam_pool
 from congrasp.services.evaluate.failures import failure_sheets
 from congrasp.services.evaluate.protocol import objects_label, two_seconds
 from congrasp.services.evaluate.report import (
@@ -73,14 +72,19 @@ def report_on(
     """
     template()  # fails before the evaluation if a package is missing
     policy, engine = bundles.load(file), resolve_physics(physics)
-    names = known_rows(TABLES, policy.task)
     curves = list(curves_of(run_dir)) if run_dir else []
-    given = objects_of(objects, track=track) if objects else load_pool(ObjectsConfig(count=pool, seed=HELD_OUT_SEED))
+    given = objects_of(objects, track=track) if objects else exam_pool("figures", pool)
     track("Making constraints", None)
-    held, threads = two_seconds(policy.task), cores()
-    evaluator = Evaluator(policy, given, physics=engine, threads=threads, seed=seed, hold_steps=held)
-    names, left_out = evaluator.allowed(names)
+    evaluator = Evaluator(
+        policy, given, physics=engine, threads=cores(), seed=seed, hold_steps=two_seconds(policy.task)
+    )
+    names, left_out = evaluator.allowed(known_rows(TABLES, policy.task))
     rows = evaluator.rows(names, episodes, track("Episodes", len(names) * episodes), keep=True)
+    rules = ""
+    if "heading" in names and policy.task.headings == "all":
+        by_center, found = evaluator.row_by_center(episodes, track("Episodes with other rules for headings", episodes))
+        rows.insert(names.index("heading") + 1, by_center)
+        rules = f". {found.sentence(policy.spec.hand_name)}"
     advance = track("Pictures", len(names))
     sheets = []
     for name, sheet, causes in failure_sheets(evaluator, policy, names, _PICTURED, _PICTURED):
@@ -92,7 +96,7 @@ def report_on(
     )
     commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
     which = f"{len(given)} objects ({objects_label(policy, objects)})"
-    how = f"{episodes} episodes a row on {which}, {engine_title(engine)}, seed {seed}"
+    how = f"{episodes} episodes a row on {which}, {engine_title(engine)}, seed {seed}{rules}"
     write_report(out, policy, file.name, rows, how, sheets, curves, commands, check, _motion(evaluator, names))
     return Reported(rows, left_out)
 

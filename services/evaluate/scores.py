@@ -1,4 +1,4 @@
-"""Rows of an evaluation: rates with intervals, errors, forces, and the paper's figures to compare them with."""
+"""Rows of an evaluation: rates with intervals, errors, forces, and the paper's figures to compare with."""
 
 import dataclasses
 import json
@@ -13,6 +13,7 @@ from congrasp.common.config import TaskConfig
 from congrasp.common.io.files import write_atomically
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.plausibility import CLEAN_MM
+from congrasp.services.evaluate.intervals import NORMAL_95, clustered, independent_episodes, standard_error
 from congrasp.services.evaluate.paper import PaperRow, paper_row
 from congrasp.services.evaluate.plan import ALIGNED
 
@@ -24,12 +25,12 @@ TABLES = {
 """Rows of the paper's tables, by the constraints that are active; the aligned pairs are none of the paper's."""
 ERRORS = {c.name: {spec.name: spec.column or spec.name for spec in c.errors} for c in CONSTRAINTS}
 """Of each constraint: names of its errors among the metrics of episodes and in the rows."""
-_UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
+UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
+"""Units of the errors, by their names in rows."""
 PROBED_EPISODES = 2000
 """Forces are read from this many episodes of a row at most."""
 _FORCES = ("link_force", "force_sum", "torque_share")
 _PRESSED = ("force_peak_n", "force_mean_n")
-_NORMAL_95 = 1.959964
 _HUNDREDTHS = np.linspace(0, 1, 101)
 _SIZES = ("small", "medium", "large")
 
@@ -39,7 +40,8 @@ class Sample:
     """Episodes that count for one row."""
 
     values: dict[str, np.ndarray]
-    """Metrics (E,), by the names in `actors.env.metric_names`."""
+    """Metrics (E,), by the names in `actors.env.metric_names`; `mass_kg`; and `identity` and `reference`, equal for
+    equal episodes and for those of one object and reference (`services.evaluate.episodes`)."""
     link_force: np.ndarray
     """(E', W, L) net contact force of each link in the paper's window, N; of the first E' of the episodes."""
     torque: np.ndarray
@@ -73,7 +75,8 @@ def joined(samples: Sequence[Sample]) -> Sample:
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One row: rates with 95 % Wilson intervals, errors and forces averaged over successful episodes."""
+    """One row: rates with 95 % intervals (`services.evaluate.intervals.clustered`: objects are clusters, or
+    captured sequences), errors and forces averaged over successful episodes."""
 
     constraint: str
     hand: str
@@ -84,14 +87,24 @@ class Row:
     covered: int
     """Objects that allow the row's constraints."""
     pool: int
-    """Objects that were asked for."""
+    """Requested objects."""
+    distinct: int
+    """Different episodes: those that begin alike under the same goal are one."""
+    independent: float
+    """Independent episodes that the interval of the success rate is of."""
+    mass_kg: float
+    """Mean mass of the episodes' objects."""
     success: float
     success_low: float
     success_high: float
+    success_all: float
+    """Success rate over all requested objects, where every uncovered object fails."""
     held_2s: float | None
     """Rate of success that lasts for two seconds without the table; None where episodes ended before."""
     held_2s_low: float | None
     held_2s_high: float | None
+    held_all: float | None
+    """The same as `success_all`, for two seconds."""
     errors: dict[str, float | None]
     forces: dict[str, float | None]
     episode_return: float
@@ -122,29 +135,14 @@ class Row:
           LookupError, TypeError: it did not.
         """
         own = {field.name: row[field.name] for field in dataclasses.fields(cls) if field.name in row}
-        # Files of before lack what constraints that came later measure.
+        # Constraints that a file's project did not have are absent from it.
         errors = {name: row.get(name) for names in ERRORS.values() for name in names.values()}
         forces = {f"{name}_{of}": row[f"{name}_{of}"] for name in _FORCES for of in ("mean", "p95")}
-        forces |= {name: row.get(name) for name in _PRESSED}
+        forces |= {name: row[name] for name in _PRESSED}
         known = {*own, *errors, *forces, "return"}
         measured = {name: value for name, value in row.items() if name not in known}
         own |= {"paper": PaperRow(**row["paper"]) if row["paper"] else None, "plausibility": measured}
         return cls(**own, errors=errors, forces=forces, episode_return=row["return"])
-
-
-def wilson(successes: int, count: int) -> tuple[float, float]:
-    """95 % Wilson score interval of a rate."""
-    if count == 0:
-        return 0.0, 1.0
-    from scipy.stats import binomtest
-
-    interval = binomtest(successes, count).proportion_ci(method="wilson")
-    return float(interval.low), float(interval.high)
-
-
-def standard_error(values: np.ndarray) -> float:
-    """Of the mean of independent values (E,), at least two."""
-    return float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def known_rows(tables: Iterable[str], task: TaskConfig) -> list[str]:
@@ -160,6 +158,8 @@ def summarise(
     *,
     held_2s: bool,
     objects: Sequence[str],
+    pool: int | None = None,
+    by_reference: bool = False,
     group: str = "",
     method: str = "ours",
     paper: str = "",
@@ -172,16 +172,18 @@ def summarise(
       sample: its episodes.
       held_2s: whether the episodes lasted for two seconds without the table.
       objects: names of the pool's objects, those without an episode too.
+      pool: number of the requested objects, where the row is of some of these; otherwise all of them.
+      by_reference: whether references, such as captured sequences, are the clusters of the intervals, not objects.
       group: which objects these are, such as "small (below 8 cm)".
       method: `common.task.methods`.
       paper: which of the paper's tables it stands beside, see `services.evaluate.paper`.
     """
     constraint = name.removesuffix(ALIGNED)
     group = group or ("aligned pairs" if name.endswith(ALIGNED) else "")
-    values = sample.values
-    success, held = values["success"] > 0, values["held"] > 0
-    low, high = wilson(int(success.sum()), len(success))
-    held_low, held_high = wilson(int(held.sum()), len(held)) if held_2s else (None, None)
+    values, pool = sample.values, pool or len(objects)
+    success, index = values["success"] > 0, values["object_index"]
+    clusters = values["reference"] if by_reference else index
+    held = _rates(("held_2s", "held_all"), values["held"] > 0, clusters, index, pool)
     found = {name: values[source][success] for part in constraint.split("+") for source, name in ERRORS[part].items()}
     reached = {name: error for name, error in found.items() if len(error)}
     means = {name: float(error.mean()) for name, error in reached.items()}
@@ -191,14 +193,13 @@ def summarise(
         method=method,
         group=group,
         episodes=len(success),
-        covered=len(np.unique(values["object_index"])),
-        pool=len(objects),
-        success=float(success.mean()),
-        success_low=low,
-        success_high=high,
-        held_2s=float(held.mean()) if held_2s else None,
-        held_2s_low=held_low,
-        held_2s_high=held_high,
+        covered=len(np.unique(index)),
+        pool=pool,
+        distinct=len(np.unique(values["identity"])),
+        independent=independent_episodes(success, clusters),
+        mass_kg=float(values["mass_kg"].mean()),
+        **_rates(("success", "success_all"), success, clusters, index, pool),
+        **(held if held_2s else dict.fromkeys(held)),
         errors={name: means.get(name) for names in ERRORS.values() for name in names.values()},
         forces=_forces(sample.where(success)),
         episode_return=float(values["return"].mean()),
@@ -206,10 +207,29 @@ def summarise(
         diverged=float((values["bad"] > 0).mean()),
         paper=paper_row(paper, hand, method, constraint, group),
         plausibility=_plausibility(values, held_2s),
-        margins={name: _NORMAL_95 * standard_error(error) for name, error in reached.items() if len(error) > 1},
+        margins={name: NORMAL_95 * standard_error(error) for name, error in reached.items() if len(error) > 1},
         quantiles={name: np.quantile(error, _HUNDREDTHS).round(6).tolist() for name, error in reached.items()},
         objects=_by_object(values, objects, held_2s),
     )
+
+
+def _rates(
+    names: tuple[str, str], outcomes: np.ndarray, clusters: np.ndarray, objects: np.ndarray, pool: int
+) -> dict[str, Any]:
+    """Columns of a rate: its mean over episodes with the interval, and over `pool` objects, of which some have none.
+
+    Args:
+      names: of the two means.
+      outcomes: (E,) bool.
+      clusters: (E,) see `services.evaluate.intervals`.
+      objects: (E,) index of each episode's object.
+      pool: number of objects; those without episodes have a rate of 0.
+    """
+    low, high = clustered(outcomes, clusters)
+    _, members = np.unique(objects, return_inverse=True)
+    of_each = np.bincount(members, outcomes) / np.bincount(members)
+    found = {names[0]: float(outcomes.mean()), f"{names[0]}_low": low, f"{names[0]}_high": high}
+    return {**found, names[1]: float(of_each.sum() / pool)}
 
 
 def _by_object(values: dict[str, np.ndarray], objects: Sequence[str], held_2s: bool) -> list[dict[str, Any]]:
@@ -289,166 +309,7 @@ def object_groups(sizes: np.ndarray, masses: np.ndarray, families: np.ndarray) -
 
 
 def write_json(rows: Sequence[Row], path: pathlib.Path, about: dict[str, Any]) -> None:
-    """Writes `{"rows": [...]}` together with what is known about the evaluation."""
-    write_atomically(path, json.dumps({**about, "rows": [row.to_json() for row in rows]}, indent=2).encode())
-
-
-RATES = ("constraint", "episodes", "objects", "success", "held 2 s", "error", "paper")
-"""Columns of the table that compares with the paper; `rate_cells` fills them."""
-PLAUSIBILITY = (
-    "constraint",
-    "hand in hand, mm",
-    "in table, mm",
-    "in object, mm",
-    "wrist m/s",
-    "m/s²",
-    "clean",
-    "lifted",
-    "pushed",
-)
-"""Columns of the table of plausibility (`plausibility_cells`): deepest penetration (mean, 95th percentile), in the
-object also that of the hand's own meshes where it has some; peak speed and acceleration of the wrist; rates."""
-FORCES = ("constraint", "link, N", "sum, N", "torque, % of limit", "links in contact at table removal", "diverged")
-"""Columns of the table of forces after the removal (mean, 95th percentile); `force_cells` fills them."""
-
-
-def rate_cells(row: Row) -> tuple[str, ...]:
-    """A row's cells under `RATES`."""
-    return (
-        _name(row),
-        str(row.episodes),
-        str(row.covered) if row.covered == row.pool else f"{row.covered} of {row.pool}",
-        _rate(row.success, row.success_low, row.success_high),
-        _rate(row.held_2s, row.held_2s_low, row.held_2s_high),
-        _errors(row.errors),
-        "  ".join(paper_cells(row)).strip(),
-    )
-
-
-def paper_cells(row: Row) -> tuple[str, str]:
-    """The paper's success and errors beside a row, empty where it has none."""
-    return (_percent(row.paper.success), _errors(row.paper.errors)) if row.paper else ("", "")
-
-
-def force_cells(row: Row) -> tuple[str, ...]:
-    """A row's cells under `FORCES`."""
-    return (
-        _name(row),
-        _pair(row.forces["link_force_mean"], row.forces["link_force_p95"], 1.0),
-        _pair(row.forces["force_sum_mean"], row.forces["force_sum_p95"], 1.0),
-        _pair(row.forces["torque_share_mean"], row.forces["torque_share_p95"], 100.0),
-        f"{row.links_at_removal:.1f}",
-        _percent(row.diverged),
-    )
-
-
-def plausibility_cells(row: Row) -> tuple[str, ...]:
-    """A row's cells under `PLAUSIBILITY`."""
-    found = row.plausibility
-    *depths, mesh = (_pair(found.get(name), found.get(f"{name}_p95"), 1.0) for name in CLEAN_MM)
-    if found.get("hand_mesh_mm") is not None:
-        depths[-1] += f", its meshes {mesh}"
-    peaks = (found.get(name) for name in ("wrist_speed", "wrist_acceleration"))
-    rates = (found.get(name) for name in ("clean", "lift_survival", "push_survival"))
-    return (
-        _name(row),
-        *depths,
-        *("-" if peak is None else f"{peak:.3g}" for peak in peaks),
-        *("-" if rate is None else _percent(rate) for rate in rates),
-    )
-
-
-def tables_of(rows: Sequence[Row], title: str, missing: Sequence[tuple[str, str, str]] = ()) -> list[Any]:
-    """Rows as rich tables: rates and errors beside the paper's, plausibility, then forces.
-
-    Args:
-      rows: of one policy, or of several, which are then named and stand beside one another for each constraint.
-      title: of the first table.
-      missing: hands and methods that have no row, and why.
-    """
-    from rich.table import Table
-
-    several = bool(missing) or len({(row.hand, row.method) for row in rows}) > 1
-    order = {name: i for i, name in enumerate(dict.fromkeys(map(_name, rows)))}
-    rows = sorted(rows, key=lambda row: order[_name(row)])
-    tables = []
-    for heading, columns, cells in (
-        (title, RATES, rate_cells),
-        ("Plausibility of all episodes", PLAUSIBILITY, plausibility_cells),
-        ("Forces after the removal: mean, 95th percentile", FORCES, force_cells),
-    ):
-        table = Table(title=heading, title_justify="left")
-        for column in (*columns[:1], *(("hand", "method") if several else ()), *columns[1:]):
-            table.add_column(column, no_wrap=column in ("constraint", "method", "success", "held 2 s"))
-        for row in rows:
-            name, *others = cells(row)
-            table.add_row(name, *((row.hand, row.method) if several else ()), *others)
-        for hand, method, reason in missing if heading == title else ():
-            table.add_row(reason, hand, method)
-        tables.append(table)
-    return tables
-
-
-def object_table(rows: Sequence[Row]) -> Any:
-    """Success and held rate of each object (a line) in each row (a column), as a rich table."""
-    from rich.table import Table
-
-    table = Table(title="By object: success, held 2 s", title_justify="left")
-    table.add_column("object", no_wrap=True)
-    found = [{of["name"]: of for of in row.objects} for row in rows]
-    several = len({(row.hand, row.method) for row in rows}) > 1
-    for row in rows:
-        table.add_column(f"{_name(row)}, {row.hand}, {row.method}" if several else _name(row))
-    for name in dict.fromkeys(name for of in found for name in of):
-        cells = []
-        for of in found:
-            rates = [of[name][key] for key in ("success", "held_2s") if key in of[name]] if name in of else []
-            cells.append(", ".join(_percent(rate) for rate in rates))
-        table.add_row(name, *cells)
-    return table
-
-
-_FOR_PEOPLE = {"rad": ("°", 180 / np.pi), "m": ("mm", 1000.0), "": ("%", 100.0)}
-"""Unit and factor in which errors are shown, by the unit in which they are kept."""
-
-
-def error_title(name: str) -> str:
-    """Heading of an error's column, such as "heading, mm"."""
-    constraint = next(constraint for constraint, names in ERRORS.items() if name in names.values())
-    return f"{constraint}, {_FOR_PEOPLE[_UNITS[name]][0]}"
-
-
-def scaled(name: str, error: float | None) -> str:
-    """An error under `error_title`; empty where there is none."""
-    return "" if error is None else f"{_FOR_PEOPLE[_UNITS[name]][1] * error:.1f}"
-
-
-def _name(row: Row) -> str:
-    """Constraint and group."""
-    return f"{row.constraint}, {row.group}" if row.group else row.constraint
-
-
-def _percent(rate: float) -> str:
-    return f"{100 * rate:.1f} %"
-
-
-def _rate(rate: float | None, low: float | None, high: float | None) -> str:
-    """Such as "98.7 % (96.6-99.5)"."""
-    if rate is None or low is None or high is None:
-        return "-"
-    return f"{_percent(rate)} ({100 * low:.1f}-{100 * high:.1f})"
-
-
-def _pair(mean: float | None, percentile: float | None, factor: float) -> str:
-    """Such as "7.1, 19.3"."""
-    return "-" if mean is None or percentile is None else f"{factor * mean:.1f}, {factor * percentile:.1f}"
-
-
-def _errors(errors: dict[str, float | None] | dict[str, float]) -> str:
-    """Such as "0.137 rad 0.020 m", constraint by constraint."""
-    parts = []
-    for names in ERRORS.values():
-        found = [(errors.get(name), _UNITS[name]) for name in names.values()]
-        part = " ".join(f"{value:.3f} {unit}".strip() for value, unit in found if value is not None)
-        parts += [part] if part else []
-    return ", ".join(parts)
+    """Writes `{"rows": [...]}`, a line for each row, together with what is known about the evaluation."""
+    head = json.dumps({**about, "rows": []}, indent=1).removesuffix("]\n}")
+    lines = ",\n".join(json.dumps(row.to_json()) for row in rows)
+    write_atomically(path, f"{head}\n{lines}\n ]\n}}\n".encode())

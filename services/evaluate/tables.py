@@ -2,14 +2,15 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
 
-from congrasp.common.config import ObjectsConfig, Split
+from congrasp.common.config import Split
 from congrasp.common.errors import CongraspError
-from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
+from congrasp.common.hands import get_hand
+from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.runtime.engines import PhysicsName
@@ -17,8 +18,10 @@ from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.methods import takes
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.sets import bank_of, load_for
-from congrasp.services.evaluate import sensing
+from congrasp.services.evaluate import loads, sensing
 from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.exam import Exam, exam_pool
+from congrasp.services.evaluate.heading_rules import HeadingRules
 from congrasp.services.evaluate.noise import LEVELS
 from congrasp.services.evaluate.paper import CAPTURED_SETS
 from congrasp.services.evaluate.plan import from_references
@@ -27,11 +30,9 @@ from congrasp.services.evaluate.references import reference_policy
 from congrasp.services.evaluate.scores import TABLES, Row, known_rows
 from congrasp.services.evaluate.unseen import evaluate_objects, folder_pools, procedural_pools
 
-POOL = 64
-"""Procedural objects of rows."""
 MANY = 50_000
 """Most procedural objects of the table `objects`, where their number is not given."""
-_OTHERS = {"noise", "sensing", "objects"}  # tables whose rows are no constraints
+_OTHERS = {"noise", "sensing", "objects", "payload", "peers"}  # tables whose rows are no constraints
 Track = Callable[[str, int | None], Callable[[int], None]]
 """(what is done, its total if known) -> what to call with the amount done."""
 
@@ -44,8 +45,10 @@ class Setup:
     """Of each row; of the table `objects` in all."""
     physics: PhysicsName
     """Not `auto`."""
+    exam: Exam = "figures"
+    """Which procedural objects."""
     pool: int = 0
-    """Procedural objects; 0 takes `POOL`, for the table `objects` one an episode, at most `MANY`."""
+    """Procedural objects; 0 takes `exam.POOL`, for the table `objects` one an episode, at most `MANY`."""
     batch: int = 0
     """Worlds side by side; 0 chooses by the engine."""
     seed: int = 0
@@ -77,6 +80,8 @@ class Found(NamedTuple):
     """All rows."""
     references: str
     """Where reference poses and trajectories come from; empty if no row has any."""
+    heading_rules: HeadingRules | None = None
+    """Effect of the rules for headings; None without the table `single` of sampled headings."""
 
 
 def evaluate_tables(
@@ -86,7 +91,7 @@ def evaluate_tables(
 
     Args:
       policy: as the method that its task names.
-      tables: keys of `TABLES`, `objects`, `noise`, `sensing`, or `all` for all of these.
+      tables: keys of `TABLES`, `objects`, `noise`, `sensing`, `payload`, `peers`, or `all` for all of these.
       setup: objects, engine and numbers.
       track: shows progress.
       keep: keep episodes for `Evaluator.examples`.
@@ -97,17 +102,15 @@ def evaluate_tables(
     method, wanted = policy.task.method, {*TABLES, *_OTHERS} if "all" in tables else set(tables)
     names = [name for name in known_rows((key for key in TABLES if key in wanted), policy.task) if takes(method, name)]
     if not takes(method, "heading"):
-        wanted -= {"objects", "sensing"}
+        wanted -= _OTHERS - {"noise"}
     if not names and not wanted & _OTHERS:
         raise CongraspError(f"The method '{method}' has no row in these tables.", "Name another --table.")
     rows: list[Row] = []
     noisy: list[Row] = []
-    sensed: list[Row] = []
-    many: list[Row] = []
     left_out: list[CongraspError] = []
     evaluator: Evaluator | None = None
-    source = ""
-    if names or wanted & {"noise", "sensing"}:
+    rules, source = None, ""
+    if names or wanted & _OTHERS - {"objects"}:
         evaluator = _evaluator(policy, setup, track)
         if "noise" in wanted or any(from_references(name) for name in names):
             source = _references(evaluator, track)
@@ -115,23 +118,41 @@ def evaluate_tables(
             names, left_out = evaluator.allowed(names)
             advance = track("Episodes", len(names) * setup.episodes)
             rows = evaluator.rows(names, setup.episodes, advance, keep=keep)
+        if "single" in wanted and "heading" in names and setup.bank is None and policy.task.headings == "all":
+            advance = track("Episodes with other rules for headings", setup.episodes)
+            by_center, rules = evaluator.row_by_center(setup.episodes, advance)
+            rows.insert(names.index("heading") + 1, by_center)
         if "noise" in wanted:
             advance = track("Episodes under noise", len(LEVELS) * setup.episodes)
             noisy = evaluator.rows_under_noise(advance, setup.episodes)
-        if "sensing" in wanted:
-            advance = track("Episodes with a robot's sensors", len(sensing.LEVELS) * setup.episodes)
-            sensed = evaluator.rows_under_sensing(advance, setup.episodes)
+        rows += noisy + _rows_at_levels(evaluator, policy, wanted, setup.episodes, track)
     if "objects" in wanted:
-        many = _object_rows(policy, setup, track)
-    return Found(evaluator, names, left_out, noisy, [*rows, *noisy, *sensed, *many], source)
+        rows += _object_rows(policy, setup, track)
+    return Found(evaluator, names, left_out, noisy, rows, source, rules)
+
+
+def _rows_at_levels(
+    evaluator: Evaluator, policy: PolicyBundle, wanted: Set[str], episodes: int, track: Track
+) -> list[Row]:
+    """Rows of the tables `sensing`, `payload` and `peers`, if they are wanted."""
+    rows: list[Row] = []
+    if "sensing" in wanted:
+        advance = track("Episodes with a robot's sensors", len(sensing.LEVELS) * episodes)
+        rows += evaluator.rows_under_sensing(advance, episodes)
+    scale = object_scale(get_hand(policy.spec.hand), policy.task)
+    levels = {"payload": loads.payload(scale, constant_mass=policy.task.constant_mass), "peers": loads.PEERS}
+    for table in sorted(wanted & levels.keys()):
+        advance = track("Episodes under loads", len(levels[table]) * episodes)
+        rows += evaluator.rows_under_loads(levels[table], advance, episodes)
+    return rows
 
 
 def _evaluator(policy: PolicyBundle, setup: Setup, track: Track) -> Evaluator:
-    """An evaluator of given objects, or of held-out procedural ones."""
+    """An evaluator of given objects, or of an exam's procedural ones."""
     track("Making constraints", None)
     return Evaluator(
         policy,
-        setup.given or load_pool(ObjectsConfig(count=setup.pool or POOL, seed=HELD_OUT_SEED)),
+        setup.given or exam_pool(setup.exam, setup.pool),
         physics=setup.physics,
         batch=setup.batch,
         threads=cores(),
@@ -161,7 +182,7 @@ def _object_rows(policy: PolicyBundle, setup: Setup, track: Track) -> list[Row]:
     if setup.folder:
         pools = folder_pools(setup.folder, setup.physics)
     else:
-        pools = procedural_pools(setup.pool or min(setup.episodes, MANY), setup.physics)
+        pools = procedural_pools(setup.pool or min(setup.episodes, MANY), setup.physics, setup.exam)
     return evaluate_objects(
         policy,
         pools,

@@ -27,7 +27,7 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
 from congrasp.common.objects import procedural
 from congrasp.common.objects.distance import DistanceField, distance_field
-from congrasp.common.objects.pool import HELD_OUT_SEED, object_scale, scale_objects
+from congrasp.common.objects.pool import object_scale, scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
@@ -38,6 +38,7 @@ from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.evaluator import MEASURED, STRESSED, batch_of, simulate
+from congrasp.services.evaluate.exam import FAMILIES, Exam, first_seed
 from congrasp.services.evaluate.plan import batches, plan_row
 from congrasp.services.evaluate.protocol import protocol, two_seconds
 from congrasp.services.evaluate.scores import Row, Sample, joined, object_groups, summarise
@@ -68,10 +69,11 @@ class Pools(NamedTuple):
     make: list[Callable[[], Loaded]]
 
 
-def procedural_pools(count: int, physics: PhysicsName, seed: int = HELD_OUT_SEED) -> Pools:
-    """At least `count` procedural objects of the seeds from `seed`, in pools of one size."""
+def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
+    """At least `count` procedural objects of an exam, in pools of one size."""
     number, size = _divided(count, _MOST[ENGINES[physics].on_device])
-    families = procedural.family_turns(number * size, seed)
+    seed = first_seed(exam, number * size)
+    families = procedural.family_turns(number * size, seed, FAMILIES)
 
     def make(start: int) -> Loaded:
         seeds = range(seed + start, seed + start + size)
@@ -310,7 +312,7 @@ def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
     for label, members in object_groups(sizes, masses, families):
         chosen = members[index]
         if chosen.any():
-            rows.append(row(sample=whole.where(chosen), group=label))
+            rows.append(row(sample=whole.where(chosen), pool=int(members.sum()), group=label))
     return rows
 
 

@@ -3,15 +3,12 @@
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
-from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.evaluate.paper import PaperLine, paper_lines
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.reproduce.evaluation import Result
 from congrasp.services.reproduce.plan import Policy
 
 SUCCESS = "success"
-UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
-"""Of errors, by their names in rows."""
 CAPTURED_DATA = {"captured": "GRAB and OakInk", "cross": "DexYCB"}
 CONDITIONS = (
     "MuJoCo stands in for the paper's simulator; contacts, friction, servos and the hands' models differ.",
@@ -47,7 +44,7 @@ class Cell:
     ours: float | None = None
     low: float | None = None
     high: float | None = None
-    """95 % interval: Wilson's of a rate, 1.96 standard errors around a mean error."""
+    """95 % interval: of a rate with objects as clusters, 1.96 standard errors around a mean error."""
     difference: float | None = None
     """Ours less the paper's."""
     nearest: float | None = None

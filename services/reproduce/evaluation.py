@@ -92,6 +92,7 @@ def evaluate_part(part: Part, entrant: Entrant, numbers: Numbers, out: pathlib.P
         "source": data.paper if data else _SOURCES.get(part.table, "hands"),
         "pictures": pictures,
         "references": found.references,
+        "heading_rules": found.heading_rules.sentence(entrant.hand) if found.heading_rules else "",
         "left_out": [str(error) for error in found.left_out],
         "seconds": round(time.monotonic() - began, 1),
     }
@@ -105,7 +106,8 @@ def _read(file: pathlib.Path, part: Part, settings: Mapping[str, Any]) -> Result
     try:
         about = read_json(file, _LARGEST)
         rows = [Row.from_json(row) for row in about.pop("rows")]
-        same = about["settings"] == settings and about.keys() >= {"pictures", "seconds", "references", "left_out"}
+        kept = {"pictures", "seconds", "references", "left_out", "heading_rules"}
+        same = about["settings"] == settings and about.keys() >= kept
         return Result(part, about["source"], rows, about, False) if same else None
     except (OSError, LookupError, TypeError, AttributeError, CongraspError):
         return None

@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from congrasp.services.evaluate.paper import TABLES
-from congrasp.services.reproduce.comparison import SUCCESS, UNITS, Cell
+from congrasp.services.evaluate.scores import UNITS
+from congrasp.services.reproduce.comparison import SUCCESS, Cell
 
 COLUMNS = (
     ("constraint", ""),

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
+from congrasp.services.evaluate.cells import PLAUSIBILITY, RATES, plausibility_cells, rate_cells
 from congrasp.services.evaluate.report import Picture, embedded, template
-from congrasp.services.evaluate.scores import PLAUSIBILITY, RATES, Row, plausibility_cells, rate_cells
+from congrasp.services.evaluate.scores import Row
 from congrasp.services.reproduce.comparison import CONDITIONS, SUCCESS, Cell, unmatched
 from congrasp.services.reproduce.evaluation import Result
 from congrasp.services.reproduce.latex import latex
@@ -58,7 +59,7 @@ def write(account: Account, out: pathlib.Path) -> None:
         conditions=f"{account.conditions} {_times(account.seconds)}",
         command=account.command,
         tables=shown,
-        everywhere=CONDITIONS,
+        everywhere=_different(account.results),
         absent=absent,
         details=_details(account.results),
         pictures=[embedded(picture) for picture in [*_pictures(account.results), *account.curves]],
@@ -81,7 +82,7 @@ def to_json(account: Account) -> dict[str, Any]:
         "not_comparable": [
             {"line": what, "reason": why, "nearest": nearest} for what, why, nearest in not_comparable(account.cells)
         ],
-        "different_everywhere": list(CONDITIONS),
+        "different_everywhere": _different(account.results),
         "failures": account.failures,
         "parts": [
             {"name": result.part.name, "source": result.source, **result.about}
@@ -102,6 +103,12 @@ def summary(cells: Sequence[Cell]) -> str:
         f"It is at or above the paper's in {above}; the whole 95 % interval is above it in {verdicts['better']}, "
         f"and below it in {verdicts['worse']}."
     )
+
+
+def _different(results: Sequence[Result]) -> list[str]:
+    """What is different in every table, and of each hand how many headings its rules leave."""
+    rules = dict.fromkeys(result.about["heading_rules"] for result in results if result.about["heading_rules"])
+    return [*CONDITIONS, *rules]
 
 
 def _times(seconds: Mapping[str, float]) -> str:

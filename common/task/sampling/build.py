@@ -221,7 +221,8 @@ def headings_of(
     )
     assert whole is not None, "only the graspable region may be out of reach"
     sets = [whole, graspable or whole]
-    found = [within_reach(headings, obj.points, obj.rest_poses, hand) for headings in sets]
+    own = CENTER if task.headings == "center" else hand
+    found = [within_reach(headings, obj.points, obj.rest_poses, own) for headings in sets]
     reachable = np.stack([fine for _, fine in found])
     if task.headings == "above" and reachable[0].any():
         steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])

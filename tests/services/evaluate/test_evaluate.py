@@ -1,6 +1,8 @@
 """Evaluation of an untrained policy: the command from end to end, and what it refuses."""
 
 import dataclasses
+import hashlib
+import importlib.metadata
 import json
 
 import numpy as np
@@ -13,6 +15,8 @@ from congrasp.common.objects.store import Catalogue
 from congrasp.common.policy import bundle as bundles
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.loads import Load
+from congrasp.services.evaluate.paper import CENTER_GROUP
 from congrasp.services.train.command import untrained
 
 CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
@@ -44,14 +48,27 @@ def test_the_command_measures_rows_by_the_protocol(policy, tmp_path, capsys, mon
     assert names == [("pose+trajectory", ""), ("pose+trajectory", "aligned pairs"), ("trajectory+affordance", "")]
     assert all(row["hand"] == "human" and 0 <= row["held_2s"] <= row["success"] <= 1 for row in read["rows"])
     assert read["physics"] == "native" and "grasps of the reference policy of the human hand" in printed
+    assert read["policy"]["sha256"] == hashlib.sha256(policy.read_bytes()).hexdigest()
+    assert read["version"] == importlib.metadata.version("congrasp") and read["exam"] is None and read["machine"]
     for row, sample in zip(read["rows"], samples.values(), strict=True):
+        assert row["distinct"] <= row["episodes"] and row["success_all"] <= row["success"]
         assert row["pool"] == 3 and sum(obj["episodes"] for obj in row["objects"]) == row["episodes"] >= 3
         assert {obj["episodes"] for obj in row["objects"]} == {row["episodes"] // row["covered"]}
         assert all(obj["name"] in printed and obj.keys() >= {"success", "held_2s", "clean"} for obj in row["objects"])
         assert row["paper"] is None  # its composed rows are of captured constraints
-        assert np.all(sample.values["length"] == 300)  # 1 s with the table, 2 s without
+        assert np.all(sample.values["length"] == CONFIG.task.approach_steps + 200)  # with the table, and 2 s without
         assert sample.link_force.shape == (row["episodes"], 25, 16)
         assert sample.torque.shape == (row["episodes"], 25, 20) and 0.0 < sample.torque.max() <= 1.0
+
+
+def test_the_exam_has_a_row_of_the_hands_centre_alone_and_rows_of_loads(evaluator):
+    told = []
+    row, rules = evaluator.row_by_center(3, told.append)
+    assert row.group == CENTER_GROUP and row.episodes == 3 == told[-1] and row.paper.success == 0.96
+    assert 0 < rules.kept < rules.kept_by_center < 1
+    light, heavy = evaluator.rows_under_loads([Load("light", mass=(0.1, 0.1)), Load("heavy", mass=(2, 2))], print, 3)
+    assert (light.group, light.mass_kg, heavy.mass_kg) == ("light", pytest.approx(0.1), pytest.approx(2.0))
+    assert light.constraint == "heading" and light.paper is None and heavy.diverged == 0
 
 
 def test_a_row_is_the_same_alone_and_among_others(evaluator):

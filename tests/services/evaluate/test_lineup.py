@@ -110,7 +110,7 @@ def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monk
     command = ["--table", "ablation", "--policy", *files, "--episodes", "7", "--json", str(tmp_path / "rows.json")]
     assert load("evaluate")(command)() == 0
     printed, read = capsys.readouterr().out, json.loads((tmp_path / "rows.json").read_text())
-    assert "2 policies, on held-out procedural objects" in printed and printed.count("not trained") == 3
+    assert "2 policies, on procedural objects (figures)" in printed and printed.count("not trained") == 3
     assert [one["method"] for one in read["rows"]] == ["ours", "no-feedforward"]
     assert [one["method"] for one in read["policies"]] == ["ours", "no-feedforward"]
     missing = [(one["method"], one["reason"]) for one in read["missing"]]

@@ -8,6 +8,8 @@ import pytest
 
 from congrasp.common.config import TaskConfig
 from congrasp.common.task.constraints import blocks
+from congrasp.services.evaluate.cells import RATES, rate_cells, tables_of
+from congrasp.services.evaluate.intervals import clustered
 from congrasp.services.evaluate.paper import paper_row
 from congrasp.services.evaluate.scores import (
     PROBED_EPISODES,
@@ -16,8 +18,6 @@ from congrasp.services.evaluate.scores import (
     joined,
     object_groups,
     summarise,
-    tables_of,
-    wilson,
     write_json,
 )
 from tests.rows import row as made_row
@@ -26,7 +26,8 @@ TASK = TaskConfig()
 BLOCKS = blocks(TASK)
 REQUIRED = (
     *("constraint", "hand", "method", "episodes", "success", "heading_rad", "heading_m", "pose_rad", "pose_m"),
-    *("traj_rad", "traj_m", "affordance_ratio"),
+    *("traj_rad", "traj_m", "affordance_ratio", "fingers_ratio", "force_ratio", "success_low", "success_high"),
+    *("success_all", "held_all", "distinct", "mass_kg"),
 )
 
 
@@ -42,19 +43,10 @@ def _sample(success, held, **columns) -> Sample:
         *(f"mask_{name}" for name in BLOCKS),
     )
     values = {name: np.zeros(count, np.float32) for name in names}
+    values |= {"identity": np.arange(count, dtype=np.uint32), "mass_kg": np.full(count, 0.2)}
     values |= {"success": np.array(success, np.float32), "held": np.array(held, np.float32)}
-    values |= {name: np.array(column, np.float32) for name, column in columns.items()}
+    values |= {name: np.array(column, values.get(name, np.zeros(0)).dtype) for name, column in columns.items()}
     return Sample(values, np.zeros((count, 1, 2), np.float16), np.zeros((count, 1, 3), np.float16))
-
-
-def test_wilson_interval():
-    # n = 10, p = 0.8, z = 1.96: centre (0.8 + 0.19207) / 1.38415, half width 1.96 sqrt(0.016 + 0.0096036) / 1.38415.
-    assert wilson(8, 10) == pytest.approx((0.49016, 0.94332), abs=1e-5)
-    # No success: 0 to z^2 / (n + z^2).
-    assert wilson(0, 10) == pytest.approx((0.0, 3.84146 / 13.84146), abs=1e-5)
-    low, high = wilson(1000, 1000)
-    assert high == pytest.approx(1.0) and low == pytest.approx(1000 / 1003.84146, abs=1e-6)
-    assert wilson(0, 0) == (0.0, 1.0)
 
 
 def test_a_row_averages_over_successful_episodes():
@@ -77,7 +69,9 @@ def test_a_row_averages_over_successful_episodes():
         ("e", 1, 1.0),
         ("f", 1, 0.0),
     ]
-    assert (row.success_low, row.success_high) == wilson(3, 4) and (row.held_2s_low, row.held_2s_high) == wilson(2, 4)
+    objects = sample.values["object_index"]
+    assert (row.success_low, row.success_high) == clustered(np.array([1, 1, 0, 1]), objects)
+    assert (row.held_2s_low, row.held_2s_high) == clustered(np.array([1, 0, 0, 1]), objects)
     assert row.errors["pose_rad"] == pytest.approx(0.2) and row.errors["pose_m"] == pytest.approx(0.02)
     assert row.errors["traj_rad"] == pytest.approx(0.5)
     assert row.errors["heading_rad"] is None and row.errors["affordance_ratio"] is None
@@ -86,6 +80,30 @@ def test_a_row_averages_over_successful_episodes():
     assert row.forces["force_sum_mean"] == pytest.approx(4.0)  # 2, 10, 0
     assert row.forces["torque_share_mean"] == pytest.approx(3.0 / 9)
     assert row.paper is not None and row.paper.success == 0.865
+
+
+def test_uncovered_objects_count_as_failures():
+    """Five objects, of which three are covered: rates 1, 1/2 and 0 are 0.5 of three, and 0.3 of five."""
+    sample = _sample([1, 1, 1, 0, 0, 0], [1, 0, 1, 0, 0, 0], object_index=[0, 0, 2, 2, 4, 4])
+    row = summarise("affordance", "human", sample, held_2s=True, objects=list("abcde"))
+    assert (row.covered, row.pool, row.success, row.success_all) == (3, 5, 0.5, pytest.approx(0.3))
+    assert row.held_2s == pytest.approx(1 / 3) and row.held_all == pytest.approx(0.2)
+    assert rate_cells(row)[RATES.index("of all objects")] == "30.0 %, 20.0 %"
+    # Of a group of three of the five there is no uncovered object.
+    assert summarise("heading", "human", sample, held_2s=True, objects=list("abcde"), pool=3).success_all == 0.5
+
+
+def test_an_episode_that_repeats_counts_once_and_clusters_widen_the_interval():
+    repeated = _sample([1] * 8 + [0] * 8, [0] * 16, identity=[0] * 8 + [1] * 8, object_index=[0] * 8 + [1] * 8)
+    row = summarise("pose", "human", repeated, held_2s=True, objects=["a", "b"])
+    assert (row.episodes, row.distinct, row.independent) == (16, 2, pytest.approx(1.0))
+    assert rate_cells(row)[1] == "16 (2 different)"
+    spread = summarise("pose", "human", _sample([1] * 8 + [0] * 8, [0] * 16), held_2s=True, objects=["a"])
+    assert spread.distinct == 16 and row.success_low < spread.success_low < spread.success_high < row.success_high
+    # Sequences of one object are the clusters where references are.
+    own = _sample([1, 1, 0, 0], [0] * 4, reference=[7, 7, 9, 9])
+    row = summarise("pose", "human", own, held_2s=True, objects=["a"], by_reference=True)
+    assert row.independent == pytest.approx(1.0)
 
 
 def test_a_row_without_success_has_no_errors_and_short_episodes_no_hold():

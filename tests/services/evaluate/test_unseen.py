@@ -10,7 +10,7 @@ from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
-from congrasp.services.evaluate import unseen
+from congrasp.services.evaluate import exam, unseen
 from congrasp.services.evaluate.scores import Sample
 from congrasp.services.evaluate.unseen import Loaded, Pools, evaluate_objects, folder_pools, procedural_pools
 from congrasp.services.train.command import untrained
@@ -54,6 +54,7 @@ def simulated(monkeypatch):
         progress(total)
         values = {name: np.ones(total, np.float32) for name in metric_names(CONFIG.task)}
         values |= {"object_index": index.astype(np.float32), "clean": np.zeros(total, np.float32)}
+        values |= {"mass_kg": np.full(total, 0.2, np.float32), "identity": np.arange(total, dtype=np.uint32)}
         return Sample(values, np.ones((total, 1, 2), np.float16), np.ones((total, 1, 3), np.float16))
 
     monkeypatch.setattr(unseen, "Episodes", Running)
@@ -79,7 +80,8 @@ def test_every_object_has_the_same_episodes_whichever_pool_it_is_in(simulated):
     assert (whole.episodes, whole.covered, whole.pool, whole.success) == (10, 5, 6, 1.0)
     assert told == [6, 12]  # the second pool is filled up, and what fills it does not count
     by_size = [row for row in groups if row.group.split(" ")[0] in ("small", "medium", "large")]
-    assert sum(row.episodes for row in by_size) == 10
+    assert sum(row.episodes for row in by_size) == 10 and {row.success_all for row in by_size} == {1.0}
+    assert whole.success_all == pytest.approx(5 / 6)
     assert sum(row.episodes for row in groups if row.group.startswith("family")) == 10
     assert whole.paper.success == 0.927
     assert [stressed for _, stressed in simulated] == [200, 194]
@@ -165,8 +167,8 @@ def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch)
 
 def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
     monkeypatch.setitem(unseen._MOST, False, 2)
-    pools = procedural_pools(5, "native", 1_000_000)
+    pools = procedural_pools(5, "native", "development")
     objects = [make().objects for make in pools.make]
     assert pools.size == 2 and [len(pool) for pool in objects] == [2, 2, 2]
     names = [obj.name for pool in objects for obj in pool]
-    assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000)]
+    assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000, exam.FAMILIES)]

@@ -22,7 +22,7 @@ def evaluation(path: pathlib.Path) -> list[dict]:
     """Three rows of 40 episodes, of which 30 succeeded with errors that rise evenly from 0.1 to 0.4."""
     rows = []
     for constraint in ("heading", "trajectory+affordance", "fingers"):
-        values = {name: np.zeros(40) for name in METRICS}
+        values = {name: np.zeros(40) for name in (*METRICS, "mass_kg", "identity")}
         values["success"][:30] = 1
         for name in METRICS:
             if name.endswith(("_rad", "_m", "_ratio")):

@@ -1,0 +1,191 @@
+"""Figures of record: the files of `docs/results`, and the tables that pages show of them.
+
+`congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m congrasp.services.evaluate.results` writes
+each table between `<!-- results NAME KIND -->` and `<!-- end of results -->` in the README and in `docs`. KIND is one
+of `KINDS`.
+"""
+
+import dataclasses
+import importlib.metadata
+import pathlib
+import platform
+import re
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_json
+from congrasp.common.runtime.engines import engine_title
+from congrasp.common.runtime.parallel import cores
+from congrasp.services.evaluate.cells import paper_cells, plausibility_cells, rate_cells, row_title
+from congrasp.services.evaluate.heading_rules import HeadingRules
+from congrasp.services.evaluate.scores import Row
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+FOLDER = pathlib.Path("docs", "results")
+_BLOCK = re.compile(r"(<!-- results (\S+) (\S+) -->\n).*?(<!-- end of results -->)", re.S)
+_LARGEST = 1 << 26
+_NONE = "\N{EN DASH}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """A file of results."""
+
+    rows: Sequence[Row]
+    about: Mapping[str, Any]
+    """What else `congrasp evaluate --json` wrote."""
+
+    @property
+    def policies(self) -> dict[str, str]:
+        """SHA-256 of each policy by its file's name."""
+        return {policy["file"]: policy["sha256"] for policy in self.about["policies"]}
+
+
+def provenance() -> dict[str, Any]:
+    """Version of the package, the command line and the machine of an evaluation that runs now."""
+    device = jax.local_devices()[0]
+    accelerator = [] if device.platform == "cpu" else [device.device_kind]
+    return {
+        "version": importlib.metadata.version("congrasp"),
+        "command": shlex.join(["congrasp", *sys.argv[1:]]),
+        "machine": ", ".join([f"{cores()} {platform.machine()} cores", *accelerator]),
+    }
+
+
+def read_results(file: pathlib.Path) -> Results:
+    """The rows of a file and how they were made.
+
+    Raises:
+      CongraspError: the file cannot be read, or another version of the project wrote it.
+    """
+    remedy = "Run the command again that wrote it."
+    try:
+        about = read_json(file, _LARGEST)
+        rows = [Row.from_json(row) for row in about.pop("rows")]
+    except OSError as error:
+        raise CongraspError(f"{file} cannot be read: {error.strerror}.", remedy) from None
+    except (LookupError, TypeError, AttributeError):
+        raise CongraspError(f"{file} is not a file of results of this version.", remedy) from None
+    if missing := {"policies", "command", "machine", "version", "objects", "physics", "heading_rules"} - about.keys():
+        raise CongraspError(f"{file} lacks '{min(missing)}'.", remedy)
+    return Results(rows, about)
+
+
+def recorded(root: pathlib.Path = ROOT) -> dict[str, Results]:
+    """All files of results by name."""
+    return {file.stem: read_results(file) for file in sorted((root / FOLDER).glob("*.json"))}
+
+
+def summary(results: Results) -> list[str]:
+    """Success, held and clean beside the paper's success."""
+    head = ("constraint", "success", "held for 2 s", "held, and clean", "success, held of all objects", "paper")
+    return _table(
+        head,
+        (
+            (
+                row_title(row),
+                f"{100 * row.success:.1f} %",
+                _percent(row.held_2s),
+                _percent(row.plausibility.get("clean")),
+                f"{_percent(row.success_all)}, {_percent(row.held_all)}",
+                paper_cells(row)[0],
+            )
+            for row in results.rows
+        ),
+    )
+
+
+def rates(results: Results) -> list[str]:
+    """Rates with intervals and errors, and the paper's."""
+    head = ("constraint", "episodes (independent)", "objects", "success (95 %)", "held 2 s (95 %)", "of all objects")
+    rows = []
+    for row in results.rows:
+        name, _, *cells = rate_cells(row)
+        rows.append((name, f"{row.episodes} ({row.independent:.0f})", *cells))
+    return _table((*head, "error", "paper"), rows)
+
+
+def plausibility(results: Results) -> list[str]:
+    """Penetrations (mean, 95th percentile), peaks of the wrist, and what grasps survive."""
+    head = ("constraint", "in itself, mm", "in the table", "in the object", "wrist, m/s", "m/s²", "clean", "lifted")
+    return _table((*head, "pushed by half the weight", "and by 1 N"), map(plausibility_cells, results.rows))
+
+
+def conditions(results: Results) -> list[str]:
+    """Policy, objects, machine and command, and the effect of the rules for headings."""
+    about = results.about
+    policies = ", ".join(
+        f"`{policy['file']}` of version {policy['version']} (SHA-256 {policy['sha256'][:12]})"
+        for policy in about["policies"]
+    )
+    return [
+        f"{policies}, on {about['objects']}, {engine_title(about['physics'])}, {about['machine']}, congrasp "
+        f"{about['version']}:",
+        "",
+        "```text",
+        about["command"],
+        "```",
+        *(line for sentence in headings(results) for line in ("", sentence)),
+    ]
+
+
+def headings(results: Results) -> list[str]:
+    """Effect of the rules for headings."""
+    return [HeadingRules(**found).sentence(hand) for hand, found in results.about["heading_rules"].items()]
+
+
+KINDS: dict[str, Callable[[Results], list[str]]] = {
+    function.__name__: function for function in (summary, rates, plausibility, conditions, headings)
+}
+"""What a page may show of a file of results, as lines of Markdown."""
+
+
+def filled(page: str, results: Mapping[str, Results], name: str = "page") -> str:
+    """A page with its tables written anew from results.
+
+    Raises:
+      CongraspError: it shows a file or a kind of table that does not exist.
+    """
+
+    def block(found: re.Match[str]) -> str:
+        """One table between its markers."""
+        if found[2] not in results or found[3] not in KINDS:
+            raise CongraspError(
+                f"{name} shows '{found[2]} {found[3]}', which does not exist.",
+                f"Files: {', '.join(results)}; tables: {', '.join(KINDS)}.",
+            )
+        lines = "\n".join(KINDS[found[3]](results[found[2]]))
+        return f"{found[1]}\n{lines}\n\n{found[4]}"
+
+    return _BLOCK.sub(block, page)
+
+
+def pages(root: pathlib.Path = ROOT) -> Iterator[tuple[pathlib.Path, str]]:
+    """Every page whose tables differ from the results, and its text as it should be."""
+    results = recorded(root)
+    for path in (root / "README.md", *sorted((root / "docs").rglob("*.md"))):
+        text = path.read_text()
+        if (new := filled(text, results, path.name)) != text:
+            yield path, new
+
+
+def _table(head: Sequence[str], rows: Iterator[tuple[str, ...]] | Sequence[tuple[str, ...]]) -> list[str]:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines]
+
+
+def _percent(rate: float | None) -> str:
+    return _NONE if rate is None else f"{100 * rate:.1f} %"
+
+
+if __name__ == "__main__":
+    for page, text in pages():
+        write_atomically(page, text.encode())
+        print(f"Wrote {page.relative_to(ROOT)}.")

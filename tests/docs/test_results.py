@@ -1,0 +1,83 @@
+"""Figures of record: pages show what the files say, and the files are of the policies that ship."""
+
+import dataclasses
+import hashlib
+import json
+
+import pytest
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.policy.pretrained import pretrained_file, pretrained_hands
+from congrasp.services.evaluate.results import KINDS, ROOT, filled, pages, read_results, recorded
+
+RESULTS = recorded()
+MARKS = "<!-- results human {kind} -->\n{text}<!-- end of results -->\n"
+
+
+def test_pages_show_the_results():
+    outdated = [str(path.relative_to(ROOT)) for path, _ in pages()]
+    assert not outdated, "Run: python -m congrasp.services.evaluate.results"
+
+
+@pytest.mark.parametrize("hand", pretrained_hands())
+def test_every_shipped_policy_has_figures(hand):
+    policy = RESULTS[hand].about["policy"]
+    assert (policy["hand"], policy["method"]) == (hand, "ours")
+    assert {row.hand for row in RESULTS[hand].rows} == {hand}
+    assert RESULTS[hand].about["exam"] == "figures" and hand in RESULTS[hand].about["heading_rules"]
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_results_are_of_the_policies_that_ship(name):
+    """A new policy needs new figures: run the command in the file again."""
+    for policy in RESULTS[name].about["policies"]:
+        path = pretrained_file(policy["hand"]).with_name(policy["file"])
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == policy["sha256"], RESULTS[name].about["command"]
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_file_is_written_by_its_command(name):
+    assert f"--json docs/results/{name}.json" in RESULTS[name].about["command"]
+
+
+def test_a_table_is_written_between_its_marks_and_nothing_else_changes():
+    results = RESULTS["human"]
+    page = "Before.\n\n" + MARKS.format(kind="rates", text="old\n") + "\nAfter.\n"
+    new = filled(page, {"human": results})
+    assert new.startswith("Before.\n\n<!-- results human rates -->\n\n| constraint |") and "old" not in new
+    assert new.endswith("<!-- end of results -->\n\nAfter.\n")
+    assert filled(new, {"human": results}) == new
+    row = results.rows[0]
+    assert f"| {row.episodes} ({row.independent:.0f}) |" in new and f"{100 * row.success:.1f} % (" in new
+    other = dataclasses.replace(results, rows=[dataclasses.replace(row, success=0.123)])
+    assert "12.3 % (" in filled(page, {"human": other}) != new
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_table_is_markdown(kind):
+    lines = [line for line in KINDS[kind](RESULTS["human"]) if line.startswith("|")]
+    assert len({line.replace("\\|", "").count("|") for line in lines}) <= 1
+    assert bool(lines) == (kind not in ("conditions", "headings"))
+
+
+def test_conditions_name_the_policy_the_machine_and_the_command():
+    about = RESULTS["human"].about
+    text = "\n".join(KINDS["conditions"](RESULTS["human"]))
+    for part in (about["policy"]["sha256"][:12], about["machine"], about["command"], about["version"]):
+        assert part in text
+
+
+@pytest.mark.parametrize("marks", ["human nothing", "unknown rates"])
+def test_a_mark_without_results_is_an_error(marks):
+    with pytest.raises(CongraspError, match="does not exist"):
+        filled(f"<!-- results {marks} -->\n<!-- end of results -->", RESULTS)
+
+
+def test_a_file_of_another_kind_is_an_error(tmp_path):
+    file = tmp_path / "human.json"
+    file.write_text(json.dumps({"rows": [{"success": 1.0}]}))
+    with pytest.raises(CongraspError, match="not a file of results"):
+        read_results(file)
+    file.write_text(json.dumps({"rows": []}))
+    with pytest.raises(CongraspError, match="lacks"):
+        read_results(file)

@@ -1,0 +1,122 @@
+"""What the exam is made of: objects, rules for headings, loads, and which episodes are the same."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED
+from congrasp.common.task.sampling.build import build_bank
+from congrasp.services.evaluate import exam
+from congrasp.services.evaluate.episodes import identity, reference
+from congrasp.services.evaluate.heading_rules import HeadingRules, heading_rules
+from congrasp.services.evaluate.loads import MASSES, PEERS, Load, at_load, loaded, payload
+from tests import draws
+
+HAND, TASK = get_hand("human"), TaskConfig(surface_points=64, p_force=0.5)
+OBJECTS = [procedural.generate(0, "box"), procedural.generate(1, "mug")]
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return build_bank(HAND, TASK, OBJECTS, 0)
+
+
+@pytest.fixture(scope="module")
+def conditions(bank):
+    return jax.device_get(draws.sample(HAND, TASK, bank, jax.random.key(0), 64))
+
+
+def test_an_exam_has_all_families_and_seeds_of_its_own(monkeypatch):
+    asked = []
+    monkeypatch.setattr(procedural, "parallel_map", lambda make, seeds, families: asked.append((list(seeds), families)))
+    exam.exam_pool("figures")
+    exam.exam_pool("development", 5)
+    (figures, families), (development, _) = asked
+    assert sorted(families) == sorted(procedural.FAMILIES), "one object of each family"
+    assert figures == list(range(FIGURES_SEED, FIGURES_SEED + len(procedural.FAMILIES)))
+    assert development == list(range(HELD_OUT_SEED, HELD_OUT_SEED + 5))
+
+
+def test_the_development_exam_never_reaches_objects_for_figures():
+    assert exam.first_seed("development", 1_000_000) == HELD_OUT_SEED
+    with pytest.raises(CongraspError, match="smaller --pool"):
+        exam.first_seed("development", 1_000_001)
+
+
+def test_shares_of_the_rules_for_headings(bank):
+    """They add up, agree with the bank, and the hand's centre alone leaves more."""
+    task = dataclasses.replace(TASK, headings="center")
+    by_center = build_bank(HAND, task, OBJECTS, 0)
+    found = heading_rules(bank, OBJECTS, by_center)
+    assert found.kept + found.from_below + found.no_room == pytest.approx(1.0)
+    assert 0 < found.kept < found.kept_by_center <= 1 - found.from_below + 1e-9 and 0 <= found.moved <= 1
+    kept = sum(
+        len(set(np.asarray(bank.heading_index)[n, 0, r]))
+        for n, obj in enumerate(OBJECTS)
+        for r in range(len({tuple(rest) for rest in np.asarray(bank.rest)[n].tolist()}))
+    )
+    assert found.kept * 256 * sum(len(obj.rest_poses) for obj in OBJECTS) == pytest.approx(kept)
+
+
+def test_the_rules_are_said_in_one_sentence_each():
+    text = HeadingRules(kept=0.24, from_below=0.45, no_room=0.31, moved=0.4, kept_by_center=0.52).sentence("human")
+    for words in ("human hand: 24 %", "45 % dropped", "31 % because the table", "40 % of the kept", "52 % are kept"):
+        assert words in text
+    assert "centre" not in HeadingRules(kept=0.24, from_below=0.45, no_room=0.31, moved=0.4).sentence("human")
+
+
+def test_a_load_sets_the_mass_of_objects_and_the_friction_of_the_same_episodes(conditions):
+    for obj, heavy in zip(OBJECTS, loaded(OBJECTS, Load("2 kg", mass=(2.0, 2.0))), strict=True):
+        assert heavy.mass == 2.0 and heavy.name == obj.name
+        np.testing.assert_allclose(heavy.inertia * obj.mass, 2.0 * obj.inertia)
+    for obj, half in zip(OBJECTS, loaded(OBJECTS, Load("half", factor=0.5)), strict=True):
+        assert half.mass == pytest.approx(obj.mass / 2)
+    many = [dataclasses.replace(OBJECTS[0], name=f"box_{i}") for i in range(64)]
+    masses = np.array([obj.mass for obj in loaded(many, PEERS[1])])
+    assert 0.04 <= masses.min() < 0.1 and 0.44 < masses.max() <= 0.5 and 0.2 < masses.mean() < 0.34
+    dexsuite = at_load(conditions, PEERS[1]).reset_state
+    assert 0.5 <= dexsuite.friction.min() < 0.6 and 0.9 < dexsuite.friction.max() <= 1.0
+    np.testing.assert_array_equal(dexsuite.q, conditions.reset_state.q)
+    assert at_load(conditions, Load("2 kg", mass=(2.0, 2.0))) is conditions
+    # An episode's friction does not depend on the others.
+    last = jax.tree.map(lambda leaf: leaf[-1:], conditions)
+    assert at_load(last, PEERS[1]).reset_state.friction[0] == dexsuite.friction[-1]
+
+
+@pytest.mark.parametrize("constant_mass", [True, False])
+def test_payload_has_the_literal_scaling_where_lengths_are_scaled(constant_mass):
+    """Objects of 1.4 times the length are 2.744 times as heavy at the same density."""
+    *masses, own, literal = payload(1.4, constant_mass=constant_mass)
+    assert [load.mass for load in masses] == [(mass, mass) for mass in MASSES]
+    assert literal.factor / own.factor == pytest.approx(2.744)
+    assert (own if constant_mass else literal).factor == pytest.approx(1.0)
+    assert len(payload(1.0, constant_mass=constant_mass)) == len(MASSES) + 1
+
+
+def test_episodes_that_begin_alike_are_one(conditions):
+    twice = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf]), conditions)
+    found = identity(twice)
+    np.testing.assert_array_equal(found[:64], found[64:])
+    assert len(np.unique(found)) == 64
+    # The limit of a force that nothing asks for does not tell episodes apart; one that is asked for does.
+    goal, active = conditions.goal, conditions.goal.active["force_limit"]
+    other = conditions._replace(goal=goal.replace("force", limit=goal["force"].limit + 1))
+    changed = identity(other) != identity(conditions)
+    np.testing.assert_array_equal(changed, active)
+    assert not active.all()
+
+
+def test_episodes_of_one_reference_are_a_cluster(conditions):
+    goal, index = conditions.goal, conditions.reset_state.object_index
+    found = reference(conditions)
+    posed = goal.active["pose_finger"] | goal.active["trajectory"]
+    plain = ~posed
+    assert len(np.unique(found[plain])) == len(np.unique(index[plain])), "without a reference, objects"
+    moved = conditions._replace(goal=goal.replace("pose", q=goal["pose"].q + 0.1))
+    np.testing.assert_array_equal(reference(moved) != found, goal.active["pose_finger"] | goal.active["pose_wrist"])
