@@ -302,13 +302,21 @@ def test_vhacd_takes_over_when_coacd_runs_out_of_time_and_the_hull_when_both_do(
     mesh = ell()
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert result.method == "vhacd"
-    assert result.notes == ["coacd took longer than 0.01 s"]
+    assert result.notes == ["coacd took longer than 0.01 s of processor time"]
     assert sum(shapes.hull_of(piece).volume for piece in result.pieces) < 1.2 * mesh.volume
     monkeypatch.setattr(decompose, "FALLBACK_LIMIT", 0.01)
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert (result.method, len(result.pieces)) == ("hull", 1)
     np.testing.assert_allclose(shapes.hull_of(result.pieces[0]).volume, 0.08**2 * 0.02 - 0.06**2 / 2 * 0.02, rtol=1e-6)
     assert "hull" in result.notes[-1]
+
+
+def test_a_busy_machine_changes_no_shape(monkeypatch):
+    """A child that gets no processor time is no reason for another shape."""
+    monkeypatch.setattr(decompose, "STARVED", 0.02)
+    mesh = ell()
+    with pytest.raises(CongraspError, match=r"The machine is too busy: coacd .* Stop other programs and try again"):
+        decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
 
 
 def test_a_decomposer_that_dies_is_reported(monkeypatch):
