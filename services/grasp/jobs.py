@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import math
 import pathlib
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -14,10 +13,10 @@ from PIL import Image
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import file_name
-from congrasp.common.objects.procedural import MASS_RANGE
 from congrasp.common.objects.resting import rest_tilts
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.store import Catalogue
+from congrasp.services.assets.objects.materials import with_mass
 from congrasp.services.assets.objects.named import ObjectAt, objects_at
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sizes import size_in_words
@@ -139,7 +138,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "key": key,
             "file": str(at.path),
             "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
-            "mass": obj.mass,
+            "object_mass": obj.mass,
             "notes": [*obj.notes, *_notes(at, obj, settings.options)],
             "rules": list(found.active),
         }
@@ -171,14 +170,13 @@ def rest_pose(obj: GraspObject, text: str) -> int:
 
 
 def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
-    """What is said of a mesh's mass, beside the notes of its import."""
+    """Where a mesh's mass comes from, where the user has not set it."""
     if not at.source or options.mass is not None:
         return []
-    grams = f"{1000 * obj.mass:.0f} g"
-    bound = next((limit for limit in MASS_RANGE if math.isclose(obj.mass, limit, rel_tol=1e-3)), None)
-    if bound is None:
-        return [f"its mass is {grams} (--density {options.density:g} kg/m³; --mass sets another)"]
-    return [f"its mass is {grams}, a limit for masses from --density {options.density:g} kg/m³; --mass sets another"]
+    basis = f"of {options.material}" if options.material else "by its surface and volume"
+    if options.density is not None:
+        basis = f"by {options.density:g} kg/m³"
+    return [f"its mass is {1000 * obj.mass:.0f} g, {basis} (--material or --mass sets another)"]
 
 
 def _content(at: ObjectAt) -> str:
@@ -190,9 +188,11 @@ def _content(at: ObjectAt) -> str:
 
 
 def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
-    """The object; of an object file the scale is all that the options change."""
+    """The object; of an object file, or one of the generator, the options set scale and mass alone."""
     check_options(options)
-    return at.load(options) if at.source else at.load().scaled(options.scale)
+    if at.source:
+        return at.load(options)
+    return with_mass(at.load().scaled(options.scale), options.mass, options.material)
 
 
 def _identity(text: str) -> str:
