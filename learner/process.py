@@ -33,12 +33,12 @@ from congrasp.learner.batch import collate, rollout_form
 from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
 from congrasp.learner.collapse import CollapseWatch
 from congrasp.learner.distributed.ranks import Ranks, ended_by
-from congrasp.learner.hub.hub.hub.hub.admission import Admission
-from congrasp.learner.hub.hub.hub.hub.hub import LearnerHub
-from congrasp.learner.hub.hub.hub.hub.ranges import task_ranges
-from congrasp.learner.hub.hub.hub.hub.staleness import Counters, StalenessManager
-from congrasp.learner.hub.hub.hub.hub.used_rollouts import AuditLog
-from congrasp.learner.hub.hub.hub.hub.write_ahead import FOLDER, WriteAheadLog
+from congrasp.learner.hub.admission import Admission
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.ranges import task_ranges
+from congrasp.learner.hub.staleness import Counters, StalenessManager
+from congrasp.learner.hub.used_rollouts import AuditLog
+from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
 from congrasp.learner.run_directory import (
     CHECKPOINTS,
     CONFIG_FILE,

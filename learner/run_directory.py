@@ -21,7 +21,7 @@ from congrasp.common.io.inputs import read_file
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.learner.checkpoint import Checkpoints, set_aside
-from congrasp.learner.hub.hub.hub.hub.used_rollouts import journalled_version
+from congrasp.learner.hub.used_rollouts import journalled_version
 
 POLICY_FILE = "policy.safetensors"
 INITIAL_FILE = "initial.safetensors"

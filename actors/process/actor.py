@@ -14,8 +14,8 @@ from congrasp.actors.env import episode_fields
 from congrasp.actors.episode import episode_message
 from congrasp.actors.followed import Followed, Follower
 from congrasp.actors.physics import make_physics
-from congrasp.actors.process.actor.actor.actor.failure_weights import FailureWeights
-from congrasp.actors.process.actor.actor.actor.link import ActorLink, RunFinished, RunRestarted, Ticket
+from congrasp.actors.process.failure_weights import FailureWeights
+from congrasp.actors.process.link import ActorLink, RunFinished, RunRestarted, Ticket
 from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
 from congrasp.actors.training_set import training_set
 from congrasp.common.config import RunConfig, run_config_from_json

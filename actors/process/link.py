@@ -13,7 +13,7 @@ import time
 from concurrent.futures import Future
 from typing import Any, NamedTuple, Self
 
-from congrasp.actors.process.actor.actor.actor.uploads import Outcome, Uploads, backoff, check_timeout
+from congrasp.actors.process.uploads import Outcome, Uploads, backoff, check_timeout
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.io.journal import Journal
 from congrasp.common.transport.base import Transport

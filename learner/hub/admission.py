@@ -1,7 +1,7 @@
 """What a rollout may say: every number is compared with what the task can produce, and names are a closed set.
 
 A peer that lies within these ranges is believed. One whose rollout is refused is put off, longer each time
-(`learner.hub.hub.hub.hub.rate_limit.PutOff`).
+(`learner.hub.rate_limit.PutOff`).
 """
 
 import collections
@@ -13,7 +13,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message
-from congrasp.learner.hub.hub.hub.hub.rate_limit import PutOff
+from congrasp.learner.hub.rate_limit import PutOff
 
 _DENSITY = (-100.0, 10.0)  # nats of a log probability for each action; 14 standard deviations, and one of 2e-5
 _ACTIONS = 256  # where a rollout has a log probability and no action
@@ -23,7 +23,7 @@ _HALF_MAGNITUDE = 0x7FFF
 
 
 class Ranges(NamedTuple):
-    """Largest magnitudes that a task can produce (`learner.hub.hub.hub.hub.ranges`)."""
+    """Largest magnitudes that a task can produce (`learner.hub.ranges`)."""
 
     observation: np.ndarray
     """(D,)."""

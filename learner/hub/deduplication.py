@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from congrasp.common.wire.messages import RolloutHeader
-from congrasp.learner.hub.hub.hub.hub.rate_limit import certificate
-from congrasp.learner.hub.hub.hub.hub.staleness import Owner
+from congrasp.learner.hub.rate_limit import certificate
+from congrasp.learner.hub.staleness import Owner
 
 _INCARNATIONS = 1024  # whose sequences are kept
 _WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another

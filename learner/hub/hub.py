@@ -28,13 +28,13 @@ from congrasp.common.wire.messages import (
     validate_bundle,
     validate_rollout,
 )
-from congrasp.learner.hub.hub.hub.hub.admission import Admission
-from congrasp.learner.hub.hub.hub.hub.deduplication import SequenceTable
-from congrasp.learner.hub.hub.hub.hub.members import Members
-from congrasp.learner.hub.hub.hub.hub.rate_limit import DAMAGED, RateLimit
-from congrasp.learner.hub.hub.hub.hub.staleness import Owner, StalenessManager
-from congrasp.learner.hub.hub.hub.hub.used_rollouts import AuditLog
-from congrasp.learner.hub.hub.hub.hub.write_ahead import Identity, Recovered, WriteAheadLog
+from congrasp.learner.hub.admission import Admission
+from congrasp.learner.hub.deduplication import SequenceTable
+from congrasp.learner.hub.members import Members
+from congrasp.learner.hub.rate_limit import DAMAGED, RateLimit
+from congrasp.learner.hub.staleness import Owner, StalenessManager
+from congrasp.learner.hub.used_rollouts import AuditLog
+from congrasp.learner.hub.write_ahead import Identity, Recovered, WriteAheadLog
 
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0

@@ -4,7 +4,7 @@ import collections
 import itertools
 
 from congrasp.common.transport.keys import Alive
-from congrasp.learner.hub.hub.hub.hub.rate_limit import certificate
+from congrasp.learner.hub.rate_limit import certificate
 
 _EACH = 64
 """Listed tokens of one role and certificate."""

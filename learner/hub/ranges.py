@@ -27,7 +27,7 @@ from congrasp.common.task.privileged import Parameters
 from congrasp.common.task.reward import reward_terms
 from congrasp.common.task.sensing import Readings, draw_sensors
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
-from congrasp.learner.hub.hub.hub.hub.admission import Ranges
+from congrasp.learner.hub.admission import Ranges
 
 _STATES = 128
 _SLACK = 2.0

@@ -10,7 +10,7 @@ for. So nothing is made that could only be thrown away, unless its actor is slow
 `max_staleness` versions after the policy that made it is refused, and dropped if it grows that old while it waits.
 
 A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes. Who gets one, until when, and
-how long it is waited for also depends on what has come of earlier ones (`learner.hub.hub.hub.hub.tickets`).
+how long it is waited for also depends on what has come of earlier ones (`learner.hub.tickets`).
 
 The lag of a rollout is the number of updates between the policy that acted and the current one. A learner that resumes
 from a checkpoint gives its policy a new number; what acted under the versions before is measured from the checkpoint's:
@@ -24,8 +24,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Literal, NamedTuple
 
-from congrasp.learner.hub.hub.hub.hub.rate_limit import certificate
-from congrasp.learner.hub.hub.hub.hub.tickets import TicketBudget
+from congrasp.learner.hub.rate_limit import certificate
+from congrasp.learner.hub.tickets import TicketBudget
 
 Owner = tuple[str, str]
 """Actor and incarnation."""

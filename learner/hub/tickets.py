@@ -15,7 +15,7 @@ import statistics
 import time
 from collections.abc import Callable
 
-from congrasp.learner.hub.hub.hub.hub.rate_limit import PutOff, certificate
+from congrasp.learner.hub.rate_limit import PutOff, certificate
 
 _RECENT = 256  # rollouts by which shares, and what the run's usually need, are measured
 _OWN = 16  # and by which an actor is

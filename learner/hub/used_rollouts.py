@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from congrasp.common.io.journal import AUDIT, Journal, JournalLines, has_fields, is_rows, read_journal
 from congrasp.common.wire.codec import Message, checksum
-from congrasp.learner.hub.hub.hub.hub.write_ahead import Identity
+from congrasp.learner.hub.write_ahead import Identity
 
 _ROWS = ("taken", "dropped", "spoilt", "unwritten", "end")
 

@@ -29,7 +29,7 @@ from congrasp.services.viz.sheets import save_png
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
 PORTRAIT = "portrait.png"
 """Its last frame, 1280 x 720, with a view from the thumb's side."""
-_FORMAT = 3  # of result.json: what was written with another is done anew
+_FORMAT = 4  # of result.json: what was written with another is done anew
 THUMBNAIL = "thumbnail.png"
 """A picture of its last frame."""
 OBJECT = "object.png"

@@ -79,6 +79,24 @@ class Grasp:
         """Whether this one held the object to the end."""
         return self.motion.metrics["held"] > 0
 
+    @property
+    def sink(self) -> float:
+        """Metres by which the wrist sinks in the hold at most."""
+        height = self.motion.wrist_position[self._from("hold") :, 2]
+        return float(max(height[0] - height.min(), 0.0))
+
+    @property
+    def shove(self) -> float:
+        """Metres by which the object moves at most before it is lifted, or the table removed."""
+        phase = "lift" if "lift" in self.motion.about["phases"] else "hold"
+        moved = self.motion.object_position[: self._from(phase)] - self.motion.object_position[0]
+        return float(np.linalg.norm(moved, axis=-1).max())
+
+    def _from(self, phase: str) -> int:
+        """The first step of a phase."""
+        begin = self.motion.about["phases"][phase]
+        return min(int(np.searchsorted(self.motion.time, begin - 1e-6)), len(self.motion.time) - 1)
+
     def facts(self) -> dict[str, Any]:
         """Result, attempts and errors, for tables and files."""
         return {
@@ -91,6 +109,8 @@ class Grasp:
             "rest": self.rest + 1,
             "phases": self.motion.about.get("phases", {}),
             "constraints": list(self.motion.constraints),
+            "sink_mm": 1e3 * self.sink,
+            "shove_mm": 1e3 * self.shove,
             "links_at_removal": self.motion.metrics["links_at_removal"],
             **{name: value for name, value in self.motion.metrics.items() if name in ASSESSED},
             **{name: self.motion.metrics[name] for name in _errors_of(self.motion.constraints)},

@@ -58,12 +58,19 @@ class Result(NamedTuple):
     skipped: bool = False
     """It was finished before."""
 
+    @property
+    def held(self) -> bool:
+        """True if the object is held, and its shape is that of its file."""
+        return bool(self.facts.get("success")) and self.facts["shape_reliable"]
+
     def line(self) -> str:
         """One line."""
         if self.error:
             return self.error
         facts = self.facts
         outcome = "held" if facts["success"] else "not held"
+        if not facts["shape_reliable"]:
+            outcome += ", but its shape is unreliable (see its notes; repair the mesh, or set --time-limit)"
         outcome += ", also against pushes of 1 N" if facts.get("push_survival") else ""
         best = f"best of {facts['attempts']} attempts, {facts['attempts_held']} of which hold it"
         errors = [f"{what} {_shown(facts, stem)}" for stem, what in _ERRORS.items() if f"{stem}_m" in facts]
@@ -139,6 +146,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "file": str(at.path),
             "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
             "object_mass": obj.mass,
+            "shape_reliable": obj.shape_reliable,
             "notes": [*obj.notes, *_notes(at, obj, settings.options)],
             "rules": list(found.active),
         }
@@ -203,7 +211,7 @@ def _identity(text: str) -> str:
 
 def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> None:
     """Writes the results of a hand as JSON, and the last frames of all grasps as one picture."""
-    held = sum(bool(result.facts.get("success")) for result in results)
+    held = sum(result.held for result in results)
     rows = [{"name": r.name, "error": r.error} if r.error else {"name": r.name, **r.facts} for r in results]
     summary = {"hand": hand, "objects": len(rows), "succeeded": held, "results": rows}
     write_atomically(out / SUMMARY, json.dumps(summary, indent=2).encode())
@@ -211,8 +219,15 @@ def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> Non
     if drawn:
         images = [np.asarray(Image.open(out / result.name / THUMBNAIL).convert("RGB")) for result in drawn]
         labels = [
-            f"{name}: {'held' if facts['success'] else 'NOT HELD'}, {facts['attempts_held']} of {facts['attempts']}"
-            for name, facts, *_ in drawn
+            f"{result.name}: {_verdict(result)}, {result.facts['attempts_held']} of {result.facts['attempts']}"
+            for result in drawn
         ]
         title = f"{hand} hand: {held} of {len(rows)} objects held for two seconds without the table"
         save_png(out / SHEET, contact_sheet(images, labels, columns=min(_COLUMNS, len(drawn)), title=title))
+
+
+def _verdict(result: Result) -> str:
+    """The outcome on a picture."""
+    if not result.facts["shape_reliable"]:
+        return "SHAPE UNRELIABLE"
+    return "held" if result.held else "NOT HELD"

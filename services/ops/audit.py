@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.journal import AUDIT, JournalLines, has_fields, read_journal
-from congrasp.learner.hub.hub.hub.hub.used_rollouts import Used, read_uses, replay
+from congrasp.learner.hub.used_rollouts import Used, read_uses, replay
 
 Identity = tuple[str, str, int]
 """Actor, incarnation and sequence number."""

@@ -7,7 +7,7 @@ import pathlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
-from congrasp.actors.process.actor.actor.actor.actor import run_actor
+from congrasp.actors.process.actor import run_actor
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores, prepare_workers

@@ -35,9 +35,9 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub.hub.hub.hub.admission import Admission, Ranges
-from congrasp.learner.hub.hub.hub.hub.hub import LearnerHub
-from congrasp.learner.hub.hub.hub.hub.staleness import StalenessManager
+from congrasp.learner.hub.admission import Admission, Ranges
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.assets.objects.sources import read_mesh
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.grasp.wrist_paths import read_bvh, read_wrist_path

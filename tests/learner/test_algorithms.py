@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.actors.process.actor.actor.actor.link import ActorLink, RunFinished
+from congrasp.actors.process.link import ActorLink, RunFinished
 from congrasp.common.config import PPOConfig, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
@@ -19,7 +19,7 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.learner.algorithms import ALGORITHMS, make_algorithm
 from congrasp.learner.batch import collate, partition_specs
-from congrasp.learner.hub.hub.hub.hub.admission import Ranges
+from congrasp.learner.hub.admission import Ranges
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run
 from congrasp.services.bench import toy

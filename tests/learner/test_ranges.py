@@ -16,8 +16,8 @@ from congrasp.common.task.metrics import episode_fields
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.schema import PRIVILEGED, RECORDED
-from congrasp.learner.hub.hub.hub.hub.admission import Admission
-from congrasp.learner.hub.hub.hub.hub.ranges import task_ranges
+from congrasp.learner.hub.admission import Admission
+from congrasp.learner.hub.ranges import task_ranges
 
 TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, approach_steps=50, hold_steps_max=40)
 RANGES = task_ranges(TASK, CurriculumConfig())

@@ -23,6 +23,7 @@ from congrasp.services.cli.main import load
 from congrasp.services.export.motion_file import load_motion, motion_of_episode
 from congrasp.services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
 from congrasp.services.grasp.grasper import Grasp, Grasper, costs
+from congrasp.services.grasp.jobs import Result
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.record.reader import read_episodes
 from tests.episodes import episode
@@ -42,6 +43,13 @@ def grasper():
     grasper = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, threads=2)
     yield grasper
     grasper.close()
+
+
+def test_a_shape_that_is_another_one_is_not_held():
+    held = {"success": True, "shape_reliable": True}
+    assert Result("mug", held).held
+    assert not Result("mug", held | {"shape_reliable": False}).held
+    assert not Result("mug", held | {"success": False}).held
 
 
 def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):

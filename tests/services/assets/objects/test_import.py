@@ -311,6 +311,16 @@ def test_vhacd_takes_over_when_coacd_runs_out_of_time_and_the_hull_when_both_do(
     assert "hull" in result.notes[-1]
 
 
+def test_a_hull_that_stands_in_is_no_reliable_shape(tmp_path, options, monkeypatch):
+    """An ell's hull has 64 % more volume; squeezed to its volume, it is far from its surface."""
+    ell().export(tmp_path / "ell.stl")
+    (good,) = objects_of(tmp_path / "ell.stl", options)
+    monkeypatch.setattr(decompose, "FALLBACK_LIMIT", 0.01)
+    (bad,) = objects_of(tmp_path / "ell.stl", dataclasses.replace(options, time_limit=0.01))
+    assert good.shape_reliable and not bad.shape_reliable
+    assert [dataclasses.replace(good, surface_error=d).shape_reliable for d in (0.0049, 0.0051)] == [True, False]
+
+
 def test_a_busy_machine_changes_no_shape(monkeypatch):
     """A child that gets no processor time is no reason for another shape."""
     monkeypatch.setattr(decompose, "STARVED", 0.02)
