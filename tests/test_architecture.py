@@ -38,7 +38,7 @@ def graph(everything: bool) -> dict[str, set[str]]:
 
 
 def test_every_import_of_ours_exists():
-    """Those in functions, too, which nothing else finds before they run; mypy takes what it does not find for granted."""
+    """Those in functions, too, which nothing finds before they run; mypy takes what it does not find for granted."""
     names = graph(everything=False).keys() | {"congrasp"}
     for path in (path for folder in (*FOLDERS, "tests", "examples") for path in (ROOT / folder).rglob("*.py")):
         body = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.stmt)]

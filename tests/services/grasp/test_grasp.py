@@ -134,7 +134,7 @@ def made_up(monkeypatch):
     def grasp(self, obj, request=None, progress=lambda what, done, total: None):
         calls.append(obj.name)
         made = episode(success=obj.name != "loose")
-        made.meta.update(object=obj.name)
+        made.meta.update(object=obj.name, phases={"grasp": 0.0, "hold": 0.04})
         made.meta["metrics"] |= dict.fromkeys(
             ("heading_rad", "heading_m", "pose_rad", "pose_m", "trajectory_rad", "trajectory_m"), 0.01
         )
