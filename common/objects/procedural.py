@@ -8,7 +8,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
-from congrasp.common.objects.families import BASIC, BUILDERS, HOUSEHOLD, Draft
+from congrasp.common.objects.families import BASIC, BUILDERS, HOUSEHOLD, SCANS, Draft
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.surface import halves, mass_properties, sample_union
@@ -19,8 +19,13 @@ BASIC_FAMILIES = tuple(BASIC)
 HOUSEHOLD_FAMILIES = tuple(HOUSEHOLD)
 PRIMITIVE_FAMILIES = tuple(family for family in BASIC_FAMILIES if family not in ("ring", "bowl", "cup"))
 """Basic families whose objects have no mesh pieces."""
-GROUPS = {"basic": BASIC_FAMILIES, "household": HOUSEHOLD_FAMILIES, "all": FAMILIES}
-"""Names that stand for several families."""
+GROUPS = {
+    "basic": BASIC_FAMILIES,
+    "household": HOUSEHOLD_FAMILIES,
+    "all": (*BASIC_FAMILIES, *HOUSEHOLD_FAMILIES),
+    "scans": tuple(SCANS),
+}
+"""Names that stand for several families; scans' kinds of shape are apart, so that pools of `all` stay the same."""
 MASS_RANGE = (0.02, 0.6)
 """Kilograms."""
 _SETTLED = {True: (0.05, 0.5), False: (0.02, 0.5)}

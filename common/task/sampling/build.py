@@ -222,7 +222,12 @@ def headings_of(
     assert whole is not None, "only the graspable region may be out of reach"
     sets = [whole, graspable or whole]
     own = CENTER if task.headings == "center" else hand
-    found = [within_reach(headings, obj.points, obj.rest_poses, own) for headings in sets]
+    # Captured headings may be off by a centimetre, and a hand held what they are of.
+    regions = [None, obj.non_graspable_points if graspable is not None and given is None else None]
+    found = [
+        within_reach(headings, obj.points, obj.rest_poses, own, avoid)
+        for headings, avoid in zip(sets, regions, strict=True)
+    ]
     reachable = np.stack([fine for _, fine in found])
     if task.headings == "above" and reachable[0].any():
         steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])

@@ -25,12 +25,13 @@ from congrasp.services.assets.objects.collision import convex_pieces
 from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.materials import Weight, guessed_mass, materials_of, weigh
 from congrasp.services.assets.objects.options import ImportOptions, check_options
+from congrasp.services.assets.objects.regions import cut_to_hold
 from congrasp.services.assets.objects.sizes import metres_per_unit
 from congrasp.services.assets.objects.sources import Source, read_mesh
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""
-_CACHE_VERSION = 7
+_CACHE_VERSION = 8
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
 
@@ -38,7 +39,7 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
     """Imports one object, or takes it from the cache of finished imports; its `notes` say what the user should know.
 
     Its origin moves to the centre of mass; its orientation stays the file's. Parts come from part files; an object
-    without them is labelled by its two halves, the slimmer one graspable.
+    without them is labelled by two halves, the slimmer one graspable if a hand can close on it (`cut_to_hold`).
 
     Raises:
       CongraspError: a mesh cannot be used; the line names it, its fault and the remedy.
@@ -167,7 +168,8 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         volume_error=errors.volume,
         colours=colours,
     )
-    return dataclasses.replace(obj, rest_poses=rest_poses(obj))
+    obj = dataclasses.replace(obj, rest_poses=rest_poses(obj))
+    return obj if source.parts else cut_to_hold(obj)
 
 
 def _colours(source: Source, factor: float, center: np.ndarray, seed: int, notes: list[str]) -> Colours | None:
