@@ -228,6 +228,11 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
                 f"({deep['sequence']}). They were moved apart: their farthest joint by {mean:.2f} rad on average, "
                 f"{moved['moved_apart_rad']:.2f} rad at most ({moved['sequence']})."
             )
+        if later := [row["frames_after_touch"] for row in kept if row["frames_after_touch"]]:
+            print(
+                f"Thumb and fingers oppose after the first touch in {len(later)} of {len(kept)}, and the reference is "
+                f"taken then: {sum(later) / len(later):.0f} frames later on average."
+            )
         above = sum(row["clear_of_table"] for row in kept)
         sets = len({row["object"] for row in kept})
         print(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")

@@ -3,7 +3,8 @@
 import collections
 import dataclasses
 import pathlib
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Sequence as Items
 from typing import Any, Literal
 
 import numpy as np
@@ -31,6 +32,7 @@ from congrasp.common.task.sampling.write_sets import for_training, set_of
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
 from congrasp.services.assets.captures.objects import import_meshes
+from congrasp.services.assets.captures.refuse import check_reference
 from congrasp.services.assets.captures.separate import deepest, separated
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
 from congrasp.services.assets.captures.transfer import demonstrated_headings, transferred
@@ -42,6 +44,8 @@ Affordance = Literal["auto", "parts", "contacts", "none"]
 _Shapes = dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
 _TOUCHED = 0.03
 """Metres around touched points that count as touched."""
+IN_TABLE = 0.005
+"""Metres that a captured hand may be in the table where no resting pose keeps it out."""
 _VERTICES = 3
 """Contact points that make a part of an object graspable (O+ in the paper)."""
 
@@ -113,7 +117,7 @@ def import_sets(
         read.append(item)
     shapes = _shapes([item for item in read if isinstance(item, Sequence)], progress)
     groups: dict[str, _Group] = {}
-    beyond = options.beyond if hand is HUMAN else np.inf
+    beyond, scale = options.beyond if hand is HUMAN else np.inf, object_scale(hand, TaskConfig(hand=hand.name))
     for item in read:
         try:
             if isinstance(item, Dropped):
@@ -121,6 +125,7 @@ def import_sets(
             progress(f"Grasp of {item.name}")
             obj, surface = _shape(item, shapes)
             demonstration = extract(item, obj, surface, options.waypoints, beyond)
+            check_reference(hand, demonstration, obj, scale)
             labelled = _labelled(item, obj, demonstration, options.affordance)
             groups.setdefault(labelled.name, _Group(labelled)).demonstrations.append(demonstration)
         except Dropped as dropped:
@@ -137,26 +142,46 @@ def import_sets(
             continue
         objects.append(obj)
         sets.append(made)
-        usable, below = made.arrays["pose/allowed"].any((0, 1)), _from_below(made)
-        overlap, moved = np.asarray(deepest(hand, given)), np.abs(made.arrays["pose/q"][0] - given).max(-1)
-        for m, demonstration in enumerate(group.demonstrations):
-            report.kept.append(
-                {
-                    "sequence": demonstration.name,
-                    "object": obj.name,
-                    "frame": demonstration.frame,
-                    "first_frame": demonstration.start,
-                    "residual_rad": round(demonstration.fit.angle, 5),
-                    "residual_tip_m": round(demonstration.fit.tip, 5),
-                    "overlap_m": round(float(overlap[m]), 5),
-                    "moved_apart_rad": round(float(moved[m]), 5),
-                    "touched_points": len(demonstration.contact),
-                    "clear_of_table": bool(usable[m]),
-                    "from_below": bool(below[m]),
-                    "split": "training" if training[m] else "held-out",
-                }
-            )
+        report.kept += _rows(hand, obj, made, group.demonstrations, given, training)
     return objects, sets, report
+
+
+def _rows(
+    hand: Hand,
+    obj: GraspObject,
+    made: Message,
+    demonstrations: Items[Demonstration],
+    given: np.ndarray,
+    training: np.ndarray,
+) -> Iterator[dict[str, Any]]:
+    """Outcome of each of M kept demonstrations on an object.
+
+    Args:
+      hand: whose set it is.
+      obj: the object.
+      made: the set.
+      demonstrations: M of them.
+      given: (M, F) finger angles before fingers were moved apart.
+      training: (M,) bool, those for training.
+    """
+    usable, below = made.arrays["pose/allowed"].any((0, 1)), _from_below(hand, made)
+    overlap, moved = np.asarray(deepest(hand, given)), np.abs(made.arrays["pose/q"][0] - given).max(-1)
+    for m, demonstration in enumerate(demonstrations):
+        yield {
+            "sequence": demonstration.name,
+            "object": obj.name,
+            "frame": demonstration.frame,
+            "frames_after_touch": demonstration.later,
+            "first_frame": demonstration.start,
+            "residual_rad": round(demonstration.fit.angle, 5),
+            "residual_tip_m": round(demonstration.fit.tip, 5),
+            "overlap_m": round(float(overlap[m]), 5),
+            "moved_apart_rad": round(float(moved[m]), 5),
+            "touched_points": len(demonstration.contact),
+            "clear_of_table": bool(usable[m]),
+            "from_below": bool(below[m]),
+            "split": "training" if training[m] else "held-out",
+        }
 
 
 def _split(groups: Collection[_Group], seed: int) -> list[np.ndarray]:
@@ -240,7 +265,8 @@ def _resting_poses(
     """(M, R) bool, in which resting poses (R, 7) of the object each of M captured references is asked for.
 
     Their wrist must stay over the table, and the hand out of it, as with other references. Where no resting pose allows
-    that, because captured hands are off by a centimetre, it is the one in which the hand is least deep in the table.
+    that, because captured hands are off by some millimetres, it is the one in which the hand is least deep in it,
+    if that is no deeper than `IN_TABLE`.
 
     Args:
       hand: whose references these are.
@@ -252,7 +278,7 @@ def _resting_poses(
     rests = np.stack([rest] * len(position))
     clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, rests))
     height = np.where(clear, height_over_table(hand, q, position, quaternion, rests), -np.inf)
-    return clear & (height >= np.minimum(-SOFT, height.max(1, keepdims=True)))
+    return clear & (height >= np.clip(height.max(1, keepdims=True), -IN_TABLE, -SOFT))
 
 
 def _set(
@@ -313,11 +339,13 @@ def _set(
     return obj, made, given_q
 
 
-def _from_below(made: Message) -> np.ndarray:
-    """(M,) bool: demonstrations that no resting pose allows only because the hand comes from below."""
-    path, rest = (made.arrays[name] for name in ("trajectory/position", "rest"))
-    clear = np.asarray(above_table(path[0], np.stack([rest] * path.shape[1]))).any(-1)
-    return clear & ~made.arrays["pose/allowed"].any((0, 1))
+def _from_below(hand: Hand, made: Message) -> np.ndarray:
+    """(M,) bool: demonstrations that every resting pose excludes, one of them only as the hand comes from below."""
+    names = "trajectory/position", "pose/quaternion", "rest"
+    path, turn, rest = (made.arrays[name] for name in names)
+    rests = np.stack([rest] * path.shape[1])
+    clear = np.asarray(clear_of_table(hand, turn[0], path[0], rests))
+    return np.asarray(np.asarray(above_table(path[0], rests)).any(-1) & ~clear.any(-1))
 
 
 def _twice(values: np.ndarray) -> np.ndarray:

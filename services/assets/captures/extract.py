@@ -4,6 +4,7 @@ The paper leaves some terms open; here they mean:
 
 * wrist-object distance: from the wrist's origin to the nearest point of the object's surface;
 * contact: a finger's skin within `CONTACT` of the surface, or below it;
+* grasped: skins of thumb and another finger within `CLOSED` of the surface, where its normals oppose each other;
 * carried: the object has moved by `CARRIED`, and the wrist by less than half as much against it;
 * continuous: the wrist moves at most `JUMP` between two frames, and at most `GAP` frames in a row are missing;
 * too complex: the path is more than `DETOUR` times its straight line, or the wrist turns by more than `TURN` in all.
@@ -29,6 +30,10 @@ NEAREST = 0.08
 FARTHEST = 0.20
 """Distance (m) at which a trajectory begins at most."""
 CONTACT = 0.005
+CLOSED, OPPOSITE = 0.002, -0.5
+"""Metres of skin from the surface, and cosine of its normals, where fingers oppose each other."""
+LATER = 30
+"""Most frames between the first stable contact and the grasping frame."""
 JUMP = 0.10
 GAP = 3
 DETOUR = 2.0
@@ -60,6 +65,10 @@ class Surface:
         inside = ((points - self.points[nearest]) * self._normals[nearest]).sum(-1) < 0
         return np.where(inside, -away, away)
 
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """(..., 3) outward unit normals of the surface nearest to points (..., 3)."""
+        return np.asarray(self._normals[self._tree.query(points)[1]])
+
     def within(self, points: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """(n, 3) samples of the surface within any of the balls (M, 3), (M,)."""
         return self.points[sorted(set().union(*self._tree.query_ball_point(points, radii)))]
@@ -72,6 +81,8 @@ class Demonstration:
     name: str
     frame: int
     """The grasping frame."""
+    later: int
+    """Frames between the first stable contact and that in which the fingers have closed."""
     start: int
     """The frame of the farthest distance."""
     fit: Fit
@@ -110,14 +121,18 @@ def extract(
         reason = f"the wrist stays {nearest:.3g} m from the object: are its positions in metres?"
         raise Dropped(sequence.name, "wrong units", reason)
     skin = position[:, None, None] + np.einsum("tij,tfkj->tfki", rotation, sequence.joints)
-    touched = _grasping_frame(sequence, surface, skin)
-    frame = touched if sequence.grasp is not None else _before_carried(sequence, position, touched)
+    first = _first_contact(sequence, surface, skin)
+    touched = frame = first
+    if sequence.grasp is None:
+        touched = _opposed(sequence, surface, skin, first)
+        frame = _before_carried(sequence, position, touched)
     start, path, turns = approach(sequence.name, position, rotation, far, sequence.present, frame, waypoints)
     found = _fit(sequence, frame)
     _check_limits(sequence.name, found.q, beyond)
     return Demonstration(
         name=sequence.name,
         frame=frame,
+        later=touched - first,
         start=start,
         fit=found,
         q=np.clip(found.q, HUMAN.lower, HUMAN.upper),
@@ -170,8 +185,8 @@ def in_object_frame(sequence: Sequence, obj: GraspObject) -> tuple[np.ndarray, n
     return np.einsum("tij,tj->ti", back, offset) + obj.origin, back @ sequence.wrist_rotation
 
 
-def _grasping_frame(sequence: Sequence, surface: Surface, skin: np.ndarray) -> int:
-    """The frame in which the hand has grasped: named by the data set, or the first of stable contact."""
+def _first_contact(sequence: Sequence, surface: Surface, skin: np.ndarray) -> int:
+    """The grasping frame that the data set names, or the first frame of stable contact."""
     if sequence.grasp is not None:
         if not sequence.present[sequence.grasp]:
             reason = f"hand or object is missing in its grasping frame {sequence.grasp}"
@@ -193,6 +208,31 @@ def _grasping_frame(sequence: Sequence, surface: Surface, skin: np.ndarray) -> i
             f"{', '.join(ever) or 'none'})",
         )
     return int(np.argmax(stable))
+
+
+def _opposed(sequence: Sequence, surface: Surface, skin: np.ndarray, first: int) -> int:
+    """The first frame from that of stable contact on in which thumb and another finger have grasped.
+
+    Frames count while the object is not carried, at most `LATER` of them. If fingers never close in them, it is the
+    frame in which an opposing pair comes nearest to the surface; the first one if none opposes.
+
+    Args:
+      sequence: of frames.
+      surface: of the object.
+      skin: (T, 5, 4, 3) joints of the fingers, m, object frame.
+      first: the frame of stable contact.
+    """
+    frames = np.flatnonzero(sequence.present[: first + LATER + 1])
+    moved = np.linalg.norm(sequence.object_position - sequence.object_position[first], axis=-1)
+    frames = frames[(frames >= first) & (moved[frames] < CARRIED)]
+    points, radii = _bones(skin[frames])
+    gaps = (surface.distance(points) - radii).reshape(*points.shape[:2], -1)
+    nearest = gaps.argmin(-1)[..., None]
+    points = np.take_along_axis(points.reshape(*gaps.shape, 3), nearest[..., None], 2)[:, :, 0]
+    gap, normal = np.take_along_axis(gaps, nearest, 2)[..., 0], surface.normals(points)
+    opposing = np.einsum("tj,tfj->tf", normal[:, 0], normal[:, 1:]) < OPPOSITE
+    apart = np.where(opposing, np.maximum(gap[:, :1], gap[:, 1:]), np.inf).min(-1)
+    return int(frames[np.argmax(apart <= CLOSED) if (apart <= CLOSED).any() else np.argmin(apart)])
 
 
 def _before_carried(sequence: Sequence, position: np.ndarray, frame: int) -> int:

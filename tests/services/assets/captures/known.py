@@ -21,8 +21,9 @@ ORIGIN = np.array([0.02, -0.01, 0.03])
 
 
 def q_closed(rng: np.random.Generator) -> np.ndarray:
-    """(20,) a pinch within the limits, a little different each time, whose fingers are not in one another."""
-    q = HUMAN.q_open + 0.35 * (HUMAN.q_closed - HUMAN.q_open) + rng.uniform(-0.05, 0.05, 20)
+    """(20,) a pinch within the limits, a little different each time, with no finger in another or the box."""
+    share = np.where([joint.name.startswith(("thumb", "index")) for joint in HUMAN.joints], 0.35, 0.1)
+    q = HUMAN.q_open + share * (HUMAN.q_closed - HUMAN.q_open) + rng.uniform(-0.05, 0.05, 20)
     return separated(HUMAN, np.clip(q, HUMAN.lower + 0.01, HUMAN.upper - 0.01)[None])[0]
 
 

@@ -111,7 +111,7 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     write(case, folder / "MyoHand_cup_lift.npz")
     (folder / "MyoHand_box_text.npz").write_text("not an archive")
     limits = robot.copy()
-    limits[:, 9 + 6] = 2.2
+    limits[:, 9 + 14] = 2.2
     write(case, folder / "MyoHand_box_limits.npz", robot=limits)
     known.write_mesh(case, tmp_path / "meshes" / "box.stl")
     sets, report = run_import("myohand", folder, "--meshes", tmp_path / "meshes")
@@ -125,7 +125,7 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
         ("gone", "frames missing", "no frame"),
         ("text", "unreadable", "cannot be read"),
         ("lift", "no mesh", "no mesh of 'cup'"),
-        ("limits", "joint limits", "index_pip is 0.45 rad beyond"),
+        ("limits", "joint limits", "ring_pip is 0.45 rad beyond"),
     ):
         assert reasons[name][0] == rule and words in reasons[name][1]
 

@@ -23,7 +23,7 @@ def axes(hand):
 
 @pytest.mark.parametrize("name", ["allegro", "sharpa"])
 def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_path, capsys, name):
-    cases = [known.make(f"MyoHand_box_lift{seed}", "box", seed) for seed in range(2)]
+    cases = [known.make(f"MyoHand_box_lift{seed}", "box", seed, tail=0.04) for seed in range(2)]
     for case in cases:
         write(case, tmp_path / "data" / f"{case.name}.npz")
     # Beyond what a human finger can do, which does not matter to another hand.

@@ -51,7 +51,8 @@ def test_a_solid_block_gets_the_mass_properties_worked_out(tmp_path, options, su
     assert obj.surface_error < 1e-4
     assert obj.notes[-1].startswith("1 convex piece stands for it: ")
     assert sorted(obj.graspable.tolist()) == [False, True]
-    assert 0.4 < obj.non_graspable_points.mean() < 0.6
+    # Neither half of it can be held in all of its resting poses, but two thirds can.
+    assert obj.non_graspable_points.mean() == pytest.approx(0.35, abs=0.01)
     np.testing.assert_allclose(sorted(obj.rest_poses[:, 2]), np.repeat(SIDES / 2, 2), atol=1e-3)
 
 
