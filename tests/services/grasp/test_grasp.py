@@ -179,6 +179,7 @@ def test_a_folder_is_grasped_once_and_bad_meshes_do_not_stop_it(tmp_path, capsys
 
     (folder / "bad.obj").unlink()
     meshes(folder, "c")
+    assert json.loads((out / "a" / RESULT).read_text())["object_mass"] > 0.001
     (out / "b" / RESULT).unlink()  # as if it had been interrupted while b was written
     assert command(folder, "--out", out) == 0
     assert made_up == ["a", "b", "b", "c"] and "a (done before)" in capsys.readouterr().out
